@@ -1,0 +1,44 @@
+/* Shared by the library's files; not for users. */
+#ifndef SELFCAL_INTERNAL_H
+#define SELFCAL_INTERNAL_H
+
+#include <math.h>
+#include <string.h>
+
+#include "selfcal.h"
+
+/* Arithmetic in selfcal_real_t. The fused multiply-add is written out, so that a host and a target round alike. */
+#ifdef SELFCAL_REAL_DOUBLE
+#define R(x) (x)
+#define r_fma fma
+#define r_exp exp
+#define r_expm1 expm1
+#define r_log log
+#define r_sqrt sqrt
+#define r_fabs fabs
+#define r_fmin fmin
+#define r_fmax fmax
+#else
+#define R(x) (x##F)
+#define r_fma fmaf
+#define r_exp expf
+#define r_expm1 expm1f
+#define r_log logf
+#define r_sqrt sqrtf
+#define r_fabs fabsf
+#define r_fmin fminf
+#define r_fmax fmaxf
+#endif
+
+#define SELFCAL_LN_2PI 1.8378770664093454836
+
+/* bank.c */
+/* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
+void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
+/* `count` bank intervals without a sample. */
+void selfcal_bank_gap(selfcal_t *self, uint64_t count);
+/* Runs the nodes over what is waiting: a batch that is not yet full, a gap after it. */
+void selfcal_bank_flush(selfcal_t *self);
+
+
+#endif

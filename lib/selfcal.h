@@ -1,0 +1,405 @@
+/* selfcal: an inertial sensor at rest identifies its own error model.
+ *
+ * SCOPE
+ *   A bank of Kalman filters, one per (hypothesis, grid node), runs over the readings of up to SELFCAL_AXES_MAX axes of a
+ *   resting sensor. By Bayes' rule it gives the probability of each drift law, the noise parameters with intervals, and
+ *   the bias with its uncertainty. One axis reads, at bank interval i,
+ *       y_i = x0 + x_i + v_i,   x0 ~ N(0, P0),   v_i ~ N(0, sigma_v^2),
+ *   with the drift x_i of one of the laws in selfcal_law_t. Source of the method: Stepanov & Motorin, IFAC-PapersOnLine
+ *   50-1 (2017) 2830-2835; equation numbers in this library are theirs.
+ *
+ * HOW TO INTEGRATE
+ *   1. `selfcal codegen MODEL.yaml -o DIR` writes the model tables (const, for flash).
+ *   2. Give selfcal_init() the model and SELFCAL_SIZE(nodes, axes) bytes; the memory stays yours, nothing is allocated.
+ *   3. selfcal_push() every sample, selfcal_skip() every missing one. Cost is even: SELFCAL_BATCH bank samples are
+ *      gathered, then every node runs over them.
+ *   4. When a report is wanted: selfcal_report_begin(), then selfcal_report_step() until it no longer says SELFCAL_BUSY.
+ *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only.
+ *
+ * THREADS AND INTERRUPTS
+ *   No global state. One selfcal_t belongs to one context at a time; the caller locks when two share it.
+ *
+ * UNITS
+ *   The library knows one unit per axis, "unit" below: the model's (deg/s, m/s^2, ...). Samples come in it.
+ *       N        white noise density        unit/sqrt(Hz)   two-sided; the Allan deviation at 1 s
+ *       K        random-walk density        unit/s/sqrt(Hz) = unit/sqrt(s) of drift per second
+ *       sigma_m  Gauss-Markov deviation     unit
+ *       alpha    Gauss-Markov bandwidth     1/s
+ *   Per bank interval dt: sigma_v = N/sqrt(dt), random-walk step sigma_w = K*sqrt(dt).
+ *
+ * THREE KINDS OF TROUBLE
+ *   Bad arguments: a status is returned, nothing changes. Run-time events (gap, saturation, not-a-number, stuck sample):
+ *   counted in selfcal_counters_t, the sample is kept out of the sums. Bugs: SELFCAL_ASSERT.
+ */
+#ifndef SELFCAL_H
+#define SELFCAL_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define SELFCAL_VERSION "0.1.0"
+
+/* ---------------------------------------------------------------------------------------------------- configuration
+ * Every macro may be set on the compiler's command line. */
+
+/* Axes one bank serves at most; six inertial axes share every gain. */
+#ifndef SELFCAL_AXES_MAX
+#define SELFCAL_AXES_MAX 6
+#endif
+#if SELFCAL_AXES_MAX < 1 || SELFCAL_AXES_MAX > 16
+#error "SELFCAL_AXES_MAX must be 1 to 16"
+#endif
+
+/* Hypotheses one model holds at most. */
+#ifndef SELFCAL_HYPOTHESES_MAX
+#define SELFCAL_HYPOTHESES_MAX 4
+#endif
+#if SELFCAL_HYPOTHESES_MAX < 1 || SELFCAL_HYPOTHESES_MAX > 16
+#error "SELFCAL_HYPOTHESES_MAX must be 1 to 16"
+#endif
+
+/* Bank samples gathered before the nodes run over them. More: fewer loads per sample, a longer worst sample. */
+#ifndef SELFCAL_BATCH
+#define SELFCAL_BATCH 16
+#endif
+#if SELFCAL_BATCH < 8 || SELFCAL_BATCH > 64
+#error "SELFCAL_BATCH must be 8 (the first batch places the nodes) to 64"
+#endif
+
+/* Cells a dimension that a report integrates over. */
+#ifndef SELFCAL_REPORT_CELLS
+#define SELFCAL_REPORT_CELLS 48
+#endif
+#if SELFCAL_REPORT_CELLS < 16 || SELFCAL_REPORT_CELLS > 255
+#error "SELFCAL_REPORT_CELLS must be 16 to 255"
+#endif
+
+/* Nodes one grid dimension holds at most. */
+#ifndef SELFCAL_GRID_MAX
+#define SELFCAL_GRID_MAX 16
+#endif
+#if SELFCAL_GRID_MAX < 6 || SELFCAL_GRID_MAX > 64
+#error "SELFCAL_GRID_MAX must be 6 (a quintic spline needs six) to 64"
+#endif
+
+#ifndef SELFCAL_ASSERT
+#define SELFCAL_ASSERT(condition) ((void)0)
+#endif
+
+/* State and per-sample arithmetic: float on a target. -DSELFCAL_REAL_DOUBLE builds the same code in double, which is how
+ * the float build's own rounding is told from an error of method. */
+#ifdef SELFCAL_REAL_DOUBLE
+typedef double selfcal_real_t;
+#else
+typedef float selfcal_real_t;
+#endif
+
+/* Long sums and ln-likelihoods: they differ by (n/2) ln(ratio), which float cannot carry beyond n = 10^4. Deliberately
+ * double, in software where the FPU has none; touched once per 64 bank samples and in reports, never per sample. */
+typedef double selfcal_wide_t;
+
+/* ------------------------------------------------------------------------------------------------------------ model
+ * All tables are const and made by `selfcal codegen` or by the Python tools from the same YAML file. */
+
+typedef enum {
+    SELFCAL_CONSTANT = 0,     /* x_i = 0 */
+    SELFCAL_RANDOM_WALK = 1,  /* x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                            (23) */
+    SELFCAL_GAUSS_MARKOV = 2, /* x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-alpha dt) */
+    SELFCAL_LAWS = 3
+} selfcal_law_t;
+
+typedef enum { SELFCAL_N = 0, SELFCAL_K = 1, SELFCAL_SIGMA_M = 2, SELFCAL_ALPHA = 3, SELFCAL_PARAMETERS = 4 } selfcal_parameter_t;
+
+/* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
+typedef struct {
+    float ln_min, ln_max; /* ln of the parameter in the units above */
+    bool uniform;         /* false: log-uniform */
+} selfcal_prior_t;
+
+typedef struct {
+    selfcal_prior_t prior[SELFCAL_PARAMETERS];
+    float bias_sd;        /* sqrt(P0), unit */
+    float range;          /* |sample| at or above it is saturated, unit; 0: no check */
+    uint32_t stuck_limit; /* this many equal samples in a row are stuck; 0: no check */
+} selfcal_axis_t;
+
+/* One grid dimension: nodes at even steps of ln(value), joined by a quintic spline (not-a-knot: no knot at the two places next
+ * to either end). Even steps make its matrix the same wherever the nodes lie. */
+typedef struct {
+    uint16_t nodes;
+    const selfcal_wide_t *fit; /* [nodes][nodes]: node values to B-spline coefficients */
+} selfcal_grid_t;
+
+/* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
+ * sigma_w / sigma_v or sigma_m / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
+ * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way. Where the nodes lie decides
+ * how well the likelihood is interpolated, not the prior. */
+typedef struct {
+    selfcal_law_t law;
+    float ln_probability;        /* prior */
+    const selfcal_grid_t *rho;   /* NULL for SELFCAL_CONSTANT */
+    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV */
+} selfcal_hypothesis_t;
+
+typedef struct {
+    uint32_t id;        /* checksum of the tables: what a snapshot or a monitor tells models apart by */
+    float dt_s;         /* bank interval */
+    uint32_t block;     /* samples averaged into one bank sample */
+    uint8_t axes;
+    uint8_t hypotheses;
+    uint16_t nodes;     /* of all hypotheses together */
+    const selfcal_axis_t *axis;             /* [axes] */
+    const selfcal_hypothesis_t *hypothesis; /* [hypotheses] */
+} selfcal_model_t;
+
+/* ------------------------------------------------------------------------------------------------------------- bank */
+
+typedef enum {
+    SELFCAL_OK = 0,
+    SELFCAL_BUSY = 1,            /* a report has more steps to go */
+    SELFCAL_TOO_SHORT = 2,       /* fewer bank samples than a report needs (SELFCAL_REPORT_MIN) */
+    SELFCAL_BAD_ARGUMENT = -1,   /* null pointer, axis or node out of range, sigma_v not positive */
+    SELFCAL_BAD_MODEL = -2,      /* tables contradict themselves or exceed a configured maximum */
+    SELFCAL_BAD_MEMORY = -3      /* too small, or not aligned to 8 bytes */
+} selfcal_status_t;
+
+/* Monotonic since selfcal_init(). */
+typedef struct {
+    uint64_t samples;       /* pushed and used */
+    uint64_t missing;       /* told by selfcal_skip() */
+    uint32_t gaps;          /* runs of missing or rejected samples */
+    uint32_t blocks_lost;   /* bank intervals without a value: fewer than half of their samples were usable */
+    uint32_t blocks_part;   /* bank intervals averaged from part of their samples */
+    uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
+    uint32_t saturated[SELFCAL_AXES_MAX];
+    uint32_t stuck[SELFCAL_AXES_MAX];
+} selfcal_counters_t;
+
+/* One filter: the gain side, shared by all axes because covariances do not depend on the data. Relative to sigma_v.
+ * Private; here so that the caller can size it. */
+typedef struct {
+    selfcal_real_t beta;  /* 1 - phi */
+    selfcal_real_t q;     /* drift variance added per interval */
+    selfcal_real_t p_inf; /* predicted variance once converged */
+    selfcal_real_t c;     /* phi^2 / (1 + p_inf): contraction of d */
+    selfcal_real_t d;     /* predicted variance less p_inf; exactly 0 once converged */
+    selfcal_real_t u;     /* innovation of the regressor "1" at the next sample */
+    uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
+    selfcal_wide_t a;     /* sum u^2 / s */
+    selfcal_wide_t ln_s;  /* sum ln s of the other samples */
+} selfcal_node_t;
+
+/* Bytes of memory selfcal_init() needs: for each node in the float build, 48 and 28 more per axis. */
+#define SELFCAL_SIZE(nodes, axes) \
+    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_wide_t) + 3U * sizeof(selfcal_real_t))))
+
+/* Private; declared here so that the caller can place it. */
+typedef struct {
+    const selfcal_model_t *model;
+    selfcal_node_t *node;    /* [nodes] */
+    selfcal_wide_t *b, *c;   /* [nodes][axes]: sums u nu / s and nu^2 / s */
+    selfcal_real_t *x;       /* [nodes][axes]: predicted drift of the zero-bias filter */
+    selfcal_real_t *b_block, *c_block; /* [nodes][axes]: the last few samples' share, not yet in b and c */
+    uint32_t in_block;       /* bank samples in b_block, c_block */
+    uint32_t n;              /* bank samples in all sums */
+    selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
+    selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
+    /* batch */
+    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
+    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over that of a whole block */
+    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
+    uint32_t pending_gap;            /* ... and after the last */
+    uint32_t in_batch;
+    /* averager */
+    bool started;
+    float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
+    selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
+    float first[SELFCAL_AXES_MAX];           /* this block's first sample: its sums are taken about it */
+    selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX];
+    uint32_t position, used; /* samples of this block: passed, and usable */
+    selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
+    uint64_t within_dof;
+    float last[SELFCAL_AXES_MAX];
+    uint32_t equal[SELFCAL_AXES_MAX];
+    bool in_gap;
+    selfcal_counters_t counters;
+} selfcal_t;
+
+/* Prepares `self` over `memory` (SELFCAL_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
+ * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
+selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
+
+/* One sample of every axis, in the model's axis order, in the model's units. A value that is not finite, at the range limit
+ * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes); every
+ * block * SELFCAL_BATCH samples O(nodes * axes * SELFCAL_BATCH). */
+selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
+
+/* `count` samples are missing. The prediction over the gap is exact, however long it is. A block with half or more of its
+ * samples counts as their mean with its variance raised by block / used; one with fewer is dropped. */
+selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
+
+/* Bank samples in the sums, those of the current batch included. */
+uint32_t selfcal_count(const selfcal_t *self);
+
+const selfcal_counters_t *selfcal_counters(const selfcal_t *self);
+
+/* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1 or before the first whole block.
+ * White noise would make it sigma_v * sqrt(block): more says coloured noise or vibration within the blocks. */
+float selfcal_within_sd(const selfcal_t *self, uint8_t axis);
+
+/* Offset (unit) that is taken off an axis before the filters: its first bank sample. */
+selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis);
+
+/* What one node knows of one axis, for tests and tools; folds the batch first, hence not const. */
+typedef struct {
+    selfcal_law_t law;
+    selfcal_wide_t ln_rho, ln_alpha; /* the node; NaN where the law has none */
+    selfcal_wide_t a, b, c, ln_s;      /* sums of bank.md: A, B, C about the offset, and D */
+    selfcal_wide_t drift;     /* at the last interval, if x0 were the offset */
+    selfcal_wide_t bias_left; /* change of x0 + drift at the last interval per unit of x0 */
+    selfcal_wide_t drift_var; /* variance of the drift there, given x0, over sigma_v^2 */
+} selfcal_node_view_t;
+selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
+
+/* Exact ln p(Y | node, sigma_v) of everything pushed on one axis, x0 integrated out; sigma_v in unit per bank interval. */
+selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v, selfcal_wide_t *ln_p);
+
+/* ----------------------------------------------------------------------------------------------------------- report */
+
+/* Bank samples below which no report is made. */
+#define SELFCAL_REPORT_MIN 3
+
+enum {
+    SELFCAL_IDENTIFIED = 1,   /* sd of ln(parameter) is below half its prior's, and neither limit holds it */
+    SELFCAL_AT_MIN = 2,       /* more than 5 % of the posterior lies in the lowest 2 % of the prior's ln range */
+    SELFCAL_AT_MAX = 4,       /* likewise at the top */
+    SELFCAL_OFF_GRID = 8      /* more than 1 % of the posterior lies beyond the last node: extrapolated */
+};
+
+typedef struct {
+    float mean, sd, median, q05, q95; /* units as above */
+    uint8_t flags;
+} selfcal_estimate_t;
+
+typedef struct {
+    float probability;
+    selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
+    selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
+    float bias_mean, bias_sd;   /* x0 + drift now, under this hypothesis, unit */
+} selfcal_posterior_t;
+
+typedef struct {
+    uint8_t axis;
+    uint32_t n;                /* bank samples it rests on */
+    float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit */
+    selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
+} selfcal_report_t;
+
+#define SELFCAL_HISTOGRAM 128
+#define SELFCAL_SIGMA_CELLS 24
+
+/* Scratch of a report under way. Private; may be shared by all axes and reused. */
+typedef struct {
+    selfcal_t *bank;
+    uint8_t axis, hypothesis, stage, pass;
+    uint16_t row, first_node;
+    /* of the hypothesis in hand */
+    selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
+    selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
+    bool refined;            /* the expectation is about the peak, no longer about the best node */
+    selfcal_real_t truth[2]; /* drift variance over sigma_v^2 and 1 - pole that the expectation supposes */
+    selfcal_real_t ln_v_peak;
+    selfcal_wide_t values[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];
+    selfcal_real_t profile[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* B-spline coefficients of the profile ln-likelihood ... */
+    selfcal_real_t ln_sigma[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of ln of sigma_v's conditional mode, both less their expectation */
+    selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function */
+    /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
+    selfcal_real_t lo[2], width[2];
+    selfcal_real_t limit_lo[2], limit_hi[2];
+    selfcal_real_t found_lo[2], found_hi[2];
+    selfcal_real_t best, best_at[2], best_ln[SELFCAL_PARAMETERS];
+    selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
+    selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
+    uint8_t basis_first[SELFCAL_REPORT_CELLS];
+    /* sigma_v cells: offsets in ln from the conditional mode, with their weights */
+    selfcal_real_t delta[SELFCAL_SIGMA_CELLS], delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS], delta_width;
+    /* posterior sums */
+    selfcal_wide_t mass, off_grid, sigma_sq;
+    selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
+    selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+} selfcal_work_t;
+
+/* Starts a report on one axis. Do not push or skip between this and the last step. SELFCAL_TOO_SHORT if there are too few samples. */
+selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
+
+/* One slice of it. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. */
+selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);
+
+/* All steps in a row. */
+selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
+
+/* -------------------------------------------------------------------------------------------------------- telemetry
+ * Reports as classical CAN frames of 8 bytes with 11-bit ids. selfcal.dbc describes every item, its unit and its bits, and
+ * is the one source of selfcal_frames.h and of the decoders. Each frame carries one value and its item number, a counter
+ * over all frames of the module, the module time in whole seconds modulo 256, and a CRC-12.
+ * Frames must reach the wire in the order they are made (bxCAN: set TXFP). */
+
+typedef struct {
+    uint16_t id; /* 11 bits */
+    uint8_t length;
+    uint8_t data[8];
+} selfcal_frame_t;
+
+/* What the module does, for its status: finished once no sample will follow. */
+typedef enum { SELFCAL_RUNNING, SELFCAL_FINISHED } selfcal_state_t;
+
+/* Private; declared here so that the caller can place it. */
+typedef struct {
+    const selfcal_model_t *model;
+    uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
+    uint8_t of_law[SELFCAL_LAWS];      /* hypothesis with that law; SELFCAL_HYPOTHESES_MAX: none */
+    /* source of the frames under way: a report, or the status if NULL */
+    const selfcal_report_t *report;
+    const selfcal_counters_t *counters;
+    selfcal_wide_t ln_best;
+    uint32_t report_number;
+    uint32_t time_ms;
+    selfcal_state_t state;
+    uint8_t item;  /* to look at next */
+    uint8_t items; /* past the last one: 0 with nothing under way */
+    uint8_t made;  /* frames of this report or status */
+    uint32_t frames; /* made since selfcal_telemetry_init() */
+} selfcal_telemetry_t;
+
+/* `axis_name[]`: the name of each axis of the model, which chooses its message: gx gy gz (deg/s), ax ay az (m/s^2). The
+ * model's units must be those. SELFCAL_BAD_ARGUMENT on a null pointer; SELFCAL_BAD_MODEL if a name has no message or comes
+ * twice, or if two hypotheses share a law. */
+selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal_model_t *model,
+                                        const char *const axis_name[]);
+
+/* Sends one axis's report next, about 44 frames. `time_ms`: module time since its start, modulo 2^32, later than that of
+ * the axis's last report. `report` and `counters` must stay, the report unchanged, until selfcal_telemetry_next() says
+ * false. SELFCAL_BUSY, and nothing changes, while frames are still to be fetched. */
+selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
+                                          const selfcal_counters_t *counters, uint32_t time_ms);
+
+/* Sends the status next, 16 frames; otherwise as selfcal_telemetry_report(). */
+selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
+                                          selfcal_state_t state, uint32_t report_number, uint32_t time_ms);
+
+/* Makes the next frame; false when there is none. O(1). */
+bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame);
+
+/* CRC-12/CDMA2000: polynomial 0xF13, initial value 0xFFF, most significant bit first. */
+uint16_t selfcal_crc12(const uint8_t *data, size_t length);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
