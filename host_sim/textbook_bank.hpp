@@ -1,0 +1,67 @@
+// The bank of Kalman filters as printed in Stepanov & Motorin, IFAC-PapersOnLine 50-1 (2017) 2830-2835: double
+// precision, the bias a filter state, one full filter per node, a covariance at every step. It is what lib/ is measured
+// against, so it takes none of lib/'s short cuts and shares no code with it. Equation numbers are the paper's.
+//
+// One axis, sampled every dt:  y_i = x0 + x_i + v_i  (22),  x0 ~ N(bias mean, P0),  v_i ~ N(0, r_i sigma_v^2).
+// Two deviations from the print:
+//   - the Gauss-Markov noise gain is the exact sigma_m sqrt(1 - phi^2); the printed one,
+//     sigma_m sqrt(2 / (alpha dt)) (1 - phi), is (alpha dt)^2 / 24 off it, relatively;
+//   - the covariance update has Joseph's form: algebraically the same, and P0 >> sigma_v^2 does not cancel in it.
+#pragma once
+
+#include <Eigen/Core>
+
+#include <array>
+#include <cstddef>
+#include <vector>
+
+namespace selfcal_reference {
+
+enum class Law { constant = 0, random_walk = 1, gauss_markov = 2 };
+constexpr std::size_t laws = 3;
+
+// One value theta^kj of the parameters of hypothesis k.
+struct Node {
+    Law law;
+    double drift;   // random walk: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; constant: not used
+    double alpha;   // Gauss-Markov only, 1/s
+    double sigma_v; // unit, per sample
+};
+
+// One axis of a recording. A sample that is NaN is missing: the filter predicts over it.
+struct Record {
+    const double *y; // [n] unit
+    const double *r; // [n] factor on sigma_v^2, or null for 1
+    std::size_t n;
+    double dt_s;
+    double bias_mean, bias_sd; // prior of x0, unit
+};
+
+// What a filter knows after its last sample: ln p(Y | h_k, theta_kj), and the state [drift; x0] given them.
+struct Filtered {
+    double ln_p;
+    Eigen::Vector2d mean;
+    Eigen::Matrix2d covariance;
+};
+
+// One filter over the whole record. If `standardized` is not null it receives nu_i / sqrt(s_i) [n], NaN where missing.
+Filtered run_filter(const Record &record, const Node &node, double *standardized = nullptr);
+
+// run_filter() for every node, spread over the machine's cores.
+std::vector<Filtered> run_filters(const Record &record, const std::vector<Node> &nodes);
+
+// Posterior of the whole bank after one sample. A hypothesis of probability 0 has NaN moments.
+struct Posterior {
+    std::vector<double> weight;                   // [nodes], sum 1: mu_i^kj Pr(H = h_k | Y_i)          (11), (13)
+    std::array<double, laws> probability;         //                                                     (13)
+    std::array<Eigen::Vector3d, laws> mean;       // of (drift, alpha, sigma_v) under each hypothesis    (12)
+    std::array<Eigen::Matrix3d, laws> covariance; //                                                     (14)
+    std::array<double, laws> bias_mean, bias_var; // of x0 + x_i under each hypothesis                   (12), (14)
+};
+
+// The bank at chosen samples. `ln_prior` [nodes] is ln(mu_0^kj Pr(H = h_k)) up to one constant; `after` [m] ascending,
+// each the number of samples seen, 0 to n.
+std::vector<Posterior> run_bank(const Record &record, const std::vector<Node> &nodes,
+                                const std::vector<double> &ln_prior, const std::vector<std::size_t> &after);
+
+} // namespace selfcal_reference
