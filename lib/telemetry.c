@@ -1,0 +1,321 @@
+/* Reports and status as frames. Items, bits and scales: selfcal_frames.h, made from selfcal.dbc. */
+#include "selfcal.h"
+#include "selfcal_frames.h"
+
+#include <math.h>
+#include <string.h>
+
+enum { STATISTICS = 5 }; /* mean, median, sd, q05, q95: items in this order */
+
+static const struct {
+    const char *name;
+    uint16_t id;
+} message_table[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_TABLE;
+
+/* The estimates on the wire: whose they are, the item of the mean, and the place of the flags. */
+static const struct {
+    uint8_t law, parameter, first_item, flags_shift;
+} estimate_table[] = {
+    {SELFCAL_CONSTANT, SELFCAL_N, SELFCAL_AXIS_CONSTANT_N_MEAN, SELFCAL_AXIS_CONSTANT_N_FLAGS_SHIFT},
+    {SELFCAL_RANDOM_WALK, SELFCAL_N, SELFCAL_AXIS_RANDOM_WALK_N_MEAN, SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_SHIFT},
+    {SELFCAL_RANDOM_WALK, SELFCAL_K, SELFCAL_AXIS_RANDOM_WALK_K_MEAN, SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_SHIFT},
+    {SELFCAL_GAUSS_MARKOV, SELFCAL_N, SELFCAL_AXIS_GAUSS_MARKOV_N_MEAN, SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_SHIFT},
+    {SELFCAL_GAUSS_MARKOV, SELFCAL_SIGMA_M, SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEAN,
+     SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS_SHIFT},
+    {SELFCAL_GAUSS_MARKOV, SELFCAL_ALPHA, SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEAN,
+     SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS_SHIFT},
+};
+enum { ESTIMATES = sizeof estimate_table / sizeof estimate_table[0] };
+
+uint16_t selfcal_crc12(const uint8_t *data, size_t length)
+{
+    uint32_t crc = 0xFFFU;
+    for (size_t i = 0; i < length; i++) {
+        crc ^= (uint32_t)data[i] << 4;
+        for (int bit = 0; bit < 8; bit++) {
+            crc = (crc << 1) ^ ((crc & 0x800U) != 0U ? 0xF13U : 0U);
+        }
+        crc &= 0xFFFU;
+    }
+    return (uint16_t)crc;
+}
+
+static uint32_t float_bits(float value)
+{
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+/* `value` in steps of 1 / `per_unit` as a 32-bit two's complement number, held at its ends. NaN: the lower end. */
+static uint32_t scaled_bits(selfcal_wide_t value, selfcal_wide_t per_unit)
+{
+    const selfcal_wide_t scaled = floor(value * per_unit + 0.5);
+    int32_t held;
+    if (scaled >= (selfcal_wide_t)INT32_MAX) {
+        held = INT32_MAX;
+    } else if (scaled > (selfcal_wide_t)INT32_MIN) {
+        held = (int32_t)scaled;
+    } else {
+        held = INT32_MIN;
+    }
+    return (uint32_t)held;
+}
+
+static uint32_t held_count(uint64_t count)
+{
+    return count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
+}
+
+selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal_model_t *model,
+                                        const char *const axis_name[])
+{
+    if (self == NULL || model == NULL || axis_name == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (model->axes > SELFCAL_AXES_MAX || model->hypotheses > SELFCAL_HYPOTHESES_MAX) {
+        return SELFCAL_BAD_MODEL;
+    }
+    memset(self, 0, sizeof *self);
+    self->model = model;
+    for (uint8_t axis = 0; axis < model->axes; axis++) {
+        uint8_t found = 0;
+        while (found < SELFCAL_FRAME_AXES && strcmp(axis_name[axis], message_table[found].name) != 0) {
+            found++;
+        }
+        if (found == SELFCAL_FRAME_AXES) {
+            return SELFCAL_BAD_MODEL;
+        }
+        for (uint8_t other = 0; other < axis; other++) {
+            if (self->message[other] == found) {
+                return SELFCAL_BAD_MODEL;
+            }
+        }
+        self->message[axis] = found;
+    }
+    memset(self->of_law, SELFCAL_HYPOTHESES_MAX, sizeof self->of_law);
+    for (uint8_t k = 0; k < model->hypotheses; k++) {
+        const selfcal_law_t law = model->hypothesis[k].law;
+        if ((unsigned)law >= SELFCAL_LAWS || self->of_law[law] != SELFCAL_HYPOTHESES_MAX) {
+            return SELFCAL_BAD_MODEL;
+        }
+        self->of_law[law] = k;
+    }
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
+                                          const selfcal_counters_t *counters, uint32_t time_ms)
+{
+    if (self == NULL || report == NULL || counters == NULL || report->axis >= self->model->axes) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (self->items != 0) {
+        return SELFCAL_BUSY;
+    }
+    self->report = report;
+    self->counters = counters;
+    self->time_ms = time_ms;
+    self->ln_best = report->hypothesis[0].ln_evidence;
+    for (uint8_t k = 1; k < self->model->hypotheses; k++) {
+        if (report->hypothesis[k].ln_evidence > self->ln_best) {
+            self->ln_best = report->hypothesis[k].ln_evidence;
+        }
+    }
+    self->item = 0;
+    self->made = 0;
+    self->items = SELFCAL_AXIS_END_ITEMS + 1;
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
+                                          selfcal_state_t state, uint32_t report_number, uint32_t time_ms)
+{
+    if (self == NULL || counters == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (self->items != 0) {
+        return SELFCAL_BUSY;
+    }
+    self->report = NULL;
+    self->counters = counters;
+    self->state = state;
+    self->report_number = report_number;
+    self->time_ms = time_ms;
+    self->item = 0;
+    self->made = 0;
+    self->items = SELFCAL_STATUS_FRAMES_SENT + 1;
+    return SELFCAL_OK;
+}
+
+/* The posterior under a law; NULL if the model has no such hypothesis. */
+static const selfcal_posterior_t *posterior(const selfcal_telemetry_t *self, uint8_t law)
+{
+    const uint8_t k = self->of_law[law];
+    return k < self->model->hypotheses ? &self->report->hypothesis[k] : NULL;
+}
+
+static bool probability_value(const selfcal_telemetry_t *self, uint8_t law, uint32_t *value)
+{
+    const selfcal_posterior_t *p = posterior(self, law);
+    if (p == NULL) {
+        return false;
+    }
+    *value = float_bits(p->probability);
+    return true;
+}
+
+static bool evidence_value(const selfcal_telemetry_t *self, uint8_t law, selfcal_wide_t per_unit, uint32_t *value)
+{
+    const selfcal_posterior_t *p = posterior(self, law);
+    if (p == NULL) {
+        return false;
+    }
+    *value = scaled_bits(p->ln_evidence - self->ln_best, per_unit);
+    return true;
+}
+
+static uint32_t health_value(const selfcal_telemetry_t *self)
+{
+    const selfcal_counters_t *c = self->counters;
+    const uint8_t axis = self->report->axis;
+    return (c->not_finite[axis] != 0 ? 1U << SELFCAL_AXIS_NOT_FINITE_SHIFT : 0U) |
+           (c->saturated[axis] != 0 ? 1U << SELFCAL_AXIS_SATURATED_SHIFT : 0U) |
+           (c->stuck[axis] != 0 ? 1U << SELFCAL_AXIS_STUCK_SHIFT : 0U) |
+           (c->gaps != 0 ? 1U << SELFCAL_AXIS_GAPS_SHIFT : 0U) |
+           (c->blocks_lost != 0 ? 1U << SELFCAL_AXIS_BLOCKS_LOST_SHIFT : 0U);
+}
+
+static uint32_t estimate_flags_value(const selfcal_telemetry_t *self)
+{
+    uint32_t flags = 0;
+    for (size_t e = 0; e < ESTIMATES; e++) {
+        const selfcal_posterior_t *p = posterior(self, estimate_table[e].law);
+        if (p != NULL) {
+            flags |= (uint32_t)p->parameter[estimate_table[e].parameter].flags << estimate_table[e].flags_shift;
+        }
+    }
+    return flags;
+}
+
+static bool estimate_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
+{
+    for (size_t e = 0; e < ESTIMATES; e++) {
+        const uint8_t first = estimate_table[e].first_item;
+        if (item >= first && item < first + STATISTICS) {
+            const selfcal_posterior_t *p = posterior(self, estimate_table[e].law);
+            if (p == NULL) {
+                return false;
+            }
+            const selfcal_estimate_t *x = &p->parameter[estimate_table[e].parameter];
+            const float statistic[STATISTICS] = {x->mean, x->median, x->sd, x->q05, x->q95};
+            *value = float_bits(statistic[item - first]);
+            return true;
+        }
+    }
+    return false;
+}
+
+/* The value of an axis item; false if this model does not have it. */
+static bool axis_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
+{
+    const selfcal_report_t *r = self->report;
+    switch (item) {
+    case SELFCAL_AXIS_TIME_MS: *value = self->time_ms; return true;
+    case SELFCAL_AXIS_COUNT: *value = r->n; return true;
+    case SELFCAL_AXIS_NOT_FINITE: *value = health_value(self); return true;
+    case SELFCAL_AXIS_LN_EVIDENCE: *value = float_bits((float)self->ln_best); return true;
+    case SELFCAL_AXIS_BIAS_MEAN: *value = float_bits(r->bias_mean); return true;
+    case SELFCAL_AXIS_BIAS_SD: *value = float_bits(r->bias_sd); return true;
+    case SELFCAL_AXIS_CONSTANT_PROBABILITY: return probability_value(self, SELFCAL_CONSTANT, value);
+    case SELFCAL_AXIS_RANDOM_WALK_PROBABILITY: return probability_value(self, SELFCAL_RANDOM_WALK, value);
+    case SELFCAL_AXIS_GAUSS_MARKOV_PROBABILITY: return probability_value(self, SELFCAL_GAUSS_MARKOV, value);
+    case SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF:
+        return evidence_value(self, SELFCAL_CONSTANT, SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF_PER_UNIT, value);
+    case SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF:
+        return evidence_value(self, SELFCAL_RANDOM_WALK, SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF_PER_UNIT, value);
+    case SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF:
+        return evidence_value(self, SELFCAL_GAUSS_MARKOV, SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF_PER_UNIT, value);
+    case SELFCAL_AXIS_CONSTANT_N_FLAGS: *value = estimate_flags_value(self); return true;
+    case SELFCAL_AXIS_END_ITEMS:
+        *value = (self->time_ms & SELFCAL_AXIS_END_TIME_MS_MASK) << SELFCAL_AXIS_END_TIME_MS_SHIFT |
+                 (self->made + 1U) << SELFCAL_AXIS_END_ITEMS_SHIFT;
+        return true;
+    default: return estimate_value(self, item, value);
+    }
+}
+
+static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t count[])
+{
+    uint64_t sum = 0;
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        sum += count[axis];
+    }
+    return held_count(sum);
+}
+
+static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
+{
+    const selfcal_counters_t *c = self->counters;
+    switch (item) {
+    case SELFCAL_STATUS_TIME_MS: return self->time_ms;
+    case SELFCAL_STATUS_WIRE_VERSION: return SELFCAL_FRAMES_VERSION;
+    case SELFCAL_STATUS_MODEL_ID: return self->model->id;
+    case SELFCAL_STATUS_BANK_INTERVAL: return float_bits(self->model->dt_s);
+    case SELFCAL_STATUS_BANK_BLOCK: return self->model->block;
+    case SELFCAL_STATUS_STATE:
+        return self->state == SELFCAL_FINISHED ? SELFCAL_STATUS_STATE_FINISHED : SELFCAL_STATUS_STATE_RUNNING;
+    case SELFCAL_STATUS_REPORT: return self->report_number;
+    case SELFCAL_STATUS_SAMPLES: return held_count(c->samples);
+    case SELFCAL_STATUS_MISSING: return held_count(c->missing);
+    case SELFCAL_STATUS_GAP_COUNT: return c->gaps;
+    case SELFCAL_STATUS_BLOCKS_LOST_COUNT: return c->blocks_lost;
+    case SELFCAL_STATUS_BLOCKS_PART_COUNT: return c->blocks_part;
+    case SELFCAL_STATUS_NOT_FINITE_COUNT: return sum_of_axes(self, c->not_finite);
+    case SELFCAL_STATUS_SATURATED_COUNT: return sum_of_axes(self, c->saturated);
+    case SELFCAL_STATUS_STUCK_COUNT: return sum_of_axes(self, c->stuck);
+    default: return self->frames; /* SELFCAL_STATUS_FRAMES_SENT */
+    }
+}
+
+static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t value, uint32_t counter, uint32_t time_ms)
+{
+    uint64_t bits = value;
+    bits |= (uint64_t)(item & SELFCAL_FRAME_ITEM_MASK) << SELFCAL_FRAME_ITEM_SHIFT;
+    bits |= (uint64_t)(counter & SELFCAL_FRAME_COUNTER_MASK) << SELFCAL_FRAME_COUNTER_SHIFT;
+    bits |= (uint64_t)((time_ms / 1000U) & SELFCAL_FRAME_TIME_MASK) << SELFCAL_FRAME_TIME_SHIFT;
+
+    frame->id = id;
+    frame->length = sizeof frame->data;
+    uint8_t covered[10] = {(uint8_t)(id >> 8), (uint8_t)id, sizeof frame->data};
+    for (unsigned i = 0; i < 7; i++) {
+        covered[3 + i] = (uint8_t)(bits >> (8U * i)); /* the crc's bits are still 0 */
+    }
+    bits |= (uint64_t)selfcal_crc12(covered, sizeof covered) << SELFCAL_FRAME_CRC_SHIFT;
+    for (unsigned i = 0; i < sizeof frame->data; i++) {
+        frame->data[i] = (uint8_t)(bits >> (8U * i));
+    }
+}
+
+bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame)
+{
+    while (self->item < self->items) {
+        const uint8_t item = self->item++;
+        uint16_t id = SELFCAL_FRAME_STATUS_ID;
+        uint32_t value;
+        if (self->report == NULL) {
+            value = status_value(self, item);
+        } else {
+            id = message_table[self->message[self->report->axis]].id;
+            if (!axis_value(self, item, &value)) {
+                continue;
+            }
+        }
+        pack(frame, id, item, value, self->frames, self->time_ms);
+        self->frames++;
+        self->made++;
+        return true;
+    }
+    self->items = 0;
+    return false;
+}

@@ -1,0 +1,32 @@
+/* SLCAN, the Lawicel text protocol: CAN frames over a serial line, as python-can's `slcan` and slcand speak it. This end
+ * is the adapter; its bus carries telemetry only, so commands that transmit are refused.
+ * No I/O here: bytes go in, bytes to write come out. */
+#ifndef SLCAN_H
+#define SLCAN_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "selfcal.h"
+
+#define SLCAN_FRAME_BYTES 22 /* "t" id(3) length(1) data(16) CR */
+#define SLCAN_ANSWER_BYTES 8
+
+typedef struct {
+    bool open;       /* frames may be sent */
+    uint8_t length;  /* of the line so far; 3 stands for any that is longer than a command */
+    char line[2];    /* no command that is accepted is longer */
+} slcan_t;
+
+void slcan_init(slcan_t *self);
+
+/* Takes one byte from the host. Returns how many bytes of `answer` are to be written back: 0 within a line. A line ends in
+ * CR. C closes; O and L open, also when open; S0 to S8 and an empty line are accepted and change nothing; V, v and N are
+ * answered; anything else is answered BEL. */
+size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]);
+
+/* The frame as a line, without a terminating zero. */
+void slcan_encode(const selfcal_frame_t *frame, char line[SLCAN_FRAME_BYTES]);
+
+#endif

@@ -1,0 +1,35 @@
+/* What the application needs of a target: one const struct of callbacks with their context. None of them may block for
+ * longer than the sensor's queue lasts. */
+#ifndef PORT_H
+#define PORT_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "selfcal.h"
+
+typedef enum {
+    PORT_SAMPLE, /* one was taken from the queue */
+    PORT_EMPTY,  /* none is waiting */
+    PORT_END     /* none will follow: the end of a recording */
+} port_sample_t;
+
+typedef struct {
+    void *context;
+
+    /* Time since start, ms, modulo 2^32. */
+    uint32_t (*time_ms)(void *context);
+
+    /* Takes the oldest waiting sample: one reading per axis in the model's order and units, and how many samples are
+     * missing just before it. The port queues samples while a report is worked out. */
+    port_sample_t (*sample)(void *context, float reading[], uint32_t *missing);
+
+    /* Takes a frame for the wire, in order; false: no room, the same frame is offered again later. With nobody listening
+     * the port takes frames and drops them. */
+    bool (*send)(void *context, const selfcal_frame_t *frame);
+
+    /* Nothing to do until the next sample or until the wire has room: sleep. */
+    void (*idle)(void *context);
+} port_t;
+
+#endif
