@@ -1,0 +1,137 @@
+# selfcal. On a fresh machine each of these does its own set-up first:
+#   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
+#   make test                   everything that is checked; ends with `N passed, N failed`
+#   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
+# Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
+
+PYTHON ?= python3
+BUILD := build
+VENV := .venv
+BIN := $(VENV)/bin
+RECORDING ?= tests/data/simulated_adis16405.npz
+
+.DELETE_ON_ERROR:
+.PHONY: all setup system python run posix test c-tests check clean
+
+all: setup
+
+# ------------------------------------------------------------------------------------------------------------- set-up
+
+UNITY_ROOT ?= $(BUILD)/unity
+UNITY := $(UNITY_ROOT)/unity.c
+PACKAGE := $(VENV)/package.stamp
+MODEL := $(BUILD)/model
+
+setup: system python $(UNITY)
+
+system:
+	@PYTHON="$(PYTHON)" tools/setup/system.sh
+
+python: $(PACKAGE)
+
+$(VENV)/requirements.stamp: tools/requirements.txt | system
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --requirement tools/requirements.txt
+	@touch $@
+
+# Installed in place: Python sources need no new set-up, C and C++ ones do.
+$(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt $(wildcard tools/bindings/*) \
+            $(wildcard host_sim/*) $(wildcard lib/*.[ch])
+	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --editable tools
+	@touch $@
+
+ifeq ($(UNITY_ROOT),$(BUILD)/unity)
+$(UNITY): tools/setup/unity.py | system
+	$(PYTHON) tools/setup/unity.py $(UNITY_ROOT)
+	@touch $@
+endif
+
+$(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
+
+# ---------------------------------------------------------------------------------------------------------------- run
+
+run: setup
+	@mkdir -p $(BUILD)/run
+	$(BIN)/selfcal replay $(RECORDING) --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png
+
+# The firmware for this machine, of the default model; `selfcal replay` builds its own for each recording's rate.
+posix: $(MODEL)/selfcal_model.c
+	@$(MAKE) --no-print-directory -f port/posix/posix.mk posix MODEL_DIR=$(MODEL) OUT=$(BUILD)/posix
+
+# -------------------------------------------------------------------------------------------------------------- tests
+
+WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
+INCLUDES := -Ilib -Iport -Iport/app -I$(MODEL)
+TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
+TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
+TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
+TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
+
+test: setup
+	@$(BIN)/python tests/run.py
+
+c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED)
+
+# One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
+$(BUILD)/c/plain/%: C := -O2
+$(BUILD)/c/sanitized/%: C := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+define C_TESTS
+$(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
+	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
+	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(WARNINGS) $(INCLUDES:-I%=-I$(CURDIR)/%) -c $(TESTED:%=$(CURDIR)/%)
+	$(CC) $$(C) -c $(UNITY) -o $$(@D)/objects/unity.o
+	$(AR) -rcs $$@ $$(@D)/objects/*.o
+$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(WARNINGS) $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
+endef
+$(eval $(call C_TESTS,plain))
+$(eval $(call C_TESTS,sanitized))
+
+# ------------------------------------------------------------------------------------------------------------- checks
+
+CHECKS := check-gcc check-clang check-arm check-c++ check-tidy check-tokens check-ruff check-mypy
+.PHONY: $(CHECKS)
+check: setup
+	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
+
+C_ALL := $(wildcard lib/*.c port/*/*.c) $(MODEL)/selfcal_model.c
+# each COMPILER+FLAGS,FILES: every file by itself, so that every complaint is seen
+each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$failed
+
+check-gcc: $(MODEL)/selfcal_model.c
+	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
+	$(call each,gcc -std=c99 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) $(INCLUDES) -DSELFCAL_REAL_DOUBLE -c -o /dev/null,$(C_ALL))
+
+check-clang: $(MODEL)/selfcal_model.c
+	$(call each,clang -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
+
+# The library as a Cortex-M4F and a Cortex-M0 get it.
+ARM := arm-none-eabi-gcc -std=c99 -O2 $(WARNINGS) -Ilib -c -o /dev/null
+check-arm:
+	$(call each,$(ARM) -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard,$(wildcard lib/*.c))
+	$(call each,$(ARM) -mcpu=cortex-m0 -mthumb,$(wildcard lib/*.c))
+
+check-c++:
+	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
+
+check-tidy: $(MODEL)/selfcal_model.c
+	@clang-tidy --quiet $(wildcard lib/*.c port/*/*.c) -- -std=c99 $(INCLUDES) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
+
+# lib/ has no heap, no I/O and no double but selfcal_wide_t. Comments do not count.
+BANNED := (malloc|calloc|realloc|free|alloca|[a-z]*printf|puts|putchar|fopen|exit|abort)[[:space:]]*\(
+check-tokens:
+	@failed=0; for file in lib/*.[ch]; do \
+	    gcc -fpreprocessed -dD -E -P $$file 2>/dev/null > $(BUILD)/tokens; \
+	    if grep -nE '\<$(BANNED)' $(BUILD)/tokens || grep -nE '\<double\>' $(BUILD)/tokens | grep -vE 'typedef double (selfcal_wide_t|selfcal_real_t);'; \
+	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
+
+check-ruff: $(PACKAGE)
+	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests
+
+check-mypy: $(PACKAGE)
+	@cd tools && ../$(BIN)/mypy --no-error-summary
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py
+
+clean:
+	rm -rf $(BUILD)

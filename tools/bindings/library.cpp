@@ -1,0 +1,212 @@
+// The C library as Python sees it: one class over selfcal_t that owns its memory and tables. Compiled twice from the same
+// sources, as _library32 (the float of the firmware) and _library64 (-DSELFCAL_REAL_DOUBLE, to tell rounding from method).
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "selfcal.h"
+
+namespace nb = nanobind;
+using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
+using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
+using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>>;
+
+// Not an anonymous namespace: two builds of one name in one process would be the same type to nanobind.
+namespace MODULE_NAME {
+
+struct Grid {
+    explicit Grid(const GridTuple &t) : fit(std::get<1>(t)), grid{std::get<0>(t), fit.data()} {
+        if (fit.size() != size_t{grid.nodes} * grid.nodes)
+            throw std::invalid_argument("the spline matrix does not fit its nodes");
+    }
+    std::vector<double> fit;
+    selfcal_grid_t grid;
+};
+
+class Bank {
+public:
+    Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses) {
+        for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
+            selfcal_axis_t axis{};
+            if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || uniform.size() != SELFCAL_PARAMETERS)
+                throw std::invalid_argument("an axis needs one prior a parameter");
+            for (size_t p = 0; p < SELFCAL_PARAMETERS; p++)
+                axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]), uniform[p]};
+            axis.bias_sd = static_cast<float>(bias_sd);
+            axis.range = static_cast<float>(range);
+            axis.stuck_limit = stuck;
+            axes_.push_back(axis);
+        }
+        size_t nodes = 0;
+        for (const auto &[law, ln_probability, rho, alpha] : hypotheses) {
+            selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha)};
+            nodes += size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
+            hypotheses_.push_back(h);
+        }
+        model_ = {0,
+                  static_cast<float>(dt_s),
+                  block,
+                  static_cast<uint8_t>(axes_.size()),
+                  static_cast<uint8_t>(hypotheses_.size()),
+                  static_cast<uint16_t>(nodes),
+                  axes_.data(),
+                  hypotheses_.data()};
+        if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
+            throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
+        memory_.resize(SELFCAL_SIZE(nodes, axes_.size()) / sizeof(double) + 1);
+        check(selfcal_init(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double)));
+    }
+    Bank(const Bank &) = delete;
+    Bank &operator=(const Bank &) = delete;
+
+    void push(const nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu> &samples,
+              const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before) {
+        if (samples.shape(1) != axes_.size() || missing_before.shape(0) != samples.shape(0))
+            throw std::invalid_argument("samples must be [n, axes] and missing_before [n]");
+        nb::gil_scoped_release release;
+        for (size_t i = 0; i < samples.shape(0); i++) {
+            if (missing_before.data()[i] > 0)
+                check(selfcal_skip(&bank_, missing_before.data()[i]));
+            check(selfcal_push(&bank_, samples.data() + i * axes_.size()));
+        }
+    }
+
+    nb::dict report(uint8_t axis) {
+        selfcal_report_t r{};
+        {
+            nb::gil_scoped_release release;
+            check(selfcal_report(work_.get(), &bank_, axis, &r));
+        }
+        nb::list hypotheses;
+        for (size_t h = 0; h < hypotheses_.size(); h++) {
+            const selfcal_posterior_t &p = r.hypothesis[h];
+            nb::list parameters;
+            for (const selfcal_estimate_t &e : p.parameter)
+                parameters.append(nb::make_tuple(e.mean, e.median, e.sd, e.q05, e.q95, e.flags));
+            nb::dict d;
+            d["probability"] = p.probability;
+            d["ln_evidence"] = p.ln_evidence;
+            d["parameters"] = parameters;
+            d["bias_mean"] = p.bias_mean;
+            d["bias_sd"] = p.bias_sd;
+            hypotheses.append(d);
+        }
+        nb::dict out;
+        out["n"] = r.n;
+        out["bias_mean"] = r.bias_mean;
+        out["bias_sd"] = r.bias_sd;
+        out["hypotheses"] = hypotheses;
+        return out;
+    }
+
+    nb::dict node(uint8_t axis, uint16_t index) {
+        selfcal_node_view_t v{};
+        check(selfcal_node(&bank_, axis, index, &v));
+        nb::dict d;
+        d["law"] = static_cast<int>(v.law);
+        d["ln_rho"] = v.ln_rho;
+        d["ln_alpha"] = v.ln_alpha;
+        d["a"] = v.a;
+        d["b"] = v.b;
+        d["c"] = v.c;
+        d["ln_s"] = v.ln_s;
+        d["drift"] = v.drift;
+        d["bias_left"] = v.bias_left;
+        d["drift_var"] = v.drift_var;
+        return d;
+    }
+
+    double log_likelihood(uint8_t axis, uint16_t node, double sigma_v) {
+        double ln_p = 0.0;
+        check(selfcal_log_likelihood(&bank_, axis, node, sigma_v, &ln_p));
+        return ln_p;
+    }
+
+    nb::dict counters() const {
+        const selfcal_counters_t *c = selfcal_counters(&bank_);
+        const size_t axes = axes_.size();
+        auto list = [axes](const uint32_t *values) { return std::vector<uint32_t>(values, values + axes); };
+        nb::dict d;
+        d["samples"] = c->samples;
+        d["missing"] = c->missing;
+        d["gaps"] = c->gaps;
+        d["blocks_lost"] = c->blocks_lost;
+        d["blocks_part"] = c->blocks_part;
+        d["not_finite"] = list(c->not_finite);
+        d["saturated"] = list(c->saturated);
+        d["stuck"] = list(c->stuck);
+        return d;
+    }
+
+    uint32_t count() const { return selfcal_count(&bank_); }
+    uint16_t nodes() const { return model_.nodes; }
+    size_t size() const { return SELFCAL_SIZE(model_.nodes, model_.axes); }
+
+    float within_sd(uint8_t axis) const {
+        if (axis >= axes_.size())
+            throw std::invalid_argument("axis out of range");
+        return selfcal_within_sd(&bank_, axis);
+    }
+
+private:
+    const selfcal_grid_t *add(const std::optional<GridTuple> &t) {
+        if (!t)
+            return nullptr;
+        grids_.push_back(std::make_unique<Grid>(*t));
+        return &grids_.back()->grid;
+    }
+
+    static void check(selfcal_status_t status) {
+        switch (status) {
+        case SELFCAL_OK:
+            return;
+        case SELFCAL_TOO_SHORT:
+            throw std::length_error("too few bank samples for a report");
+        case SELFCAL_BAD_ARGUMENT:
+            throw std::invalid_argument("argument out of range");
+        case SELFCAL_BAD_MODEL:
+            throw std::invalid_argument("the model's tables contradict themselves or exceed what the library is built for");
+        default:
+            throw std::runtime_error("selfcal status " + std::to_string(static_cast<int>(status)));
+        }
+    }
+
+    std::vector<selfcal_axis_t> axes_;
+    std::vector<selfcal_hypothesis_t> hypotheses_;
+    std::vector<std::unique_ptr<Grid>> grids_;
+    std::vector<double> memory_;
+    selfcal_model_t model_{};
+    selfcal_t bank_{};
+    std::unique_ptr<selfcal_work_t> work_ = std::make_unique<selfcal_work_t>();
+};
+
+} // namespace MODULE_NAME
+
+NB_MODULE(MODULE_NAME, m) {
+    using MODULE_NAME::Bank;
+    m.attr("version") = SELFCAL_VERSION;
+    m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
+    m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
+    m.attr("AT_MIN") = static_cast<int>(SELFCAL_AT_MIN);
+    m.attr("AT_MAX") = static_cast<int>(SELFCAL_AT_MAX);
+    m.attr("OFF_GRID") = static_cast<int>(SELFCAL_OFF_GRID);
+    nb::class_<Bank>(m, "Bank")
+        .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &>())
+        .def("push", &Bank::push)
+        .def("report", &Bank::report)
+        .def("node", &Bank::node)
+        .def("log_likelihood", &Bank::log_likelihood)
+        .def("counters", &Bank::counters)
+        .def("within_sd", &Bank::within_sd)
+        .def_prop_ro("count", &Bank::count)
+        .def_prop_ro("nodes", &Bank::nodes)
+        .def_prop_ro("size", &Bank::size);
+}

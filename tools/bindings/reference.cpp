@@ -1,0 +1,218 @@
+// host_sim/ as Python sees it: the textbook bank and the simulator. Arrays are described in selfcal/_reference.pyi.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <cmath>
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "random.hpp"
+#include "simulator.hpp"
+#include "textbook_bank.hpp"
+
+namespace nb = nanobind;
+namespace sr = selfcal_reference;
+
+namespace {
+
+using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Laws = nb::ndarray<const int, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+// A numpy array that owns what it is filled with.
+template <typename T> class Array {
+public:
+    explicit Array(std::vector<std::size_t> shape) : shape_(std::move(shape)) {
+        for (const std::size_t n : shape_)
+            size_ *= n;
+        data_ = new T[size_ > 0 ? size_ : 1];
+        owner_ = nb::capsule(data_, [](void *p) noexcept { delete[] static_cast<T *>(p); });
+    }
+    T *data() const { return data_; }
+    nb::ndarray<nb::numpy, T> numpy() const { return {data_, shape_.size(), shape_.data(), owner_}; }
+
+private:
+    std::vector<std::size_t> shape_;
+    std::size_t size_ = 1;
+    T *data_;
+    nb::capsule owner_;
+};
+
+using Output = nb::ndarray<nb::numpy, double>;
+
+sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, double bias_mean, double bias_sd) {
+    if (r && r->shape(0) != y.shape(0))
+        throw std::invalid_argument("r must have the length of y");
+    if (!(dt_s > 0.0) || !(bias_sd >= 0.0) || !std::isfinite(bias_mean))
+        throw std::invalid_argument("dt_s must be positive, bias_sd at least 0 and bias_mean finite");
+    return {y.data(), r ? r->data() : nullptr, y.shape(0), dt_s, bias_mean, bias_sd};
+}
+
+sr::Node node(int law, double drift, double alpha, double sigma_v) {
+    if (law < 0 || law >= static_cast<int>(sr::laws))
+        throw std::invalid_argument("law must be 0, 1 or 2");
+    if (!(sigma_v > 0.0) || (law != 0 && !(drift >= 0.0)) || (law == 2 && !(alpha > 0.0)))
+        throw std::invalid_argument("sigma_v and alpha must be positive, drift at least 0");
+    return {static_cast<sr::Law>(law), drift, alpha, sigma_v};
+}
+
+std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vector &alpha, const Vector &sigma_v) {
+    const std::size_t m = law.shape(0);
+    if (drift.shape(0) != m || alpha.shape(0) != m || sigma_v.shape(0) != m)
+        throw std::invalid_argument("law, drift, alpha and sigma_v must have one length");
+    std::vector<sr::Node> nodes;
+    for (std::size_t j = 0; j < m; j++)
+        nodes.push_back(node(law(j), drift(j), alpha(j), sigma_v(j)));
+    return nodes;
+}
+
+std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, double bias_mean, double bias_sd,
+                                               const Laws &law, const Vector &drift, const Vector &alpha,
+                                               const Vector &sigma_v, const std::optional<Vector> &r) {
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    std::vector<sr::Filtered> filtered;
+    {
+        nb::gil_scoped_release release;
+        filtered = sr::run_filters(rec, nodes);
+    }
+    const Array<double> ln_p({nodes.size()}), mean({nodes.size(), 2}), covariance({nodes.size(), 2, 2});
+    for (std::size_t j = 0; j < nodes.size(); j++) {
+        ln_p.data()[j] = filtered[j].ln_p;
+        Eigen::Map<Eigen::Vector2d>(mean.data() + 2 * j) = filtered[j].mean;
+        Eigen::Map<Eigen::Matrix2d>(covariance.data() + 4 * j) = filtered[j].covariance; // symmetric
+    }
+    return {ln_p.numpy(), mean.numpy(), covariance.numpy()};
+}
+
+std::tuple<Output, Output, Output, Output, Output, Output>
+run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const Laws &law, const Vector &drift,
+         const Vector &alpha, const Vector &sigma_v, const std::vector<double> &ln_prior,
+         const std::vector<std::size_t> &after, const std::optional<Vector> &r) {
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
+    if (ln_prior.size() != nodes.size())
+        throw std::invalid_argument("ln_prior must have one value a node");
+    for (std::size_t m = 0; m < after.size(); m++)
+        if (after[m] > y.shape(0) || (m > 0 && after[m] < after[m - 1]))
+            throw std::invalid_argument("after must ascend and stay within the record");
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    std::vector<sr::Posterior> posterior;
+    {
+        nb::gil_scoped_release release;
+        posterior = sr::run_bank(rec, nodes, ln_prior, after);
+    }
+    const std::size_t t = posterior.size(), k = sr::laws;
+    const Array<double> weight({t, nodes.size()}), probability({t, k}), mean({t, k, 3}), covariance({t, k, 3, 3}),
+        bias_mean_now({t, k}), bias_var_now({t, k});
+    for (std::size_t m = 0; m < t; m++) {
+        const sr::Posterior &p = posterior[m];
+        std::copy(p.weight.begin(), p.weight.end(), weight.data() + m * nodes.size());
+        std::copy(p.probability.begin(), p.probability.end(), probability.data() + m * k);
+        std::copy(p.bias_mean.begin(), p.bias_mean.end(), bias_mean_now.data() + m * k);
+        std::copy(p.bias_var.begin(), p.bias_var.end(), bias_var_now.data() + m * k);
+        for (std::size_t h = 0; h < k; h++) {
+            Eigen::Map<Eigen::Vector3d>(mean.data() + (m * k + h) * 3) = p.mean[h];
+            Eigen::Map<Eigen::Matrix3d>(covariance.data() + (m * k + h) * 9) = p.covariance[h];
+        }
+    }
+    return {weight.numpy(),        probability.numpy(), mean.numpy(), covariance.numpy(), bias_mean_now.numpy(),
+            bias_var_now.numpy()};
+}
+
+Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, int law, double drift, double alpha,
+                   double sigma_v, const std::optional<Vector> &r) {
+    const sr::Node one = node(law, drift, alpha, sigma_v);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    const Array<double> out({rec.n});
+    {
+        nb::gil_scoped_release release;
+        sr::run_filter(rec, one, out.data());
+    }
+    return out.numpy();
+}
+
+std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<double>> simulate(const sr::Scene &scene,
+                                                                         const std::vector<sr::Axis> &axes) {
+    if (!(scene.rate_hz > 0.0) || scene.block < 1 || scene.filter_taps < 1)
+        throw std::invalid_argument("rate_hz, block and filter_taps must be positive");
+    for (const sr::Axis &axis : axes)
+        if (axis.cross_axis >= axes.size())
+            throw std::invalid_argument("cross_axis is not an axis");
+    sr::Simulated simulated;
+    {
+        nb::gil_scoped_release release;
+        simulated = sr::simulate(scene, axes);
+    }
+    const std::size_t n = scene.samples;
+    const Array<double> values({axes.size(), n}), temperature({n}), supply({n});
+    const Array<bool> present({n});
+    for (std::size_t a = 0; a < axes.size(); a++)
+        std::copy(simulated.axes[a].begin(), simulated.axes[a].end(), values.data() + a * n);
+    std::copy(simulated.temperature.begin(), simulated.temperature.end(), temperature.data());
+    std::copy(simulated.supply.begin(), simulated.supply.end(), supply.data());
+    for (std::size_t i = 0; i < n; i++)
+        present.data()[i] = simulated.present[i] != 0;
+    return {values.numpy(), temperature.numpy(), supply.numpy(), present.numpy(), simulated.bias_now};
+}
+
+} // namespace
+
+NB_MODULE(_reference, m) {
+    using namespace nb::literals;
+    m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
+    m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
+          "sigma_v"_a, "r"_a = nb::none());
+    m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
+          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none());
+    m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
+          "sigma_v"_a, "r"_a = nb::none());
+
+    nb::class_<sr::Scene>(m, "Scene")
+        .def(nb::init<>())
+        .def_rw("seed", &sr::Scene::seed)
+        .def_rw("rate_hz", &sr::Scene::rate_hz)
+        .def_rw("samples", &sr::Scene::samples)
+        .def_rw("block", &sr::Scene::block)
+        .def_rw("filter_taps", &sr::Scene::filter_taps)
+        .def_rw("missing", &sr::Scene::missing)
+        .def_rw("motion_intervals", &sr::Scene::motion_intervals);
+    nb::class_<sr::Axis>(m, "Axis")
+        .def(nb::init<>())
+        .def_prop_rw(
+            "law", [](const sr::Axis &axis) { return static_cast<int>(axis.law); },
+            [](sr::Axis &axis, int law) { axis.law = node(law, 0.0, 1.0, 1.0).law; })
+        .def_rw("bias", &sr::Axis::bias)
+        .def_rw("N", &sr::Axis::N)
+        .def_rw("K", &sr::Axis::K)
+        .def_rw("sigma_m", &sr::Axis::sigma_m)
+        .def_rw("alpha", &sr::Axis::alpha)
+        .def_rw("range", &sr::Axis::range)
+        .def_rw("lsb", &sr::Axis::lsb)
+        .def_rw("temperature_coefficient", &sr::Axis::temperature_coefficient)
+        .def_rw("supply_coefficient", &sr::Axis::supply_coefficient)
+        .def_rw("ramp_slope", &sr::Axis::ramp_slope)
+        .def_rw("step_time_s", &sr::Axis::step_time_s)
+        .def_rw("step_amplitude", &sr::Axis::step_amplitude)
+        .def_rw("periodic_frequency_hz", &sr::Axis::periodic_frequency_hz)
+        .def_rw("periodic_amplitude", &sr::Axis::periodic_amplitude)
+        .def_rw("flicker_B", &sr::Axis::flicker_B)
+        .def_rw("noise_lag1", &sr::Axis::noise_lag1)
+        .def_rw("variance_time_s", &sr::Axis::variance_time_s)
+        .def_rw("variance_ratio", &sr::Axis::variance_ratio)
+        .def_rw("outlier_fraction", &sr::Axis::outlier_fraction)
+        .def_rw("motion_amplitude", &sr::Axis::motion_amplitude)
+        .def_rw("cross_axis", &sr::Axis::cross_axis)
+        .def_rw("cross_coefficient", &sr::Axis::cross_coefficient);
+    m.def("simulate", &simulate, "scene"_a, "axes"_a);
+    nb::class_<sr::Random>(m, "Random")
+        .def(nb::init<std::uint64_t, std::uint64_t>(), "seed"_a, "stream"_a)
+        .def("uniform", &sr::Random::uniform)
+        .def("normal", &sr::Random::normal);
+    m.attr("TEMPERATURE_LSB") = sr::temperature_lsb;
+    m.attr("SUPPLY_LSB") = sr::supply_lsb;
+}

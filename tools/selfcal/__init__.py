@@ -1,0 +1,23 @@
+"""selfcal: an inertial sensor at rest identifies its own error model. Every verb of the command is a function here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+VERBS = ("codegen", "identify", "monitor", "montecarlo", "replay", "simulate")
+
+
+def __getattr__(name: str) -> Any:
+    """The verb called `name`, imported when it is first asked for so that the command starts at once."""
+    if name in VERBS:
+        return getattr(import_module(f"selfcal.verbs.{name}"), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("selfcal")
+    raise AttributeError(f"module 'selfcal' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *VERBS, "__version__"]

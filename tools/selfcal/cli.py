@@ -1,0 +1,246 @@
+"""The command `selfcal`: options in, one verb called, errors as one line. Verbs are imported only when they run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from typer.exceptions import TyperException
+
+from selfcal.errors import UserError
+
+app = typer.Typer(
+    help="An inertial sensor at rest identifies its own error model.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        import selfcal
+
+        typer.echo(f"selfcal {selfcal.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_version)
+    ] = False,
+) -> None:
+    """Options of the command itself; the help text is the app's."""
+
+
+#: Exit code of everything the user can put right.
+USER_ERROR = 2
+
+
+class Engine(StrEnum):
+    """What computes."""
+
+    library = "library"
+    reference = "reference"
+
+
+class Target(StrEnum):
+    """Where the firmware runs."""
+
+    host = "host"
+    cortex_m4f = "cortex-m4f"
+    cortex_m0 = "cortex-m0"
+
+
+class Transport(StrEnum):
+    """How its frames travel."""
+
+    slcan = "slcan"
+    can = "can"
+
+
+Log = Annotated[Path, typer.Argument(metavar="LOG", help="Recording: .csv, .csv.gz or .npz", show_default=False)]
+ModelFile = Annotated[
+    Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
+]
+Axis = Annotated[
+    list[str] | None, typer.Option("--axis", metavar="NAME", help="Axis to report (repeat for more); default: all")
+]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON (- for stdout)")]
+Rate = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="Sampling rate, for recordings without a t column")
+]
+Column = Annotated[
+    list[str] | None, typer.Option("--column", metavar="gx=NAME", help="Column of a foreign header (repeat for more)")
+]
+Unit = Annotated[
+    list[str] | None,
+    typer.Option("--unit", metavar="gx=rad/s", help="Unit of a column whose header states none (repeat for more)"),
+]
+Scale = Annotated[
+    list[str] | None,
+    typer.Option("--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB of LSB columns (repeat for more)"),
+]
+
+
+@app.command()
+def identify(
+    log: Log,
+    axis: Axis = None,
+    model: ModelFile = None,
+    engine: Annotated[Engine, typer.Option(help="What computes")] = Engine.library,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the block means instead of the model file's")
+    ] = None,
+    json: Json = None,
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+) -> None:
+    """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import identify as verb
+
+    result = verb.identify(
+        log,
+        axes=axis or (),
+        model=model,
+        engine=engine.value,
+        decimate=decimate,
+        json=json,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+    )
+    verb.show(result)
+
+
+@app.command()
+def simulate(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="LOG", help="Recording to write", show_default=False)
+    ],
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same recording", min=0)] = 0,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID[:key=value,...]", help="Effect to put in, axis=NAME for one axis (repeat for more)"),
+    ] = None,
+) -> None:
+    """Write a simulated recording, read out as the sensor would, with its truth in its metadata."""
+    from selfcal.verbs import simulate as verb
+
+    verb.simulate(model, output, seed=seed, effects=effect or ())
+
+
+@app.command()
+def replay(
+    log: Log,
+    axis: Axis = None,
+    model: ModelFile = None,
+    target: Annotated[Target, typer.Option(help="Where the firmware runs")] = Target.host,
+    transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    report_every: Annotated[
+        float | None, typer.Option(metavar="S", help="Seconds between reports; default: a hundredth of the recording")
+    ] = None,
+    json: Json = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+) -> None:
+    """Run the firmware itself over a recording and watch its telemetry."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import replay as verb
+    from selfcal.verbs.identify import show
+
+    result = verb.replay(
+        log,
+        axes=axis or (),
+        model=model,
+        target=target.value,
+        transport=transport.value,
+        report_every=report_every,
+        json=json,
+        plot=plot,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+    )
+    show(result)
+
+
+@app.command()
+def monitor(
+    channel: Annotated[str, typer.Option(metavar="NAME", help="Channel: a serial port for slcan", show_default=False)],
+    interface: Annotated[str, typer.Option(metavar="NAME", help="python-can interface")] = "slcan",
+    log: Annotated[Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .trc)")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this long; default: Ctrl-C")] = None,
+    bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
+) -> None:
+    """Live view of a module's telemetry."""
+    from selfcal.verbs import monitor as verb
+
+    verb.monitor(interface=interface, channel=channel, log=log, duration=duration, bitrate=bitrate)
+
+
+@app.command()
+def montecarlo(
+    model: ModelFile = None,
+    records: Annotated[int, typer.Option(metavar="N", help="Records per law")] = 400,
+    duration: Annotated[float, typer.Option(metavar="S", help="Length of each, s")] = 3600.0,
+    axis: Annotated[str, typer.Option(metavar="NAME", help="Axis whose priors are drawn from")] = "gx",
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same records", min=0)] = 1,
+    json: Json = None,
+) -> None:
+    """Simulate records with parameters drawn from the prior and compare stated with actual errors."""
+    from selfcal.verbs import montecarlo as verb
+
+    verb.show(verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json))
+
+
+@app.command()
+def codegen(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],
+    target: Annotated[str, typer.Option(help="Whose node counts of the model file")] = "host",
+) -> None:
+    """Write the C model tables for the firmware."""
+    from selfcal.verbs import codegen as verb
+
+    verb.codegen(model, output, target=target)
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"selfcal: error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(USER_ERROR)
+
+
+def main() -> NoReturn:
+    """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 130 after Ctrl-C; a traceback is our bug."""
+    try:
+        sys.exit(app(args=sys.argv[1:] or ["--help"], standalone_mode=False))
+    except UserError as error:
+        _fail(str(error))
+    except TyperException as error:
+        _fail(error.format_message())
+    except (typer.Abort, KeyboardInterrupt):
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of our output has gone, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename is not None else str(error))
+
+
+if __name__ == "__main__":
+    main()

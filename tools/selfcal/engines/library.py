@@ -1,0 +1,76 @@
+"""The C library from Python: the very code of the firmware, in its float (`_library32`) or in double (`_library64`)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal import _library32, _library64
+from selfcal.errors import UserError
+from selfcal.model import LAWS, PARAMETERS
+from selfcal.result import AxisResult, Estimate
+from selfcal.tables import Grid, Tables
+
+
+def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
+    if grid is None:
+        return None
+    return (grid.nodes, grid.fit.ravel().tolist())
+
+
+class Bank:
+    """A bank over the axes of `tables`; `double` picks the verification build."""
+
+    def __init__(self, tables: Tables, *, double: bool = False) -> None:
+        self.tables = tables
+        self.raw: Any = (_library64 if double else _library32).Bank(
+            tables.dt_s,
+            tables.block,
+            [
+                (list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit)
+                for a in tables.axes
+            ],
+            [(h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha)) for h in tables.hypotheses],
+        )
+
+    def push(self, samples: NDArray[np.floating[Any]], missing_before: NDArray[np.integer[Any]] | None = None) -> None:
+        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing ones each."""
+        rows = np.ascontiguousarray(samples, dtype=np.float32)
+        missing = np.zeros(len(rows)) if missing_before is None else missing_before
+        self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64))
+
+    def report(self, axis: int) -> AxisResult:
+        """Posterior of one axis now. Raises UserError with fewer bank samples than a report needs."""
+        try:
+            report = self.raw.report(axis)
+        except ValueError as error:  # std::length_error
+            raise UserError(_too_short(self.tables, self.raw.count)) from error
+        log_evidence, probability, parameters = {}, {}, {}
+        for table, entry in zip(self.tables.hypotheses, report["hypotheses"], strict=True):
+            log_evidence[table.name] = entry["ln_evidence"]
+            probability[table.name] = entry["probability"]
+            parameters[table.name] = {
+                name: _estimate(entry["parameters"][PARAMETERS.index(name)]) for name in LAWS[table.name]
+            }
+        if not any(math.isfinite(p) for p in probability.values()):
+            prior = self.tables.axes[axis]
+            raise UserError(
+                f"axis {prior.name}: the record lies outside the model's priors (white noise N beyond "
+                f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g}); widen them in the model file"
+            )
+        return AxisResult(report["n"], log_evidence, probability, parameters, report["bias_mean"], report["bias_sd"])
+
+
+def _too_short(tables: Tables, count: int) -> str:
+    return (
+        f"too short: {count} bank samples of {tables.dt_s:g} s, a report needs {_library32.REPORT_MIN} "
+        "(record longer, or give --decimate HZ)"
+    )
+
+
+def _estimate(entry: tuple[float, float, float, float, float, int]) -> Estimate:
+    mean, median, sd, q05, q95, flags = entry
+    return Estimate(mean, median, sd, q05, q95, bool(flags & _library32.IDENTIFIED))

@@ -1,0 +1,226 @@
+"""The model file (YAML): hypotheses, priors, nodes and units; what every tool and the firmware assume."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from selfcal.errors import UserError
+
+SCHEMA = "selfcal.model/1"
+DEFAULT = Path(__file__).parent / "models" / "default.yaml"
+
+#: Hypothesis names in the order of `selfcal_law_t` (lib/selfcal.h), with the parameters of each.
+LAWS: dict[str, tuple[str, ...]] = {
+    "constant": ("N",),
+    "random_walk": ("N", "K"),
+    "gauss_markov": ("N", "sigma_m", "alpha"),
+}
+#: Parameter names in the order of `selfcal_parameter_t`.
+PARAMETERS = ("N", "K", "sigma_m", "alpha")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of one parameter: `normal` (mean 0, `sd`), or `log_uniform` / `uniform` from `min` to `max`."""
+
+    law: str
+    min: float = math.nan
+    max: float = math.nan
+    sd: float = math.nan
+
+
+@dataclass(frozen=True)
+class Group:
+    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha; units of `units.py`)."""
+
+    name: str
+    axes: tuple[str, ...]
+    unit: str
+    range: float
+    lsb: float
+    stuck_limit: int
+    priors: Mapping[str, Prior]
+
+
+@dataclass(frozen=True)
+class GridNodes:
+    """Filter nodes of one target: random walk (rho) and Gauss-Markov (rho, alpha)."""
+
+    random_walk: int
+    gauss_markov: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A checked model file. `hypotheses` holds prior probabilities that sum to 1."""
+
+    name: str
+    path: Path
+    bank_rate_hz: float
+    sensor_name: str
+    sensor_rate_hz: float
+    filter_taps: int
+    groups: tuple[Group, ...]
+    hypotheses: Mapping[str, float]
+    nodes: Mapping[str, GridNodes]
+    simulate: Mapping[str, Any]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """All axes, group by group: the order the library and the telemetry use."""
+        return tuple(axis for group in self.groups for axis in group.axes)
+
+    def group_of(self, axis: str) -> Group:
+        """The group an axis belongs to. Raises UserError for an axis the model does not have."""
+        for group in self.groups:
+            if axis in group.axes:
+                return group
+        raise UserError(f"{self.path}: the model has no axis '{axis}' (it has {', '.join(self.axes)})")
+
+    @staticmethod
+    def load(path: Path | str | None = None) -> Model:
+        """Read and check a model file; None is the default model. Raises UserError naming the file and the entry."""
+        return _Reader(DEFAULT if path is None else Path(path)).model()
+
+
+class _Reader:
+    """Walks the YAML tree; every complaint carries the file and the dotted name of the entry."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def fail(self, where: str, what: str) -> UserError:
+        return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
+
+    def tree(self) -> dict[str, Any]:
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot read the model file: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise UserError(f"{self.path}: not a text file") from error
+        try:
+            tree = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            line = f"line {mark.line + 1}: " if mark is not None else ""
+            raise UserError(f"{self.path}: {line}not valid YAML") from error
+        if not isinstance(tree, dict):
+            raise UserError(f"{self.path}: not a model file (a YAML mapping with schema: {SCHEMA})")
+        return tree
+
+    def entry(self, tree: Mapping[str, Any], key: str, where: str) -> Any:
+        if key not in tree:
+            raise self.fail(where, f"'{key}' is missing")
+        return tree[key]
+
+    def only(self, tree: Any, allowed: tuple[str, ...], where: str) -> dict[str, Any]:
+        if not isinstance(tree, dict):
+            raise self.fail(where, "must be a mapping")
+        for key in tree:
+            if key not in allowed:
+                raise self.fail(where, f"unknown entry '{key}' (known: {', '.join(allowed)})")
+        return tree
+
+    def number(self, value: Any, where: str, *, low: float = 0.0, strict: bool = True) -> float:
+        try:
+            number = float(value)  # YAML reads 1e-3 without a dot as text
+        except (TypeError, ValueError):
+            raise self.fail(where, f"must be a number, not {value!r}") from None
+        if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
+            bound = "above" if strict else "of at least"
+            raise self.fail(where, f"must be a finite number {bound} {low:g}, not {value!r}")
+        return number
+
+    def count(self, value: Any, where: str, low: int) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or value < low:
+            raise self.fail(where, f"must be a whole number of at least {low}, not {value!r}")
+        return value
+
+    def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
+        fields = self.only(tree, ("law", "min", "max", "sd"), where)
+        law = self.entry(fields, "law", where)
+        if bias:
+            if law != "normal":
+                raise self.fail(where, "the bias prior must have law: normal")
+            return Prior("normal", sd=self.number(self.entry(fields, "sd", where), f"{where}.sd"))
+        if law not in ("log_uniform", "uniform"):
+            raise self.fail(where, f"unknown law '{law}' (log_uniform or uniform)")
+        low = self.number(self.entry(fields, "min", where), f"{where}.min")
+        high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
+        return Prior(law, min=low, max=high)
+
+    def group(self, name: str, tree: Any) -> Group:
+        where = f"groups.{name}"
+        fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors"), where)
+        axes = self.entry(fields, "axes", where)
+        if not isinstance(axes, list) or not axes or not all(isinstance(axis, str) for axis in axes):
+            raise self.fail(f"{where}.axes", "must be a list of axis names")
+        names = ("bias", *PARAMETERS)
+        priors = self.only(self.entry(fields, "priors", where), names, f"{where}.priors")
+        return Group(
+            name=name,
+            axes=tuple(axes),
+            unit=str(self.entry(fields, "unit", where)),
+            range=self.number(fields.get("range", 0.0), f"{where}.range", strict=False),
+            lsb=self.number(fields.get("lsb", 0.0), f"{where}.lsb", strict=False),
+            stuck_limit=self.count(fields.get("stuck_limit", 0), f"{where}.stuck_limit", 0),
+            priors={
+                key: self.prior(
+                    self.entry(priors, key, f"{where}.priors"), f"{where}.priors.{key}", bias=key == "bias"
+                )
+                for key in names
+            },
+        )
+
+    def nodes(self, tree: Any, where: str) -> GridNodes:
+        fields = self.only(tree, ("random_walk", "gauss_markov"), where)
+        pair = self.entry(fields, "gauss_markov", where)
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise self.fail(f"{where}.gauss_markov", "must be [rho nodes, alpha nodes]")
+        return GridNodes(
+            self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", 6),
+            (self.count(pair[0], f"{where}.gauss_markov", 6), self.count(pair[1], f"{where}.gauss_markov", 6)),
+        )
+
+    def model(self) -> Model:
+        top = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
+        raw = self.tree()
+        if raw.get("schema") != SCHEMA:
+            raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
+        tree = self.only(raw, top, "")
+        sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
+        groups_tree = self.entry(tree, "groups", "")
+        if not isinstance(groups_tree, dict) or not groups_tree:
+            raise self.fail("groups", "must be a mapping of at least one group")
+        groups = tuple(self.group(str(name), fields) for name, fields in groups_tree.items())
+        axes = [axis for group in groups for axis in group.axes]
+        for axis in axes:
+            if axes.count(axis) > 1:
+                raise self.fail("groups", f"axis '{axis}' appears twice")
+        odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
+        weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
+        if not weights:
+            raise self.fail("hypotheses", f"must name at least one of {', '.join(LAWS)}")
+        targets = self.entry(tree, "nodes", "")
+        if not isinstance(targets, dict) or "host" not in targets:
+            raise self.fail("nodes", "must be a mapping of targets, 'host' among them")
+        simulate = tree.get("simulate") or {}
+        return Model(
+            name=str(self.entry(tree, "name", "")),
+            path=self.path,
+            bank_rate_hz=self.number(self.entry(tree, "bank_rate_hz", ""), "bank_rate_hz"),
+            sensor_name=str(sensor.get("name", "")),
+            sensor_rate_hz=self.number(self.entry(sensor, "rate_hz", "sensor"), "sensor.rate_hz"),
+            filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1),
+            groups=groups,
+            hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
+            nodes={name: self.nodes(fields, f"nodes.{name}") for name, fields in targets.items()},
+            simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
+        )

@@ -1,0 +1,43 @@
+"""What an engine says of one axis; every number in the units of the axis, continuous time (units.py)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior of one parameter under one hypothesis."""
+
+    mean: float
+    median: float
+    sd: float
+    q05: float
+    q95: float
+    identified: bool
+
+    def scaled(self, factor: float) -> Estimate:
+        """The same estimate with its unit changed by `factor`."""
+        return Estimate(
+            self.mean * factor,
+            self.median * factor,
+            self.sd * factor,
+            self.q05 * factor,
+            self.q95 * factor,
+            self.identified,
+        )
+
+
+@dataclass(frozen=True)
+class AxisResult:
+    """Posterior of one axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
+
+    `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample.
+    """
+
+    n: int
+    log_evidence: dict[str, float]
+    probability: dict[str, float]
+    parameters: dict[str, dict[str, Estimate]]
+    bias_mean: float
+    bias_sd: float

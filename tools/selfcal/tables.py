@@ -1,0 +1,138 @@
+"""The numbers behind a model: nodes, splines and priors as the C library wants them (`selfcal_model_t`)."""
+
+from __future__ import annotations
+
+import functools
+import math
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from selfcal.errors import UserError
+from selfcal.model import LAWS, PARAMETERS, Model
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
+
+    nodes: int
+    fit: NDArray[np.float64]
+
+
+@functools.cache
+def make_grid(nodes: int) -> Grid:
+    """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/posterior.c)."""
+    z = np.arange(nodes, dtype=float)
+    knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
+    return Grid(nodes, np.linalg.inv(BSpline.design_matrix(z, knots, 5).toarray()))
+
+
+@dataclass(frozen=True)
+class AxisTable:
+    """One axis: ln limits of each parameter's prior (order of PARAMETERS), whether it is uniform, and the read-out."""
+
+    name: str
+    unit: str
+    ln_min: tuple[float, ...]
+    ln_max: tuple[float, ...]
+    uniform: tuple[bool, ...]
+    bias_sd: float
+    range: float
+    stuck_limit: int
+
+
+@dataclass(frozen=True)
+class HypothesisTable:
+    """One hypothesis: its law (index into LAWS), prior probability and grids."""
+
+    name: str
+    law: int
+    ln_probability: float
+    rho: Grid | None
+    alpha: Grid | None
+
+    @property
+    def nodes(self) -> int:
+        """Filters of this hypothesis."""
+        return (self.rho.nodes if self.rho else 1) * (self.alpha.nodes if self.alpha else 1)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """A model for one bank interval `dt_s` = `block` samples, for some axes and one target's node counts."""
+
+    dt_s: float
+    block: int
+    axes: tuple[AxisTable, ...]
+    hypotheses: tuple[HypothesisTable, ...]
+
+    @property
+    def nodes(self) -> int:
+        """Filters of all hypotheses."""
+        return sum(h.nodes for h in self.hypotheses)
+
+    @property
+    def id(self) -> int:
+        """32-bit checksum of everything that decides what the sums mean."""
+        hypotheses = [
+            (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0)
+            for h in self.hypotheses
+        ]
+        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses)).encode())
+
+
+def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
+    """Samples averaged into one bank sample; a recording slower than the bank rate is taken as it is."""
+    return max(1, round(rate_hz / bank_rate_hz))
+
+
+def make_tables(
+    model: Model,
+    rate_hz: float,
+    axes: tuple[str, ...] | None = None,
+    target: str = "host",
+    bank_rate_hz: float | None = None,
+) -> Tables:
+    """The tables for samples at `rate_hz` on `axes` (default: all of the model).
+
+    Raises UserError for an unknown target or axis, or a bank interval that the priors do not fit.
+    """
+    if target not in model.nodes:
+        raise UserError(f"{model.path}: nodes has no target '{target}' (it has {', '.join(model.nodes)})")
+    nodes = model.nodes[target]
+    names = model.axes if axes is None else axes
+    block = bank_block(rate_hz, bank_rate_hz or model.bank_rate_hz)
+    axis_tables = []
+    for name in names:
+        group = model.group_of(name)
+        priors = [group.priors[key] for key in PARAMETERS]
+        axis_tables.append(
+            AxisTable(
+                name=name,
+                unit=group.unit,
+                ln_min=tuple(math.log(p.min) for p in priors),
+                ln_max=tuple(math.log(p.max) for p in priors),
+                uniform=tuple(p.law == "uniform" for p in priors),
+                bias_sd=group.priors["bias"].sd,
+                range=group.range,
+                stuck_limit=group.stuck_limit,
+            )
+        )
+    grids: dict[str, tuple[Grid | None, Grid | None]] = {
+        "constant": (None, None),
+        "random_walk": (make_grid(nodes.random_walk), None),
+        "gauss_markov": (make_grid(nodes.gauss_markov[0]), make_grid(nodes.gauss_markov[1])),
+    }
+    return Tables(
+        dt_s=float(np.float32(block / rate_hz)),
+        block=block,
+        axes=tuple(axis_tables),
+        hypotheses=tuple(
+            HypothesisTable(name, list(LAWS).index(name), math.log(probability), *grids[name])
+            for name, probability in model.hypotheses.items()
+        ),
+    )

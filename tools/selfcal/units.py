@@ -1,0 +1,159 @@
+"""Units: the one place where they are known, and the only conversions in the package.
+
+A unit is written as a product of powers: `deg/s`, `m/s^2`, `deg/s/sqrt(Hz)`, `m/s/h^1.5`. Conventions of the noise
+parameters, continuous time and two-sided: N is the white noise density (the Allan deviation at 1 s), K the random-walk
+density, sigma_m and alpha the Gauss-Markov deviation and bandwidth. At interval dt the white noise has the deviation
+N / sqrt(dt) and a random walk takes steps of K sqrt(dt).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.errors import UserError
+
+#: m/s^2 per g (3rd CGPM, 1901: exact by definition).
+STANDARD_GRAVITY = 9.80665
+#: A two-sided density is this many times the one-sided one.
+ONE_SIDED_TO_TWO_SIDED = 1.0 / math.sqrt(2.0)
+#: Counts of the sensor's least significant bit; a scale turns them into a unit.
+LSB = "LSB"
+
+# Dimensions: exponents of (angle, length, time, temperature, voltage, current, magnetic flux density, pressure).
+_Dimension = tuple[Fraction, ...]
+
+
+def _dimension(**exponent: int) -> _Dimension:
+    kinds = ("angle", "length", "time", "temperature", "voltage", "current", "field", "pressure")
+    return tuple(Fraction(exponent.get(kind, 0)) for kind in kinds)
+
+
+_NONE = _dimension()
+_TIME = _dimension(time=1)
+_ACCELERATION = _dimension(length=1, time=-2)
+
+#: name: (dimension, size in rad, m, s, K, V, A, T, Pa)
+_ATOMS: dict[str, tuple[_Dimension, float]] = {
+    "1": (_NONE, 1.0),
+    "rad": (_dimension(angle=1), 1.0),
+    "deg": (_dimension(angle=1), math.pi / 180.0),
+    "m": (_dimension(length=1), 1.0),
+    "s": (_TIME, 1.0),
+    "ms": (_TIME, 1e-3),
+    "us": (_TIME, 1e-6),
+    "ns": (_TIME, 1e-9),
+    "h": (_TIME, 3600.0),
+    "Hz": (_dimension(time=-1), 1.0),
+    "g": (_ACCELERATION, STANDARD_GRAVITY),
+    "mg": (_ACCELERATION, STANDARD_GRAVITY * 1e-3),
+    "ug": (_ACCELERATION, STANDARD_GRAVITY * 1e-6),
+    "K": (_dimension(temperature=1), 1.0),
+    "degC": (_dimension(temperature=1), 1.0),
+    "V": (_dimension(voltage=1), 1.0),
+    "mV": (_dimension(voltage=1), 1e-3),
+    "A": (_dimension(current=1), 1.0),
+    "mA": (_dimension(current=1), 1e-3),
+    "uT": (_dimension(field=1), 1e-6),
+    "Pa": (_dimension(pressure=1), 1.0),
+    "hPa": (_dimension(pressure=1), 100.0),
+}
+#: Zero of a temperature scale in K; counts only where the temperature itself is meant, not in `deg/s/degC`.
+_ZERO = {"degC": 273.15}
+
+#: What a recording's header may say, for error messages.
+RECORDING_UNITS = (
+    "deg/s", "rad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV", "s", "ms", "us", "ns",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A parsed unit: `size` in the SI unit of its dimension, `zero` the offset of its scale in that unit."""
+
+    name: str
+    dimension: _Dimension
+    size: float
+    zero: float
+
+
+_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d+(?:\.\d+)?))?)\Z")
+
+
+@cache
+def parse(name: str) -> Unit:
+    """The unit called `name`. Raises UserError if it is not one."""
+    dimension, size = _NONE, 1.0
+    for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
+        match = _FACTOR.match(part)
+        atom = match and (match["root"] or match["atom"])
+        if match is None or atom not in _ATOMS:
+            raise UserError(f"unknown unit '{name}' (known: {', '.join(RECORDING_UNITS)})")
+        power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
+        if sign == "/":
+            power = -power
+        kind, scale = _ATOMS[atom]
+        dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
+        size *= scale ** float(power)
+    return Unit(name, dimension, size, _ZERO.get(name, 0.0))
+
+
+def known(name: str) -> bool:
+    """Whether `name` is a unit (LSB counts as one)."""
+    try:
+        return name == LSB or parse(name) is not None
+    except UserError:
+        return False
+
+
+def same_kind(one: str, other: str) -> bool:
+    """Whether one unit converts into the other."""
+    return parse(one).dimension == parse(other).dimension
+
+
+def factor(unit: str, to: str) -> float:
+    """What a difference in `unit` is multiplied with to be in `to`. Raises UserError if they are of different kinds."""
+    source, target = parse(unit), parse(to)
+    if source.dimension != target.dimension:
+        raise UserError(f"'{unit}' cannot be converted to '{to}'")
+    return source.size / target.size
+
+
+@overload
+def convert(value: float, unit: str, to: str) -> float: ...
+@overload
+def convert(value: NDArray[np.float64], unit: str, to: str) -> NDArray[np.float64]: ...
+def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | NDArray[np.float64]:
+    """`value` (any shape) of `unit` in `to`; temperatures as points on their scales. Raises UserError as `factor`."""
+    scale = factor(unit, to)
+    shift = parse(unit).zero - parse(to).zero
+    return value * scale if shift == 0.0 else value * scale + shift / parse(to).size
+
+
+def per_second(unit: str) -> str:
+    """`unit` per second: `deg/s` -> `deg/s^2`, `deg/h` -> `deg/h/s`."""
+    match = re.search(r"/s(?:\^(\d+))?\Z", unit)
+    if match is None:
+        return f"{unit}/s"
+    return f"{unit[: match.start()]}/s^{int(match[1] or 1) + 1}"
+
+
+def parameter_unit(parameter: str, unit: str) -> str:
+    """Unit of a model parameter (bias, N, K, sigma_m, alpha) of an axis that reads in `unit`."""
+    match parameter:
+        case "bias" | "sigma_m":
+            return unit
+        case "N":
+            return f"{unit}/sqrt(Hz)"
+        case "K":
+            return f"{per_second(unit)}/sqrt(Hz)"
+        case "alpha":
+            return "1/s"
+    raise ValueError(f"no such parameter: {parameter}")

@@ -1,0 +1,109 @@
+"""`selfcal codegen`: the C tables of a model, const, for the firmware's flash."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from selfcal.errors import UserError
+from selfcal.model import LAWS, Model
+from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, make_tables
+
+
+def codegen(
+    model: Path | str | None,
+    output: Path | str,
+    *,
+    target: str = "host",
+    rate: float | None = None,
+    axes: Sequence[str] | None = None,
+) -> Tables:
+    """Write `selfcal_model.h` and `selfcal_model.c` into the folder `output` and return what they hold.
+
+    `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
+    is a subset of the model's.
+    Raises UserError for a bad model file or a folder that cannot be written.
+    """
+    loaded = Model.load(model)
+    tables = make_tables(loaded, rate or loaded.sensor_rate_hz, tuple(axes) if axes else None, target)
+    folder = Path(output)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "selfcal_model.h").write_text(_header(loaded, tables))
+        (folder / "selfcal_model.c").write_text(_source(loaded, tables))
+    except OSError as error:
+        raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
+    return tables
+
+
+def _header(model: Model, tables: Tables) -> str:
+    return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
+#ifndef SELFCAL_MODEL_H
+#define SELFCAL_MODEL_H
+
+#include "selfcal.h"
+
+#define SELFCAL_MODEL_NODES {tables.nodes}U
+#define SELFCAL_MODEL_AXES {len(tables.axes)}U
+#define SELFCAL_MODEL_HYPOTHESES {len(tables.hypotheses)}U
+/* Rate of the samples, Hz. */
+#define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+
+extern const selfcal_model_t selfcal_model;
+extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
+
+#endif
+"""
+
+
+def _source(model: Model, tables: Tables) -> str:
+    sizes = sorted({grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid})
+    grids = {grid.nodes: grid for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid}
+    parts = [f"/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */"]
+    parts += ['#include "selfcal_model.h"', ""]
+    parts += [_grid(grids[nodes]) for nodes in sizes]
+    parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
+    hypotheses = (_hypothesis(h) for h in tables.hypotheses)
+    parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
+    names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
+    parts += [
+        f"const char *const selfcal_model_axis_name[] = {{{names}}};",
+        "",
+        "const selfcal_model_t selfcal_model = {",
+        f"    0x{tables.id:08X}U, /* id */",
+        f"    {_f(tables.dt_s)}, /* dt_s */",
+        f"    {tables.block}U, /* block */",
+        "    SELFCAL_MODEL_AXES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_NODES, axes, hypotheses,",
+        "};",
+        "",
+    ]
+    return "\n".join(parts)
+
+
+def _f(value: float) -> str:
+    """A float32 literal that reads back exactly."""
+    return f"{value:.9g}{'' if any(c in f'{value:.9g}' for c in '.en') else '.0'}F"
+
+
+def _grid(grid: Grid) -> str:
+    rows = ",\n".join("    " + ", ".join(f"{value:.17g}" for value in row) for row in grid.fit.tolist())
+    name = f"fit_{grid.nodes}"
+    return (
+        f"static const selfcal_wide_t {name}[{grid.nodes * grid.nodes}] = {{\n{rows},\n}};\n"
+        f"static const selfcal_grid_t grid_{grid.nodes} = {{{grid.nodes}U, {name}}};\n"
+    )
+
+
+def _axis(axis: AxisTable) -> str:
+    priors = ", ".join(
+        f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}"
+        for lo, hi, uniform in zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True)
+    )
+    readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
+    return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
+
+
+def _hypothesis(hypothesis: HypothesisTable) -> str:
+    law = f"SELFCAL_{list(LAWS)[hypothesis.law].upper()}"
+    grids = ", ".join(f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
+    return f"    {{{law}, {_f(hypothesis.ln_probability)}, {grids}}},"

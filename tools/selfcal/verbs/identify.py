@@ -1,0 +1,331 @@
+"""`selfcal identify`: hypothesis probabilities, parameters with intervals and the bias of a recording at rest."""
+
+from __future__ import annotations
+
+import json as json_module
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from selfcal import units as unit_module
+from selfcal.errors import UserError
+from selfcal.model import LAWS, Group, Model
+from selfcal.recording import Recording, Scale, load
+from selfcal.result import AxisResult
+from selfcal.tables import Tables, make_tables
+
+SCHEMA = "selfcal.identify/1"
+#: The table never folds its numbers: a narrower terminal wraps its lines.
+TABLE_WIDTH = 116
+#: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
+CHECK_LIMIT = 4.0
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One axis: the engine's `result` in `unit`, and the `checks` of its adequacy (value, limit, passed)."""
+
+    unit: str
+    result: AxisResult
+    checks: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def adequate(self) -> bool:
+        """All checks passed: nothing in the record speaks against the best model."""
+        return all(bool(check["passed"]) for check in self.checks.values())
+
+
+def identify(
+    log: Path | str,
+    *,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    engine: str = "library",
+    decimate: float | None = None,
+    json: Path | str | None = None,
+    rate: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    scale: Mapping[str, Scale] | None = None,
+) -> dict[str, Any]:
+    """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
+
+    `engine`: 'library' (the firmware's C code in float, one bank an axis) or 'reference' (the textbook bank in double,
+    its grid refined until the probabilities settle). `decimate`: rate of the block means in Hz, else the model's.
+    Numbers are in the recording's units. Raises UserError for what the user can put right.
+    """
+    if engine not in ("library", "reference"):
+        raise UserError(f"there is no engine '{engine}' (library, reference)")
+    if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
+        raise UserError("--decimate must be a rate above 0 Hz")
+    loaded_model = Model.load(model)
+    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    names = chosen_axes(recording, loaded_model, axes)
+    found: dict[str, Identified] = {}
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("identify", total=len(names))
+        for name in names:
+            progress.update(task, description=f"{name} ({engine})")
+            found[name] = identify_axis(recording, name, loaded_model, engine, decimate)
+            progress.advance(task)
+    document = to_document(recording, found)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tuple[str, ...]:
+    """The axes to work on, in the model's order: those asked for, else all that the recording has."""
+    for name in wanted:
+        model.group_of(name)
+        if name not in recording.columns:
+            raise UserError(f"{recording.path}: there is no column '{name}' (there are {', '.join(recording.columns)})")
+    names = tuple(name for name in model.axes if name in (wanted or recording.columns))
+    if not names:
+        raise UserError(
+            f"{recording.path}: none of its columns ({', '.join(recording.columns)}) is an axis of the model "
+            f"({', '.join(model.axes)}); map one with --column gx=NAME"
+        )
+    return names
+
+
+def identify_axis(recording: Recording, name: str, model: Model, engine: str, decimate: float | None) -> Identified:
+    """One axis by one engine. The record is fed as float32, as the firmware gets it."""
+    group = model.group_of(name)
+    tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=decimate)
+    samples = recording.in_unit(name, group.unit).astype(np.float32)
+    blocks = block_means(samples.astype(np.float64), recording.missing_before, tables.block, group)
+    if engine == "library":
+        from selfcal.engines.library import Bank
+
+        bank = Bank(tables)
+        bank.push(samples[:, None], recording.missing_before)
+        result = bank.report(0)
+    else:
+        from selfcal.engines import reference
+
+        result = reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r)
+    checks = _checks(blocks, tables, group, result)
+    unit = recording.columns[name].unit
+    return Identified(unit, in_unit(result, group.unit, unit), checks)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
+
+    `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
+    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block.
+    """
+
+    mean: NDArray[np.float64]
+    r: NDArray[np.float64]
+    within_sd: float
+
+
+def block_means(
+    samples: NDArray[np.float64], missing_before: NDArray[np.int64], block: int, group: Group
+) -> Blocks:
+    """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out."""
+    usable = np.ones(samples.size, bool)
+    if group.range > 0.0:
+        usable &= np.abs(samples) < np.float32(group.range)
+    if group.stuck_limit > 0:
+        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
+        run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
+        usable &= run < group.stuck_limit
+    at = np.arange(samples.size) + np.cumsum(missing_before)
+    if not usable.any():
+        raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
+    at -= at[np.argmax(usable)]
+    values, index = samples[usable], at[usable] // block
+    count = int(at[-1] + 1) // block
+    keep = index < count
+    values, index = values[keep], index[keep]
+    used = np.bincount(index, minlength=count)
+    total = np.bincount(index, values, minlength=count)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        raw = total / used
+        mean = np.where(used * 2 >= block, raw, np.nan)
+        r = np.where(used * 2 >= block, block / used, 1.0)
+    good = np.isfinite(mean)[index]
+    freedom = int(good.sum()) - int(np.isfinite(mean).sum())
+    squares = float(((values - raw[index])[good] ** 2).sum())
+    within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
+    first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
+    return Blocks(mean[first:], r[first:], within)
+
+
+def _checks(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
+    """Are the innovations of the most probable law, at its posterior medians, white, normal and of one variance?"""
+    from selfcal import _reference
+
+    law = max(result.probability, key=lambda name: result.probability[name])
+    at = {name: estimate.median for name, estimate in result.parameters[law].items()}
+    offset = float(np.nanmean(blocks.mean))
+    nu = _reference.innovations(
+        np.ascontiguousarray(blocks.mean - offset),
+        tables.dt_s,
+        -offset,
+        group.priors["bias"].sd,
+        list(LAWS).index(law),
+        at.get("K", at.get("sigma_m", 0.0)),
+        at.get("alpha", 1.0),
+        at["N"] / math.sqrt(tables.dt_s),
+        blocks.r,
+    )[1:]  # the first one is the bias
+    pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
+    whole = nu[np.isfinite(nu)]
+    n = whole.size
+    if n < 20:
+        return {}
+    half = n // 2
+    lag1 = float((nu[1:] * nu[:-1])[pairs].sum() / (whole**2).sum())
+    kurtosis = float(((whole - whole.mean()) ** 4).mean() / whole.var() ** 2 - 3.0)
+    ratio = math.log(float(whole[half:].var() / whole[:half].var()))
+    # Standard deviations under white normal innovations.
+    checks = {
+        "innovation_lag1": (lag1, 1.0 / math.sqrt(n)),
+        "innovation_excess_kurtosis": (kurtosis, math.sqrt(24.0 / n)),
+        "innovation_ln_variance_ratio_of_halves": (ratio, math.sqrt(8.0 / n)),
+    }
+    return {
+        name: {"value": value, "limit": CHECK_LIMIT * sd, "passed": abs(value) <= CHECK_LIMIT * sd}
+        for name, (value, sd) in checks.items()
+    }
+
+
+def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
+    """The result in `to` instead of `unit`: every number but alpha, and the evidence, as a density per unit."""
+    factor = unit_module.factor(unit, to)
+    return AxisResult(
+        result.n,
+        {name: value - result.n * math.log(factor) for name, value in result.log_evidence.items()},
+        result.probability,
+        {
+            law: {name: e if name == "alpha" else e.scaled(factor) for name, e in estimates.items()}
+            for law, estimates in result.parameters.items()
+        },
+        result.bias_mean * factor,
+        result.bias_sd * factor,
+    )
+
+
+def to_document(recording: Recording, found: Mapping[str, Identified]) -> dict[str, Any]:
+    """The JSON of the contract."""
+    return {
+        "schema": SCHEMA,
+        "recording": {
+            "path": str(recording.path),
+            "rate_hz": recording.rate_hz,
+            "samples": recording.samples,
+            "duration_s": recording.duration_s,
+        },
+        "axes": {
+            name: {
+                "hypotheses": dict(axis.result.probability),
+                "log_evidence": dict(axis.result.log_evidence),
+                "parameters": {
+                    law: {
+                        parameter: {
+                            "mean": e.mean,
+                            "median": e.median,
+                            "sd": e.sd,
+                            "q05": e.q05,
+                            "q95": e.q95,
+                            "unit": unit_module.parameter_unit(parameter, axis.unit),
+                            "identified": e.identified,
+                        }
+                        for parameter, e in estimates.items()
+                    }
+                    for law, estimates in axis.result.parameters.items()
+                },
+                "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
+                "adequate": axis.adequate,
+                "checks": {key: dict(check) for key, check in axis.checks.items()},
+            }
+            for name, axis in found.items()
+        },
+    }
+
+
+def write_json(document: Mapping[str, Any], path: Path | str) -> None:
+    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
+    text = json_module.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+    if str(path) == "-":
+        sys.stdout.write(text)
+        return
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def show(document: Mapping[str, Any]) -> None:
+    """The table a person reads: per axis the laws, their probabilities and parameters, and the bias."""
+    recording = document["recording"]
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s",
+        title_justify="left",
+        caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it",
+        caption_justify="left",
+    )
+    for heading in ("law", "P", "N", "K or sigma_m", "1/alpha, s"):
+        table.add_column(heading, no_wrap=True)
+    failed: list[str] = []
+    for name, axis in document["axes"].items():
+        best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
+        bias = axis["bias_now"]
+        level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
+        table.add_row(f"{name} \\[{bias['unit']}]", "", level, "", "", style="cyan")
+        for law, probability in axis["hypotheses"].items():
+            parameters = axis["parameters"][law]
+            table.add_row(
+                law,
+                f"{probability:.4f}",
+                _interval(parameters["N"]),
+                _interval(parameters.get("K") or parameters.get("sigma_m")),
+                _interval(parameters.get("alpha"), inverse=True),
+                style="bold" if law == best else None,
+                end_section=law == list(axis["hypotheses"])[-1],
+            )
+        for check, outcome in axis["checks"].items():
+            if not outcome["passed"]:
+                failed.append(f"{name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
+    console = Console()
+    console.width = max(console.width, TABLE_WIDTH)
+    console.print(table)
+    for line in failed:
+        console.print(f"not adequate: {line}", highlight=False)
+
+
+def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> str:
+    if estimate is None:
+        return ""
+    low, middle, high = estimate["q05"], estimate["median"], estimate["q95"]
+    if not math.isfinite(middle):
+        return "-"
+    if inverse:
+        low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
+    mark = "" if estimate["identified"] else "~"
+    return f"{mark}{middle:.3g} \\[{low:.3g}, {high:.3g}]"

@@ -1,0 +1,192 @@
+"""`selfcal montecarlo`: an ensemble of simulated records with parameters drawn from the prior; are the answers honest?
+
+Calculated against actual, after Stepanov & Motorin (2017): covariance (17) against (16), probability of false
+identification (19) against (20); and how often the stated 90 % intervals hold the truth. (19) is read as 1 - P of
+the law that is chosen: with the P of the true law the two would not have the same mean.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from selfcal.errors import UserError
+from selfcal.model import LAWS, Group, Model, Prior
+from selfcal.tables import make_tables
+from selfcal.verbs.identify import TABLE_WIDTH, write_json
+
+SCHEMA = "selfcal.montecarlo/1"
+#: Bank samples; fewer say nothing.
+MIN_SAMPLES = 10
+
+
+@dataclass(frozen=True)
+class Record:
+    """One simulated record and what the bank said of it."""
+
+    law: str
+    truth: Mapping[str, float]
+    probability: Mapping[str, float]
+    #: mean, sd, q05, q95 of the true law's parameters
+    estimates: Mapping[str, tuple[float, float, float, float]]
+    bias_error_sd: float
+
+
+def montecarlo(
+    model: Path | str | None = None,
+    *,
+    records: int = 400,
+    duration_s: float = 3600.0,
+    axis: str = "gx",
+    seed: int = 1,
+    json: Path | str | None = None,
+) -> dict[str, Any]:
+    """Simulate `records` records per law at the bank rate, identify each with the library, and compare with the truth.
+
+    Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
+    records the calculated and actual probability of false identification, with the sd of their difference.
+    """
+    loaded = Model.load(model)
+    if records < 2:
+        raise UserError("--records must be at least 2")
+    if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
+        raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
+    loaded.group_of(axis)
+    jobs = [(law, seed + 1_000_003 * index) for law in loaded.hypotheses for index in range(records)]
+    work = partial(_record, loaded, axis, duration_s)
+    found: list[Record] = []
+    with Progress(console=Console(stderr=True), transient=True) as progress, multiprocessing.Pool() as pool:
+        task = progress.add_task("records", total=len(jobs))
+        for record in pool.imap(work, jobs, chunksize=8):
+            found.append(record)
+            progress.advance(task)
+    document = _summary(found, records, duration_s, axis)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
+    """Parameters of a law and the bias, drawn from the group's priors."""
+    truth = {name: _draw(group.priors[name], rng) for name in LAWS[law]}
+    return {**truth, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
+
+
+def _draw(prior: Prior, rng: np.random.Generator) -> float:
+    if prior.law == "uniform":
+        return float(rng.uniform(prior.min, prior.max))
+    return math.exp(rng.uniform(math.log(prior.min), math.log(prior.max)))
+
+
+def simulate_bank_samples(
+    law: str, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int
+) -> tuple[NDArray[np.float64], float]:
+    """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample."""
+    from selfcal import _reference
+
+    scene = _reference.Scene()
+    scene.seed, scene.rate_hz, scene.samples, scene.block, scene.filter_taps = seed, rate_hz, samples, 1, 1
+    axis = _reference.Axis()
+    axis.law = list(LAWS).index(law)
+    for name, value in truth.items():
+        setattr(axis, name, value)
+    values, _, _, _, bias_now = _reference.simulate(scene, [axis])
+    return values[0], float(bias_now[0])
+
+
+def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> Record:
+    from selfcal.engines.library import Bank
+
+    law, seed = job
+    tables = make_tables(model, model.bank_rate_hz, (axis,))
+    truth = draw(model.group_of(axis), law, np.random.default_rng([seed, list(LAWS).index(law)]))
+    y, bias_now = simulate_bank_samples(law, truth, model.bank_rate_hz, round(duration_s * model.bank_rate_hz), seed)
+    bank = Bank(tables)
+    bank.push(y[:, None])
+    result = bank.report(0)
+    return Record(
+        law,
+        truth,
+        result.probability,
+        {name: (e.mean, e.sd, e.q05, e.q95) for name, e in result.parameters[law].items()},
+        (result.bias_mean - bias_now) / result.bias_sd,
+    )
+
+
+def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str) -> dict[str, Any]:
+    laws: dict[str, Any] = {}
+    for law in dict.fromkeys(record.law for record in found):
+        mine = [record for record in found if record.law == law]
+        parameters = {}
+        for name in LAWS[law]:
+            truth = np.array([record.truth[name] for record in mine])
+            mean, sd, q05, q95 = np.array([record.estimates[name] for record in mine]).T
+            parameters[name] = {
+                "coverage_90": float(((truth >= q05) & (truth <= q95)).mean()),
+                "rms_actual": float(np.sqrt(((mean - truth) ** 2).mean())),
+                "rms_calculated": float(np.sqrt((sd**2).mean())),
+            }
+        right = np.array([max(r.probability, key=lambda name: r.probability[name]) == law for r in mine])
+        errors = np.array([record.bias_error_sd for record in mine])
+        laws[law] = {
+            "parameters": parameters,
+            "false_identification": float(1.0 - right.mean()),
+            "bias_coverage_90": float((np.abs(errors) < 1.6449).mean()),
+        }
+    top = np.array([max(record.probability.values()) for record in found])
+    wrong = np.array([max(r.probability, key=lambda name: r.probability[name]) != r.law for r in found])
+    return {
+        "schema": SCHEMA,
+        "records_per_law": records,
+        "duration_s": duration_s,
+        "axis": axis,
+        "laws": laws,
+        "false_identification": {
+            "calculated": float(1.0 - top.mean()),
+            "actual": float(wrong.mean()),
+            "sd_of_difference": float(np.std(wrong - (1.0 - top)) / math.sqrt(len(found))),
+        },
+    }
+
+
+def show(document: Mapping[str, Any]) -> None:
+    """The table of calculated against actual."""
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=f"{document['records_per_law']} records per law, {document['duration_s']:g} s, axis {document['axis']}",
+        title_justify="left",
+    )
+    for heading in ("law", "parameter", "truth in 90 %", "rms actual (16)", "rms calculated (17)", "ratio"):
+        table.add_column(heading, no_wrap=True)
+    for law, entry in document["laws"].items():
+        for name, p in entry["parameters"].items():
+            table.add_row(
+                law,
+                name,
+                f"{100 * p['coverage_90']:.1f} %",
+                f"{p['rms_actual']:.3g}",
+                f"{p['rms_calculated']:.3g}",
+                f"{p['rms_actual'] / p['rms_calculated']:.3f}",
+            )
+        table.add_row(law, "bias now", f"{100 * entry['bias_coverage_90']:.1f} %", end_section=True)
+    console = Console()
+    console.width = max(console.width, TABLE_WIDTH)
+    console.print(table)
+    f = document["false_identification"]
+    console.print(
+        f"false identification: calculated {f['calculated']:.4f}, actual {f['actual']:.4f}, "
+        f"difference {f['actual'] - f['calculated']:+.4f} ± {f['sd_of_difference']:.4f} (1 sd)",
+        highlight=False,
+    )

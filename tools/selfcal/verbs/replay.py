@@ -1,0 +1,189 @@
+"""`selfcal replay`: the firmware itself over a recording; its telemetry decoded and shown."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import math
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from selfcal.errors import UserError
+from selfcal.live import View, frame_counts
+from selfcal.model import Model
+from selfcal.plot import plot_run
+from selfcal.recording import Recording, Scale, load
+from selfcal.tables import bank_block
+from selfcal.verbs.codegen import codegen
+from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, write_json
+from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
+
+MAGIC = b"SELFCAL1"
+REPORTS = 100  # of each axis in a run, unless --report-every says otherwise
+TIMEOUT_S = 60.0  # without a frame
+
+
+def replay(
+    log: Path | str,
+    *,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    target: str = "host",
+    transport: str = "slcan",
+    report_every: float | None = None,
+    json: Path | str | None = None,
+    plot: Path | str | None = None,
+    rate: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    scale: Mapping[str, Scale] | None = None,
+) -> dict[str, Any]:
+    """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
+
+    The firmware is built for the model and the recording's rate if it is not there yet. `report_every`: seconds of the
+    recording between reports (default: a hundredth of it). `plot`: file for the picture of the run. Numbers are in the
+    recording's units. Raises UserError for what the user can put right.
+    """
+    if target != "host":
+        raise UserError(f"--target {target}: this build has the target host only")
+    if transport != "slcan":
+        raise UserError(f"--transport {transport}: this build has the transport slcan only")
+    if report_every is not None and not (math.isfinite(report_every) and report_every >= 0.001):
+        raise UserError(f"--report-every must be at least 0.001 s, not {report_every:g}")
+    for file in (json, plot):
+        if file is not None and not Path(file).parent.is_dir():
+            raise UserError(f"{file}: cannot write: there is no such folder")
+    loaded_model = Model.load(model)
+    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    names = chosen_axes(recording, loaded_model, axes)
+    for name in names:
+        if loaded_model.group_of(name).unit != axis_unit(name):
+            raise UserError(
+                f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
+                f"{axis_unit(name)}, so the model must be in that unit"
+            )
+    firmware = build(loaded_model, recording.rate_hz, names)
+    history = run(firmware, recording, loaded_model, names, report_every)
+    document = _document(recording, loaded_model, names, history)
+    if json is not None:
+        write_json(document, json)
+    if plot is not None:
+        simulated = bool(recording.meta.get("simulated"))
+        title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
+        plot_run(history, plot, title, recording.meta.get("truth") if simulated else None)
+        Console(stderr=True).print(f"plot: {plot}", highlight=False, soft_wrap=True)
+    return document
+
+
+def build(model: Model, rate_hz: float, axes: Sequence[str]) -> Path:
+    """The host firmware for a model, a sampling rate and a choice of axes; made anew only if something has changed."""
+    with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
+        made = Path(name)
+        codegen(model.path, made, rate=rate_hz, axes=axes)
+        digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(made.iterdir()))).hexdigest()[:12]
+        folder = ROOT / "build" / "posix" / digest
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            for file in made.iterdir():
+                if not (folder / file.name).exists():
+                    shutil.copy(file, folder)
+            command = ["make", "-s", "-f", "port/posix/posix.mk", "posix", f"MODEL_DIR={folder}", f"OUT={folder}"]
+            try:
+                done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+            except OSError as error:
+                raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
+            if done.returncode != 0:
+                first = next((line for line in done.stderr.splitlines() if line.strip()), "make failed")
+                raise UserError(f"cannot build the firmware: {first}")
+    return folder / "selfcal-posix"
+
+
+def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
+    """The recording as the host firmware reads it (port/posix/main.c): float32 in the model's units."""
+    rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("reading", "<f4", (len(axes),))])
+    rows["missing"] = recording.missing_before
+    for index, name in enumerate(axes):
+        rows["reading"][:, index] = recording.in_unit(name, model.group_of(name).unit)
+    header = np.array(
+        [(MAGIC, len(axes), 0, recording.rate_hz, recording.samples)],
+        dtype=[("magic", "S8"), ("axes", "<u4"), ("zero", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
+    )
+    with path.open("wb") as file:
+        file.write(header.tobytes())
+        file.write(rows.tobytes())
+
+
+def run(
+    firmware: Path, recording: Recording, model: Model, axes: Sequence[str], report_every: float | None
+) -> dict[str, list[AxisReport]]:
+    """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts."""
+    block = bank_block(recording.rate_hz, model.bank_rate_hz)
+    period_s = report_every or max(block / recording.rate_hz, recording.duration_s / REPORTS)
+    history: dict[str, list[AxisReport]] = {name: [] for name in axes}
+    with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
+        rows = Path(name) / "rows.bin"
+        write_rows(recording, model, axes, rows)
+        command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--timeout", f"{TIMEOUT_S:g}"]
+        with (Path(name) / "errors").open("w+") as errors:
+            module = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+            try:
+                assert module.stdout is not None
+                word, _, device = module.stdout.readline().strip().partition(" ")
+                finished = False
+                if word == "SELFCAL_PTY":
+                    # The firmware is ready at once: python-can's pause after opening is for modules that restart.
+                    with open_bus("slcan", device, bitrate=500000, sleep_after_open=0.0) as link:
+                        finished = _watch(link, recording, history)
+                module.wait(TIMEOUT_S)
+            finally:
+                module.kill()
+                module.wait()
+            if module.returncode != 0 or not finished:
+                errors.seek(0)
+                said = errors.read().strip().replace(str(rows), str(recording.path))
+                raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
+    return history
+
+
+def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]]) -> bool:
+    """Follow the telemetry until the module has finished; false if it fell silent before."""
+    decoder = Decoder(from_start=True)
+    title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
+    with View(decoder, link, title, recording.duration_s) as view:
+        while not decoder.finished:
+            frame = link.recv(TIMEOUT_S)
+            if frame is None:
+                break
+            reports = decoder.feed(frame)
+            view.show(reports)
+            for report in reports:
+                if report.complete:
+                    history[report.axis].append(report)
+    Console(stderr=True).print(frame_counts(decoder, link), highlight=False, soft_wrap=True)
+    return decoder.finished
+
+
+def _document(
+    recording: Recording, model: Model, axes: Sequence[str], history: Mapping[str, Sequence[AxisReport]]
+) -> dict[str, Any]:
+    found: dict[str, Identified] = {}
+    for name in axes:
+        if not history[name]:
+            raise UserError(f"{recording.path}: too short for a report at {model.bank_rate_hz:g} bank samples a second")
+        result = history[name][-1].result()
+        if not any(math.isfinite(p) for p in result.probability.values()):
+            raise UserError(f"{recording.path}: axis {name}: outside the model's priors; widen them in the model file")
+        unit = recording.columns[name].unit
+        found[name] = Identified(unit, in_unit(result, model.group_of(name).unit, unit), {})
+    document = to_document(recording, found)
+    for axis in document["axes"].values():
+        axis["adequate"] = None  # telemetry carries no innovations to check
+    return document

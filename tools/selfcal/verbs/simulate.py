@@ -1,0 +1,255 @@
+"""`selfcal simulate`: a recording of a resting sensor with known truth, read out as the sensor would."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcal import _reference, recording, units
+from selfcal.errors import UserError
+from selfcal.model import LAWS, PARAMETERS, Group, Model, Prior
+
+#: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
+_DRAWS = 2**32
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What an effect's default is made from: white noise density, white noise sd per sample, length, and the bias."""
+
+    n: float
+    sd: float
+    duration_s: float
+    samples: int
+    bias: float
+
+
+@dataclass(frozen=True)
+class _Key:
+    """One key of an effect: the simulator's field it sets, and its value when it is not given."""
+
+    field: str
+    default: Callable[[_Setting], float]
+
+
+#: Effects by id (design: the causes of a diagnosis); keys are those of a finding's estimate.
+_EFFECTS: dict[str, dict[str, _Key]] = {
+    "temperature": {"coefficient": _Key("temperature_coefficient", lambda s: 0.3 * s.n)},
+    "supply": {"coefficient": _Key("supply_coefficient", lambda s: 50.0 * s.n)},
+    "cross_axis": {"coefficient": _Key("cross_coefficient", lambda s: 0.5)},
+    "ramp": {"slope": _Key("ramp_slope", lambda s: 5.0 * s.n / s.duration_s)},
+    "step": {
+        "time_s": _Key("step_time_s", lambda s: s.duration_s / 2.0),
+        "amplitude": _Key("step_amplitude", lambda s: 2.0 * s.n),
+    },
+    "periodic": {
+        "frequency_hz": _Key("periodic_frequency_hz", lambda s: 0.05),
+        "amplitude": _Key("periodic_amplitude", lambda s: 0.5 * s.n),
+    },
+    "flicker": {"B": _Key("flicker_B", lambda s: 0.5 * s.n)},
+    "colored_noise": {"lag1": _Key("noise_lag1", lambda s: 0.5)},
+    "quantization": {"lsb": _Key("lsb", lambda s: 2.0 * s.sd)},
+    "outliers": {"fraction": _Key("outlier_fraction", lambda s: 0.005)},
+    "variance_change": {
+        "time_s": _Key("variance_time_s", lambda s: s.duration_s / 2.0),
+        "ratio": _Key("variance_ratio", lambda s: 4.0),
+    },
+    "saturation": {"limit": _Key("range", lambda s: abs(s.bias) + s.sd)},
+    "motion": {
+        "intervals": _Key("motion_intervals", lambda s: 5),
+        "amplitude": _Key("motion_amplitude", lambda s: 20.0 * s.sd),
+    },
+    "missing_samples": {"missing": _Key("missing", lambda s: max(1, round(0.02 * s.samples)))},
+}
+#: Values an effect's key may have, where not every number will do: test and what the complaint says.
+_LIMITS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "lag1": (lambda v: -1.0 < v < 1.0, "between -1 and 1"),
+    "fraction": (lambda v: 0.0 <= v <= 1.0, "from 0 to 1"),
+    "ratio": (lambda v: v > 0.0, "above 0"),
+    "lsb": (lambda v: v > 0.0, "above 0"),
+    "limit": (lambda v: v > 0.0, "above 0"),
+    "intervals": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
+    "missing": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
+}
+
+
+def simulate(
+    model_path: Path | str | None, output: Path | str, seed: int = 0, effects: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Write the recording that a model file's `simulate` entry describes and return its metadata, the truth included.
+
+    `model_path` None is the default model. What the entry leaves open is drawn from the priors, the hypothesis by its
+    prior probability. `effects`: texts ID[:key=value,...]; without `axis=` an effect is on every axis. The same
+    arguments give the same recording. Raises UserError for whatever is wrong with the arguments or the model file, or
+    if `output` cannot be written.
+    """
+    model = Model.load(model_path)
+    if not 0 <= seed < 2**64:
+        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
+    scene = _scene(model, seed)
+    truth = _truth(model, seed)
+    axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
+    applied = [_apply(text, model, scene, axes) for text in effects]
+    if scene.missing > scene.samples - 2:
+        raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
+    values, temperature, supply, present, bias_now = _reference.simulate(scene, axes)
+    for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
+        truth[name] |= {
+            "bias_now": now,
+            # Rounding to the lattice adds lsb^2 / 12 to each sample's variance: the white noise that a record shows.
+            "N_with_lattice": math.sqrt(axis.N**2 + axis.lsb**2 / 12.0 / scene.rate_hz),
+            "units": {key: units.parameter_unit(key, truth[name]["unit"]) for key in ("bias", *PARAMETERS)},
+        }
+    meta = {
+        "simulated": True,
+        "sensor": model.sensor_name,
+        "model": model.name,
+        "seed": seed,
+        "effects": applied,
+        "truth": truth,
+    }
+    columns = {name: (model.group_of(name).unit, row[present]) for name, row in zip(model.axes, values, strict=True)}
+    columns |= {"temp": ("degC", temperature[present]), "supply": ("V", supply[present])}
+    lattice = {name: axis.lsb for name, axis in zip(model.axes, axes, strict=True) if axis.lsb > 0.0}
+    stamps = None if present.all() else np.flatnonzero(present) / scene.rate_hz
+    recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})
+    return meta
+
+
+def _scene(model: Model, seed: int) -> _reference.Scene:
+    scene = _reference.Scene()
+    scene.seed = seed
+    scene.rate_hz = _positive(model, model.simulate.get("rate_hz", model.bank_rate_hz), "rate_hz")
+    if scene.rate_hz > 1.01 * model.sensor_rate_hz:
+        raise UserError(f"{model.path}: simulate.rate_hz: the sensor gives {model.sensor_rate_hz:g} Hz at most")
+    duration_s = _positive(model, model.simulate.get("duration_s", 3600.0), "duration_s")
+    scene.samples = round(duration_s * scene.rate_hz)
+    if scene.samples < 2:
+        raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold fewer than two samples")
+    scene.block = max(1, round(model.sensor_rate_hz / scene.rate_hz))
+    scene.filter_taps = model.filter_taps
+    return scene
+
+
+def _positive(model: Model, value: Any, where: str, *, signed: bool = False) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number) or isinstance(value, bool) or (number <= 0.0 and not signed):
+        what = "a number" if signed else "a number above 0"
+        raise UserError(f"{model.path}: simulate.{where}: must be {what}, not {value!r}")
+    return number
+
+
+def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
+    """Per axis: hypothesis, unit, bias, and the parameters of its law; drawn where the model file leaves them open."""
+    stated = model.simulate.get("axes") or {}
+    if not isinstance(stated, Mapping):
+        raise UserError(f"{model.path}: simulate.axes: must be a mapping of axes")
+    for name in stated:
+        model.group_of(str(name))
+    truth: dict[str, dict[str, Any]] = {}
+    for number, name in enumerate(model.axes):
+        where = f"axes.{name}"
+        fields = stated.get(name) or {}
+        allowed = ("hypothesis", "bias", *PARAMETERS)
+        if not isinstance(fields, Mapping):
+            raise UserError(f"{model.path}: simulate.{where}: must be a mapping of {', '.join(allowed)}")
+        for key in fields:
+            if key not in allowed:
+                raise UserError(f"{model.path}: simulate.{where}: unknown entry '{key}' (known: {', '.join(allowed)})")
+        # All are drawn, in one order, so that stating one leaves the others as they were.
+        random = _reference.Random(seed, _DRAWS + number)
+        priors = model.group_of(name).priors
+        law = _pick(model.hypotheses, random.uniform())
+        drawn = {"bias": priors["bias"].sd * random.normal()}
+        drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in PARAMETERS}
+        law = fields.get("hypothesis", law)
+        if law not in LAWS:
+            raise UserError(f"{model.path}: simulate.{where}.hypothesis: unknown '{law}' (known: {', '.join(LAWS)})")
+        for key in drawn.keys() & fields.keys():
+            drawn[key] = _positive(model, fields[key], f"{where}.{key}", signed=key == "bias")
+        truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
+        truth[name] |= {parameter: drawn[parameter] for parameter in LAWS[law]}
+    return truth
+
+
+def _pick(probability: Mapping[str, float], u: float) -> str:
+    for name, share in probability.items():
+        u -= share
+        if u < 0.0:
+            return name
+    return next(reversed(list(probability)))
+
+
+def _draw(prior: Prior, u: float) -> float:
+    """The value below which the prior has the probability `u`."""
+    if prior.law == "log_uniform":
+        return prior.min * math.pow(prior.max / prior.min, u)
+    return prior.min + (prior.max - prior.min) * u
+
+
+def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
+    axis = _reference.Axis()
+    axis.law = list(LAWS).index(truth["hypothesis"])
+    for key in ("bias", *LAWS[truth["hypothesis"]]):
+        setattr(axis, key, truth[key])
+    axis.range, axis.lsb = group.range, group.lsb
+    return axis
+
+
+def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_reference.Axis]) -> dict[str, Any]:
+    """Put one effect, ID[:key=value,...], into the scene. Returns what was applied, default values filled in."""
+    name, *pairs = re.split("[:,]", text)
+    if name not in _EFFECTS:
+        raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(_EFFECTS)})")
+    keys = _EFFECTS[name]
+    names = [*keys, *(["other"] if name == "cross_axis" else []), *([] if name == "missing_samples" else ["axis"])]
+    given: dict[str, str] = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if key not in names:
+            raise UserError(f"--effect {name}: unknown key '{key}' (known: {', '.join(names)})")
+        if not equals or not value or key in given:
+            raise UserError(f"--effect {name}: write {key}=VALUE, once")
+        given[key] = value
+    chosen = [given["axis"]] if "axis" in given else list(model.axes)
+    applied: dict[str, Any] = {"id": name, "axes": {}}
+    for axis_name in chosen:
+        group = model.group_of(axis_name)
+        axis = axes[model.axes.index(axis_name)]
+        sd = axis.N * math.sqrt(scene.rate_hz)
+        setting = _Setting(axis.N, sd, scene.samples / scene.rate_hz, scene.samples, axis.bias)
+        record: dict[str, Any] = {}
+        for key, entry in keys.items():
+            value = _number(name, key, given[key]) if key in given else entry.default(setting)
+            whole = entry.field in ("missing", "motion_intervals")
+            record[key] = int(value) if whole else value
+            setattr(scene if whole else axis, entry.field, record[key])
+        if name == "cross_axis":
+            following = group.axes[(group.axes.index(axis_name) + 1) % len(group.axes)]
+            record["other"] = given.get("other", following)
+            model.group_of(record["other"])
+            if record["other"] == axis_name:
+                raise UserError(f"--effect cross_axis: axis {axis_name} cannot be its own other")
+            axis.cross_axis = model.axes.index(record["other"])
+        applied["axes"][axis_name] = record
+    return applied
+
+
+def _number(effect: str, key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    fits, what = _LIMITS.get(key, (lambda v: True, "finite"))
+    if not math.isfinite(value) or not fits(value):
+        raise UserError(f"--effect {effect}: {key} must be a number, {what}, not '{text}'")
+    return value

@@ -1,0 +1,360 @@
+"""The wire: telemetry frames in, reports out. Format: `lib/selfcal.dbc`, the one source of ids, items and units.
+
+A frame is believed only if its form, checksum and counter are right; what is lost is counted, and a report with frames
+missing stays incomplete: it is never filled up with older values.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from selfcal.errors import UserError
+from selfcal.model import LAWS
+from selfcal.result import AxisResult, Estimate
+
+if TYPE_CHECKING:
+    import can
+    from cantools.database.can import Database
+
+#: Axis messages are named after the axis, in capitals.
+AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+STATUS = "STATUS"
+STATISTICS = ("mean", "median", "sd", "q05", "q95")
+
+COUNTER = 64  # the counter is modulo this
+JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
+RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter
+
+
+#: Root of the source tree: the package is used in place.
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@lru_cache(maxsize=1)
+def load_dbc() -> Database:
+    """The frame format, lib/selfcal.dbc."""
+    import cantools
+    from cantools.database.can import Database
+
+    database = cantools.database.load_file(ROOT / "lib" / "selfcal.dbc")
+    assert isinstance(database, Database)
+    return database
+
+
+def axis_unit(axis: str) -> str:
+    """Unit of an axis's readings on the wire. Raises UserError for an axis that has no message."""
+    if axis not in AXES:
+        raise UserError(f"axis '{axis}' has no telemetry message (there are {', '.join(AXES)})")
+    return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name("bias_mean").unit or ""
+
+
+def signal_unit(axis: str, signal: str) -> str:
+    """Unit of one signal of an axis message."""
+    return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name(signal).unit or ""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 4
+        for _ in range(8):
+            crc = (crc << 1) ^ (0xF13 if crc & 0x800 else 0)
+        table.append(crc & 0xFFF)
+    return tuple(table)
+
+
+_CRC = _crc_table()
+
+
+def crc12(data: bytes) -> int:
+    """CRC-12/CDMA2000: polynomial 0xF13, initial value 0xFFF, most significant bit first; "123456789" gives 0xD4D."""
+    crc = 0xFFF
+    for byte in data:
+        crc = ((crc << 8) & 0xFFF) ^ _CRC[(crc >> 4) ^ byte]
+    return crc
+
+
+def frame_crc(frame_id: int, data: bytes) -> int:
+    """What bits 52 to 63 of a frame with this id and these 8 bytes must be."""
+    return crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
+
+
+@dataclass
+class Statistics:
+    """Frames of one stream.
+
+    `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
+    them. `refused` had a wrong form (id, length, item) or a counter that repeats or goes back.
+    """
+
+    received: int = 0
+    lost: int = 0
+    damaged: int = 0
+    refused: int = 0
+
+
+@dataclass(frozen=True)
+class AxisReport:
+    """What arrived of one axis's report.
+
+    `values` by signal name, units as in the DBC. `time_s`: module time when it was begun, to the second below if the
+    opening frame is missing.
+    """
+
+    axis: str
+    time_s: float
+    complete: bool
+    values: dict[str, float]
+
+    def value(self, signal: str) -> float:
+        """One value, NaN if it did not arrive."""
+        return self.values.get(signal, math.nan)
+
+    def result(self) -> AxisResult:
+        """The report as the engines give it. For complete reports only (KeyError otherwise)."""
+        v = self.values
+        laws = [law for law in LAWS if f"{law}_probability" in v]
+
+        def estimate(name: str) -> Estimate:
+            numbers = {statistic: v[f"{name}_{statistic}"] for statistic in STATISTICS}
+            return Estimate(**numbers, identified=bool(int(v[f"{name}_flags"]) & 1))
+
+        return AxisResult(
+            n=int(v["count"]),
+            log_evidence={law: v["ln_evidence"] + v[f"{law}_ln_evidence_diff"] for law in laws},
+            probability={law: v[f"{law}_probability"] for law in laws},
+            parameters={law: {p: estimate(f"{law}_{p}") for p in LAWS[law]} for law in laws},
+            bias_mean=v["bias_mean"],
+            bias_sd=v["bias_sd"],
+        )
+
+
+@dataclass
+class _Open:
+    """A report under way."""
+
+    axis: str
+    second: int
+    time_s: float
+    item: int
+    frames: int = 0
+    values: dict[str, float] = field(default_factory=dict)
+
+
+class Decoder:
+    """Turns frames into reports and keeps the count of what went wrong.
+
+    `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
+    count too.
+    """
+
+    def __init__(self, *, from_start: bool = False) -> None:
+        database = load_dbc()
+        self._messages = {
+            message.frame_id: message
+            for message in database.messages
+            if message.name == STATUS or message.name.lower() in AXES
+        }
+        self.statistics = Statistics()
+        #: Last value of each status signal.
+        self.status: dict[str, float] = {}
+        #: Module time of the last opening or status frame, unwrapped, ms.
+        self.time_ms = 0
+        #: The module has said that no sample will follow, and this was its last status.
+        self.finished = False
+        self._counter: int | None = COUNTER - 1 if from_start else None
+        self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
+        self._sent = 0  # frames sent since then, as far as known
+        self._run: list[int] = []  # counters of good frames refused in a row
+        self._open: _Open | None = None
+
+    def feed(self, message: can.Message) -> list[AxisReport]:
+        """Take one frame; return the reports that it closes (none, one or two)."""
+        definition = self._messages.get(message.arbitration_id)
+        if (
+            definition is None
+            or message.is_extended_id
+            or message.is_remote_frame
+            or message.is_error_frame
+            or message.is_fd
+            or message.dlc != 8
+            or len(message.data) != 8
+        ):
+            self.statistics.refused += 1
+            return []
+        data = bytes(message.data)
+        bits = int.from_bytes(data, "little")
+        if bits >> 52 != frame_crc(message.arbitration_id, data):
+            self.statistics.damaged += 1
+            return []
+        item, counter, second = bits >> 32 & 0x3F, bits >> 38 & 0x3F, bits >> 44 & 0xFF
+        try:
+            decoded: dict[str, Any] = dict(definition.decode(data, decode_choices=False))  # type: ignore[arg-type]
+        except Exception:  # cantools has a class of its own for an item that the DBC does not have
+            self.statistics.refused += 1
+            return []
+        values = {
+            name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")
+        }
+        if "time_ms" in values and int(values["time_ms"]) // 1000 % 256 != second:
+            self.statistics.refused += 1
+            return []
+        if "frames_sent" in values and int(values["frames_sent"]) % COUNTER != counter:
+            self.statistics.refused += 1
+            return []
+        jump = self._accept(counter)
+        if jump == 0:
+            self.statistics.refused += 1
+            return []
+        self.statistics.received += 1
+        self.statistics.lost = self._sent - self.statistics.received
+        if "time_ms" in values:
+            self._advance(int(values["time_ms"]))
+        if definition.name == STATUS:
+            self.status.update(values)
+            if "frames_sent" in values:
+                self._exact(int(values["frames_sent"]))
+                self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+            return self.flush()
+        return self._assemble(definition.name.lower(), item, jump, second, values)
+
+    def flush(self) -> list[AxisReport]:
+        """Close the report under way, incomplete, for the end of a stream."""
+        report, self._open = self._open, None
+        return [] if report is None else [_report(report, complete=False)]
+
+    def _accept(self, counter: int) -> int:
+        """How far the counter went ahead; 0 if the frame is to be refused."""
+        jump = COUNTER if self._counter is None else (counter - self._counter) % COUNTER
+        if self._counter is None:
+            self._sent = 1
+        elif 1 <= jump <= JUMP_MAX:
+            self._sent += jump
+        else:
+            if not self._run or counter != (self._run[-1] + 1) % COUNTER:
+                self._run = []
+            self._run.append(counter)
+            if len(self._run) < RESYNC:
+                return 0
+            self._sent += jump or COUNTER
+            jump = COUNTER  # continues no report
+        self._run = []
+        self._counter = counter
+        return jump
+
+    def _exact(self, frames_sent: int) -> None:
+        """Make the loss exact: `frames_sent` went before the frame just accepted."""
+        if self._origin is not None:
+            unseen = (frames_sent - self._origin + 1 - self._sent) % 2**32
+            if unseen < 2**31 and unseen % COUNTER == 0:
+                self._sent += unseen
+                self.statistics.lost = self._sent - self.statistics.received
+                return
+        self._origin = frames_sent + 1 - self._sent  # first of this stream, or the module has started anew
+
+    def _advance(self, time_ms: int) -> None:
+        ahead = (time_ms - self.time_ms) % 2**32
+        self.time_ms = self.time_ms + ahead if ahead < 2**31 else time_ms  # else the module has started anew
+
+    def _assemble(self, axis: str, item: int, jump: int, second: int, values: dict[str, float]) -> list[AxisReport]:
+        """Add a frame to its report. Frames of a report follow each other in ascending item order, so a jump of the
+        counter must not exceed that of the item."""
+        closed: list[AxisReport] = []
+        report = self._open
+        if report is not None and not (axis == report.axis and second == report.second and jump <= item - report.item):
+            closed = self.flush()
+            report = None
+        if report is None:
+            report = self._open = _Open(axis, second, self._begun(second, values), item)
+        report.item = item
+        report.frames += 1
+        report.values.update(values)
+        if "end_items" in values:
+            self._open = None
+            opened = report.values.get("time_ms")
+            if opened is None or int(opened) % 2**24 == int(values["end_time_ms"]):
+                complete = opened is not None and report.frames == int(values["end_items"])
+                closed.append(_report(report, complete=complete))
+        return closed
+
+    def _begun(self, second: int, values: dict[str, float]) -> float:
+        time_ms = self.time_ms
+        if "time_ms" not in values:
+            wrapped = time_ms % 2**32
+            time_ms += 1000 * ((second - wrapped // 1000) % 256) - wrapped % 1000
+        return time_ms / 1000.0
+
+
+def _report(report: _Open, *, complete: bool) -> AxisReport:
+    return AxisReport(report.axis, report.time_s, complete, report.values)
+
+
+class Link:
+    """A python-can bus whose `recv` survives what a damaged serial line does to it.
+
+    `malformed` counts lines that were no frame; `closed` is set once the other side has gone.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self.malformed = 0
+        self.closed = False
+
+    def recv(self, timeout: float) -> can.Message | None:
+        """The next frame, or None after `timeout` seconds or once closed."""
+        import can
+
+        end = time.monotonic() + timeout
+        while not self.closed:
+            try:
+                return self.bus.recv(max(0.0, end - time.monotonic()))
+            except (IndexError, ValueError):  # python-can slcan: a line cut short, a digit that is none
+                self.malformed += 1
+            except can.CanOperationError as error:
+                if not isinstance(error.__cause__, UnicodeDecodeError):
+                    self.closed = True
+                    break
+                self.malformed += 1
+                # python-can 4.6 keeps the line it cannot decode, so every later one would fail with it. Its flush()
+                # would throw away good frames that wait behind.
+                buffer = getattr(self.bus, "_buffer", None)
+                if isinstance(buffer, bytearray):
+                    buffer.clear()
+            except (OSError, can.CanError):
+                self.closed = True
+            if time.monotonic() >= end:
+                break
+        return None
+
+    def close(self) -> None:
+        """Close the channel; a line that is gone already is no error."""
+        import can
+
+        try:
+            self.bus.shutdown()
+        except (OSError, can.CanError):
+            self.closed = True
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def open_bus(interface: str, channel: str, **options: Any) -> Link:
+    """Open a python-can interface. Raises UserError when that fails."""
+    import can
+
+    try:
+        return Link(can.Bus(interface=interface, channel=channel, **options))
+    except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+        raise UserError(f"{interface} {channel}: cannot open: {' '.join(str(error).split())}") from error
