@@ -1,0 +1,165 @@
+/* Frames of random reports, with the numbers that went in, for tests/py/test_wire.py. Not a test of its own.
+ *
+ *     telemetry_stream SEED REPORTS HYPOTHESES
+ *
+ * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
+#include "selfcal.h"
+#include "slcan.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { AXES = 6 };
+
+static const char *const law_name[] = {"constant", "random_walk", "gauss_markov"};
+static const char *const parameter_name[] = {"N", "K", "sigma_m", "alpha"};
+static const bool has[SELFCAL_LAWS][SELFCAL_PARAMETERS] = {
+    {true, false, false, false}, {true, true, false, false}, {true, false, true, true}};
+
+static uint32_t state;
+
+static uint32_t random32(void) /* xorshift32, Marsaglia 2003 */
+{
+    state ^= state << 13;
+    state ^= state >> 17;
+    state ^= state << 5;
+    return state;
+}
+
+/* Any sign, 1e-30 to 1e30. */
+static float random_float(void)
+{
+    const float sign = (random32() & 1U) != 0U ? -1.0F : 1.0F;
+    return sign * powf(10.0F, (float)random32() / 4294967296.0F * 60.0F - 30.0F);
+}
+
+static float told(const char *message, const char *signal, float number)
+{
+    (void)printf("V %s %s %.17g\n", message, signal, (double)number);
+    return number;
+}
+
+static uint32_t told_count(const char *message, const char *signal, uint32_t number)
+{
+    (void)printf("V %s %s %lu\n", message, signal, (unsigned long)number);
+    return number;
+}
+
+static void random_posterior(selfcal_posterior_t *p, const char *message, int law)
+{
+    char signal[64];
+    (void)snprintf(signal, sizeof signal, "%s_probability", law_name[law]);
+    p->probability = told(message, signal, (float)random32() / 4294967296.0F);
+    p->ln_evidence = -1e5 + (double)random32() / 4294967296.0 * 1e4;
+    (void)printf("V %s %s_ln_evidence %.17g\n", message, law_name[law], p->ln_evidence);
+    for (int q = 0; q < SELFCAL_PARAMETERS; q++) {
+        if (!has[law][q]) {
+            continue;
+        }
+        static const char *const statistic[] = {"mean", "median", "sd", "q05", "q95"};
+        float *const number[] = {&p->parameter[q].mean, &p->parameter[q].median, &p->parameter[q].sd,
+                                 &p->parameter[q].q05, &p->parameter[q].q95};
+        for (size_t s = 0; s < sizeof number / sizeof number[0]; s++) {
+            (void)snprintf(signal, sizeof signal, "%s_%s_%s", law_name[law], parameter_name[q], statistic[s]);
+            *number[s] = told(message, signal, random_float());
+        }
+        (void)snprintf(signal, sizeof signal, "%s_%s_flags", law_name[law], parameter_name[q]);
+        p->parameter[q].flags = (uint8_t)told_count(message, signal, random32() & 0xFU);
+    }
+}
+
+static void send_all(selfcal_telemetry_t *telemetry)
+{
+    selfcal_frame_t frame;
+    while (selfcal_telemetry_next(telemetry, &frame)) {
+        char line[SLCAN_FRAME_BYTES];
+        slcan_encode(&frame, line);
+        (void)printf("F %.*s\n", SLCAN_FRAME_BYTES - 1, line);
+    }
+}
+
+static void require(selfcal_status_t status)
+{
+    if (status != SELFCAL_OK) {
+        (void)fprintf(stderr, "telemetry refused: %d\n", (int)status);
+        exit(1);
+    }
+}
+
+int main(int argc, char **argv)
+{
+    static const char *const axis_name[AXES] = {"az", "gx", "ay", "gz", "ax", "gy"};
+    static const char *const message[AXES] = {"AZ", "GX", "AY", "GZ", "AX", "GY"};
+    static const selfcal_law_t order[] = {SELFCAL_RANDOM_WALK, SELFCAL_GAUSS_MARKOV, SELFCAL_CONSTANT};
+    if (argc != 4) {
+        return 2;
+    }
+    state = (uint32_t)strtoul(argv[1], NULL, 10) * 2654435769U + 1U;
+    const unsigned long reports = strtoul(argv[2], NULL, 10);
+    const uint8_t hypotheses = (uint8_t)strtoul(argv[3], NULL, 10);
+
+    selfcal_axis_t axis[AXES];
+    memset(axis, 0, sizeof axis);
+    selfcal_hypothesis_t hypothesis[3];
+    memset(hypothesis, 0, sizeof hypothesis);
+    for (int k = 0; k < 3; k++) {
+        hypothesis[k].law = order[k];
+    }
+    selfcal_model_t model;
+    memset(&model, 0, sizeof model);
+    model.id = random32();
+    model.dt_s = 0.5F;
+    model.block = 50;
+    model.axes = AXES;
+    model.hypotheses = hypotheses;
+    model.axis = axis;
+    model.hypothesis = hypothesis;
+
+    static selfcal_telemetry_t telemetry;
+    require(selfcal_telemetry_init(&telemetry, &model, axis_name));
+    for (unsigned long number = 1; number <= reports; number++) {
+        const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U); /* wraps within the stream */
+        selfcal_counters_t counters;
+        memset(&counters, 0, sizeof counters);
+        counters.samples = told_count("STATUS", "samples", random32());
+        counters.missing = told_count("STATUS", "missing", random32());
+        counters.gaps = told_count("STATUS", "gap_count", random32() & 1U);
+        counters.blocks_lost = told_count("STATUS", "blocks_lost_count", random32() & 1U);
+        counters.blocks_part = told_count("STATUS", "blocks_part_count", random32());
+        counters.not_finite[1] = told_count("STATUS", "not_finite_count", random32() & 1U);
+        counters.saturated[2] = told_count("STATUS", "saturated_count", random32() & 1U);
+        counters.stuck[3] = told_count("STATUS", "stuck_count", random32() & 1U);
+        (void)told_count("STATUS", "time_ms", time_ms);
+        (void)told_count("STATUS", "model_id", model.id);
+        (void)told_count("STATUS", "bank_block", model.block);
+        (void)told("STATUS", "bank_interval", model.dt_s);
+        (void)told_count("STATUS", "report", (uint32_t)number);
+        (void)told_count("STATUS", "state", number < reports ? 1U : 2U);
+        require(selfcal_telemetry_status(&telemetry, &counters, number < reports ? SELFCAL_RUNNING : SELFCAL_FINISHED,
+                                         (uint32_t)number, time_ms));
+        send_all(&telemetry);
+        for (uint8_t a = 0; a < AXES; a++) {
+            selfcal_report_t report;
+            memset(&report, 0, sizeof report);
+            report.axis = a;
+            report.n = told_count(message[a], "count", random32());
+            (void)told_count(message[a], "time_ms", time_ms);
+            (void)told_count(message[a], "end_time_ms", time_ms % 16777216U);
+            (void)told_count(message[a], "not_finite", counters.not_finite[a]);
+            (void)told_count(message[a], "saturated", counters.saturated[a]);
+            (void)told_count(message[a], "stuck", counters.stuck[a]);
+            (void)told_count(message[a], "gaps", counters.gaps);
+            (void)told_count(message[a], "blocks_lost", counters.blocks_lost);
+            report.bias_mean = told(message[a], "bias_mean", random_float());
+            report.bias_sd = told(message[a], "bias_sd", random_float());
+            for (uint8_t k = 0; k < hypotheses; k++) {
+                random_posterior(&report.hypothesis[k], message[a], (int)order[k]);
+            }
+            require(selfcal_telemetry_report(&telemetry, &report, &counters, time_ms));
+            send_all(&telemetry);
+        }
+    }
+    return 0;
+}

@@ -1,0 +1,126 @@
+"""The command: every fault of the user is one line on stderr and exit code 2, whatever raised it."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import selfcal
+
+from conftest import ROOT
+
+COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
+
+
+def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=cwd)
+
+
+def one_error(*arguments: str | Path, cwd: Path | None = None) -> str:
+    """The one line of a run that must fail as the contract says."""
+    done = run(*arguments, cwd=cwd)
+    assert done.returncode == 2, done
+    assert done.stdout == ""
+    assert re.fullmatch(r"selfcal: error: [^\n]+\n", done.stderr), done.stderr
+    return done.stderr.removeprefix("selfcal: error: ").rstrip()
+
+
+def test_version_is_the_headers() -> None:
+    header = (ROOT / "lib" / "selfcal.h").read_text(encoding="utf-8")
+    version = re.search(r'^#define SELFCAL_VERSION "(.*)"', header, re.MULTILINE)
+    assert version is not None
+    assert run("--version").stdout == f"selfcal {version[1]}\n"
+    assert selfcal.__version__ == version[1]
+
+
+def test_help() -> None:
+    done = run("--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert run().stdout == done.stdout
+    for verb in selfcal.VERBS:
+        assert re.search(rf"^  {verb} ", done.stdout, re.MULTILINE)
+        assert run(verb, "--help").returncode == 0
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys, selfcal.cli; print(sorted({'numpy', 'scipy', 'can', 'matplotlib', 'yaml'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_verbs_are_functions() -> None:
+    for verb in selfcal.VERBS:
+        assert callable(getattr(selfcal, verb))
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = selfcal.nonsense
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["nonsense"], "No such command 'nonsense'."),
+        (["identify"], "Missing argument 'LOG'."),
+        (["identify", "log.csv", "--rate", "fast"], "Invalid value for '--rate'"),
+        (["identify", "log.csv", "--engine", "steam"], "Invalid value for '--engine'"),
+        (["identify", "log.csv", "--unit", "rad/s"], "--unit takes NAME=VALUE, not 'rad/s'"),
+        (["identify", "log.csv", "--column", "gx=a", "--column", "gx=b"], "--column: 'gx' is given twice"),
+        (["identify", "log.csv", "--scale", "big"], "--scale takes [NAME=]SIZE[unit], not 'big'"),
+        (["identify", "absent.csv"], "absent.csv: cannot be read: No such file or directory"),
+        (["replay", "absent.csv"], "absent.csv: cannot be read: No such file or directory"),
+        (["identify", "log.csv", "--model", "absent.yaml"], "absent.yaml: "),
+        (["simulate", "absent.yaml", "-o", "log.csv"], "absent.yaml: "),
+        (["codegen", "absent.yaml", "-o", "."], "absent.yaml: "),
+        (["monitor"], "Missing option '--channel'."),
+        (["monitor", "--channel", "/dev/absent"], ""),
+    ],
+)
+def test_faults_are_one_line(tmp_path: Path, arguments: list[str], expected: str) -> None:
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n0,1\n1,2\n2,1\n3,2\n")
+    assert one_error(*arguments, cwd=tmp_path).startswith(expected)
+
+
+BAD = {
+    "empty": ("", "bad.csv: the file is empty"),
+    "header only": ("t[s],gx[deg/s]\n", "bad.csv: line 1: there is a header but no rows"),
+    "text cell": ("t[s],gx[deg/s]\n0,1\n1,x\n", "bad.csv: line 3: column 'gx': 'x' is not a number"),
+    "NaN": ("t[s],gx[deg/s]\n0,1\n1,nan\n", "bad.csv: line 3: column 'gx': not a number (NaN)"),
+    "infinity": ("t[s],gx[deg/s]\n0,1\n1,inf\n", "bad.csv: line 3: column 'gx': infinite"),
+    "time backwards": ("t[s],gx[deg/s]\n0,1\n-1,2\n", "bad.csv: line 3: column 't': time runs backwards"),
+    "missing unit": ("t[s],gx\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has no unit"),
+    "unknown unit": ("t[s],gx[dps]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has the unknown unit 'dps'"),
+    "ragged row": ("t[s],gx[deg/s]\n0,1\n1\n", "bad.csv: line 3: 1 cells where the header has 2"),
+    "binary junk": ("\0\x01\x02", "bad.csv: line 1: not text (byte 0x00)"),
+    "one row": ("t[s],gx[deg/s]\n0,1\n", "bad.csv: line 2: one row only"),
+    "duplicate column": ("gx[deg/s],gx[deg/s]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' appears twice"),
+}
+
+
+@pytest.mark.parametrize("verb", ["identify", "replay"])
+@pytest.mark.parametrize(("text", "expected"), BAD.values(), ids=BAD)
+def test_bad_recordings(tmp_path: Path, verb: str, text: str, expected: str) -> None:
+    """The step's list; every other kind is in test_recording.py."""
+    (tmp_path / "bad.csv").write_text(text)
+    assert one_error(verb, "bad.csv", cwd=tmp_path).startswith(expected)
+
+
+def test_interrupt_is_clean() -> None:
+    """Ctrl-C while a verb waits for a module that never speaks."""
+    master, slave = os.openpty()
+    try:
+        command = [*COMMAND, "monitor", "--channel", os.ttyname(slave)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            os.read(master, 1)  # python-can opens the channel: the verb runs
+            time.sleep(0.5)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert process.returncode in (0, 130)
+    assert "Traceback" not in errors

@@ -1,0 +1,132 @@
+"""`selfcal monitor`: what it counts, logs and shows. Truth: the frames that tests/c/telemetry_stream.c made."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import tty
+from pathlib import Path
+
+import can
+import pytest
+from rich.console import Console
+from test_wire import spoil
+
+from selfcal.errors import UserError
+from selfcal.live import View
+from selfcal.verbs.monitor import monitor
+from selfcal.wire import Decoder, Link
+
+from wire_stream import lines, message, serial_line, stream
+
+
+def text_of(sent_lines: list[str]) -> bytes:
+    return "".join(line + "\r" for line in sent_lines).encode()
+
+
+def test_counts_and_log_over_a_serial_line(tmp_path: Path) -> None:
+    sent = lines(stream(21, 3))
+    log = tmp_path / "frames.blf"
+    with serial_line(text_of(sent)) as path:
+        statistics = monitor(channel=path, log=log, duration=3.0)
+    assert (statistics.received, statistics.lost, statistics.damaged, statistics.refused) == (len(sent), 0, 0, 0)
+    with can.LogReader(str(log)) as reader:
+        logged = [(frame.arbitration_id, bytes(frame.data)) for frame in reader]
+    assert logged == [(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in sent]
+
+
+def test_any_python_can_interface() -> None:
+    """python-can's virtual bus stands for a CAN adapter."""
+    sent = lines(stream(21, 3))
+    with can.Bus(interface="virtual", channel="selfcal-test") as module:
+
+        def play() -> None:
+            time.sleep(0.5)
+            for line in sent:
+                module.send(message(line))
+
+        thread = threading.Thread(target=play)
+        thread.start()
+        statistics = monitor(interface="virtual", channel="selfcal-test", duration=2.0)
+        thread.join()
+    assert (statistics.received, statistics.lost) == (len(sent), 0)
+
+
+def test_noise_does_not_end_it() -> None:
+    """A third of the bytes spoilt: hardly a frame is left, and it goes on to the end of its time."""
+    begun = time.monotonic()
+    with serial_line(spoil(text_of(lines(stream(22, 6))), seed=3, share=0.33)) as path:
+        statistics = monitor(channel=path, duration=4.0)
+    assert time.monotonic() - begun >= 4.0
+    assert statistics.received < 100
+    assert statistics.damaged + statistics.refused > 0
+
+
+def test_ends_when_the_other_side_goes(capfd: pytest.CaptureFixture[str]) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    threading.Timer(3.0, os.close, [master]).start()
+    begun = time.monotonic()
+    monitor(channel=path, duration=60.0)
+    os.close(slave)
+    assert time.monotonic() - begun < 30.0
+    assert "the other side has gone" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--channel", "/dev/no-such-device"], "cannot open"),
+        (["--interface", "no-such-interface", "--channel", "x"], "cannot open"),
+        (["--channel", "x", "--log", "frames.db"], ".asc, .blf, .csv, .trc"),
+        (["--channel", "x", "--duration", "0"], "--duration"),
+        (["--interface", "virtual", "--channel", "x", "--log", "/no-such-folder/frames.asc"], "cannot write"),
+    ],
+)
+def test_user_errors_are_one_line(options: list[str], complaint: str) -> None:
+    command = [sys.executable, "-m", "selfcal.cli", "monitor", *options]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert done.stderr.startswith("selfcal: error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def shown(view: View) -> str:
+    console = Console(width=220, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    console.print(view.renderable())
+    return console.export_text()
+
+
+def test_view_shows_what_did_not_arrive_as_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never the value of the report before."""
+    monkeypatch.setenv("COLUMNS", "200")
+    sent = stream(23, 2)
+    first, second = (one for one in sent if one.message == "GX")
+    dropped = second.lines[1:6]  # count, flags, evidence, bias
+    at = sent.index(first) + 1
+    decoder = Decoder()
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "test", total_s=100.0)
+        for line in lines(sent[:at]):
+            view.show(decoder.feed(message(line)))
+        assert f"{first.truth['count']:.0f}" in shown(view)
+        assert "?" not in shown(view)
+        for line in lines(sent[at:]):
+            if line not in dropped:
+                view.show(decoder.feed(message(line)))
+        picture = shown(view)
+    assert f"{first.truth['count']:.0f}" not in picture
+    assert f"{first.truth['bias_mean']:.5g}" not in picture
+    assert "? ± ? deg/s" in picture
+    law = max(("constant", "random_walk", "gauss_markov"), key=lambda name: second.truth[f"{name}_probability"])
+    assert f"N {second.truth[f'{law}_N_median']:.3g} [" in picture
+
+
+def test_monitor_function_raises_user_errors() -> None:
+    with pytest.raises(UserError, match="cannot open"):
+        monitor(channel="/dev/no-such-device")

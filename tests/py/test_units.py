@@ -1,0 +1,85 @@
+"""Units against the factors of the project's units table (three to seven digits there, so compared to that many)."""
+
+import math
+
+import numpy as np
+import pytest
+
+from selfcal import units
+from selfcal.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("unit", "to", "factor", "digits"),
+    [
+        ("deg/sqrt(h)", "rad/sqrt(s)", 2.908882e-4, 7),
+        ("deg/h", "rad/s", 4.848137e-6, 7),
+        ("deg/h/sqrt(h)", "rad/s/sqrt(s)", 8.0802e-8, 5),
+        ("m/s/sqrt(h)", "m/s^2/sqrt(Hz)", 1 / 60, 15),
+        ("m/s/h^1.5", "m/s^3/sqrt(Hz)", 1 / 216000, 15),
+        ("mg", "m/s^2", 9.80665e-3, 15),
+        ("ug/sqrt(Hz)", "m/s^2/sqrt(Hz)", 9.80665e-6, 15),
+        ("deg/s/sqrt(Hz)", "deg/sqrt(h)", 60.0, 15),
+    ],
+)
+def test_factors_of_the_table(unit: str, to: str, factor: float, digits: int) -> None:
+    assert units.factor(unit, to) == pytest.approx(factor, rel=0.5 * 10.0 ** (1 - digits))
+    assert units.factor(to, unit) == pytest.approx(1.0 / factor, rel=0.5 * 10.0 ** (1 - digits))
+
+
+def test_one_sided_density() -> None:
+    assert pytest.approx(0.5, rel=1e-15) == units.ONE_SIDED_TO_TWO_SIDED**2
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "to", "expected"),
+    [
+        (180.0, "deg/s", "rad/s", math.pi),
+        (2.0, "rad/h", "rad/s", 2.0 / 3600.0),
+        (1.0, "g", "m/s^2", 9.80665),
+        (250.0, "us", "ms", 0.25),
+        (5.0, "ns", "s", 5e-9),
+        (3300.0, "mV", "V", 3.3),
+        (25.0, "degC", "K", 298.15),  # points on two scales: the zero counts
+        (0.0, "K", "degC", -273.15),
+        (0.5, "deg/s/degC", "deg/s/K", 0.5),  # a difference: it does not
+    ],
+)
+def test_values(value: float, unit: str, to: str, expected: float) -> None:
+    assert units.convert(value, unit, to) == pytest.approx(expected, rel=1e-14)
+
+
+def test_same_unit_is_exact() -> None:
+    values = np.array([0.1, -7.3, 1e300])
+    assert np.array_equal(units.convert(values, "deg/s", "deg/s"), values)
+
+
+@pytest.mark.parametrize(
+    ("unit", "density", "walk"),
+    [
+        ("deg/s", "deg/s/sqrt(Hz)", "deg/s^2/sqrt(Hz)"),
+        ("rad/s", "rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"),
+        ("deg/h", "deg/h/sqrt(Hz)", "deg/h/s/sqrt(Hz)"),
+        ("m/s^2", "m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)"),
+        ("mg", "mg/sqrt(Hz)", "mg/s/sqrt(Hz)"),
+    ],
+)
+def test_parameter_units(unit: str, density: str, walk: str) -> None:
+    assert units.parameter_unit("N", unit) == density
+    assert units.parameter_unit("K", unit) == walk
+    assert units.parameter_unit("sigma_m", unit) == units.parameter_unit("bias", unit) == unit
+    assert units.parameter_unit("alpha", unit) == "1/s"
+    # A random walk grows by K per square root of a second; white noise averages down as N per square root of a hertz.
+    assert units.same_kind(f"{unit}/sqrt(s)", walk)
+    assert units.same_kind(f"{unit}*sqrt(s)", density)
+
+
+@pytest.mark.parametrize("name", ["", "furlong", "deg//s", "/s", "deg/s/", "m/s^", "dps", "LSB"])
+def test_unknown(name: str) -> None:
+    with pytest.raises(UserError, match="unknown unit"):
+        units.parse(name)
+
+
+def test_kinds_do_not_mix() -> None:
+    with pytest.raises(UserError, match=r"'g' cannot be converted to 'deg/s'"):
+        units.factor("g", "deg/s")

@@ -1,0 +1,145 @@
+"""Run every suite and close with one line that sums them: `N passed, N failed[, N skipped]`. Called by `make test`.
+
+Each target of `make check` counts as one test; a program that dies without a summary counts as one failure.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+BUILD = ROOT / "build"
+#: s; a suite that takes longer hangs.
+TIMEOUT = {"check": 900, "c": 600, "pytest": 3000}
+WORKERS = "2"
+
+
+@dataclass
+class Count:
+    """Outcomes of a suite."""
+
+    passed: int = 0
+    failed: int = 0
+    skipped: int = 0
+
+    def __iadd__(self, other: Count) -> Count:
+        self.passed += other.passed
+        self.failed += other.failed
+        self.skipped += other.skipped
+        return self
+
+    def __str__(self) -> str:
+        skipped = f", {self.skipped} skipped" if self.skipped else ""
+        return f"{self.passed} passed, {self.failed} failed{skipped}"
+
+
+def run(command: list[str], timeout: int) -> tuple[int | None, str]:
+    """Exit code (None: did not end in time) and output of a command run in the root folder."""
+    try:
+        done = subprocess.run(
+            command,
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=timeout,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        return None, f"{(error.stdout or b'').decode(errors='replace')}\nno end after {timeout} s"
+    return done.returncode, done.stdout.decode(errors="replace")
+
+
+def checks() -> Count:
+    """Every target of `make check`."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    match = re.search(r"^CHECKS := (.*)$", makefile, re.MULTILINE)
+    total = Count()
+    for name in match[1].split() if match else []:
+        code, output = run(["make", "--silent", name], TIMEOUT["check"])
+        print(f"{'ok    ' if code == 0 else 'FAILED'} {name}")
+        if code != 0:
+            print(output)
+        total += Count(passed=1) if code == 0 else Count(failed=1)
+    return total
+
+
+def c_tests() -> Count:
+    """Unity programs, built plainly and with sanitizers."""
+    code, output = run(["make", "--silent", "--keep-going", "c-tests"], TIMEOUT["c"])
+    total = Count()
+    if code != 0:
+        print(f"FAILED c-tests do not build\n{output}")
+        total.failed += 1
+    for variant in ("plain", "sanitized"):
+        for source in sorted((ROOT / "tests" / "c").glob("test_*.c")):
+            program = BUILD / "c" / variant / source.stem
+            if program.is_file():
+                total += c_test(program)
+    return total
+
+
+def c_test(program: Path) -> Count:
+    code, output = run([str(program)], TIMEOUT["c"])
+    summary = re.search(r"^(\d+) Tests (\d+) Failures (\d+) Ignored", output, re.MULTILINE)
+    if summary is None or code is None or code < 0 or (code != 0 and summary[2] == "0"):
+        count = Count(failed=1)
+    else:
+        tests, failed, ignored = (int(number) for number in summary.groups())
+        count = Count(tests - failed - ignored, failed, ignored)
+    print(f"{'FAILED' if count.failed else 'ok    '} {program.relative_to(BUILD)}: {count}")
+    if count.failed:
+        print(output)
+    return count
+
+
+def pytest() -> Count:
+    """The Python tests; their output is shown as it comes."""
+    report = BUILD / "pytest.xml"
+    report.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "pytest", "-q", "-n", WORKERS, "--config-file=tools/pyproject.toml", "--rootdir=."]
+    try:
+        code = subprocess.run(
+            [*command, f"--junitxml={report}", "tests/py"],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            timeout=TIMEOUT["pytest"],
+            check=False,
+        ).returncode
+    except subprocess.TimeoutExpired:
+        print(f"FAILED pytest: no end after {TIMEOUT['pytest']} s")
+        return Count(failed=1)
+    if not report.is_file():
+        print("FAILED pytest: no report")
+        return Count(failed=1)
+    total = Count()
+    for suite in ElementTree.parse(report).iter("testsuite"):
+        tests, failed, errors, skipped = (int(suite.get(key, 0)) for key in ("tests", "failures", "errors", "skipped"))
+        total += Count(max(0, tests - failed - errors - skipped), failed + errors, skipped)
+    if code != 0 and total.failed == 0:
+        total.failed = 1
+    return total
+
+
+def main() -> None:
+    """All suites, each timed; exit code 1 if anything failed."""
+    BUILD.mkdir(exist_ok=True)
+    total = Count()
+    for suite in (checks, c_tests, pytest):
+        start = time.monotonic()
+        count = suite()
+        print(f"{suite.__name__}: {count} ({time.monotonic() - start:.0f} s)", flush=True)
+        total += count
+    (BUILD / "summary").write_text(f"{total}\n")
+    print(total, flush=True)
+    sys.exit(total.failed > 0)
+
+
+if __name__ == "__main__":
+    main()
