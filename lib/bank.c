@@ -10,18 +10,18 @@
  * - With beta = 1 - phi and g = phi K + beta, x' = x + g nu - beta y: beta down to 1e-7 keeps its digits, and a sample costs
  *   one subtraction and two fused multiply-adds besides its two sums.
  * - The Riccati recursion runs on d = P - p_inf, d' = phi^2 (r d + (r - 1) P p_inf) / ((1 + p_inf) (r + P)): its rounding is
- *   relative to d, which dies out, whereas P' itself would settle some 1e-7/kappa off (3e-4 relative at kappa = 1e-4).
+ *   relative to d, which dies out, whereas P' itself would settle some 1e-7/g off (3e-4 relative at g = 1e-4). So does u,
+ *   u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf: e' = (1 - g) e - (g - g_inf) u_inf, where
+ *   g - g_inf = phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
  */
 #include "internal.h"
-
-/* Bank samples between folds of the block sums into the wide ones. 64 keeps the float sums good to 1e-3 nat at n = 10^6. */
-#define FOLD 64U
 
 /* A node counts as converged when d falls to this part of p_inf: what is left of the gain's error moves a ln-likelihood by
  * less than that many nats. */
 #define CONVERGED R(1e-6)
 
-/* Below this, u is zero: it decays for ever in random-walk nodes and denormals are slow. */
+/* u has settled when e falls to this part of u_inf; where u_inf is 0 (random walk) at U_ZERO: denormals are slow. */
+#define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
 
 static bool valid_prior(const selfcal_prior_t *prior) {
@@ -100,7 +100,9 @@ static void init_node(selfcal_node_t *node, selfcal_law_t law, selfcal_real_t ln
     node->p_inf = (selfcal_real_t)p_inf;
     node->c = (selfcal_real_t)((1.0 - one_less_phi_sq) / (1.0 + p_inf));
     node->d = (selfcal_real_t)(p_first - p_inf);
-    node->u = R(1.0);
+    const selfcal_wide_t g_inf = (1.0 - beta) * p_inf / (1.0 + p_inf) + beta;
+    node->u_inf = g_inf > 0.0 ? (selfcal_real_t)(beta / g_inf) : R(1.0);
+    node->e = R(1.0) - node->u_inf;
 }
 
 /* Between what ln of an axis's sigma_v lies, as its first batch shows it: with D_i the differences of neighbours,
@@ -197,35 +199,40 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     memset(memory, 0, SELFCAL_SIZE(model->nodes, model->axes));
     self->model = model;
     self->node = memory;
-    self->b = (selfcal_wide_t *)(void *)(self->node + model->nodes);
+    self->b = (selfcal_sum_t *)(void *)(self->node + model->nodes);
     self->c = self->b + cells;
     self->x = (selfcal_real_t *)(void *)(self->c + cells);
-    self->b_block = self->x + cells;
-    self->c_block = self->b_block + cells;
     return SELFCAL_OK;
 }
 
-/* What the block sums of a node still have to be multiplied by: steady nodes sum plain squares, so that the rounding of 1/s
- * does not add up over n samples. */
-static selfcal_wide_t block_scale(const selfcal_node_t *node) {
-    return node->d == R(0.0) ? 1.0 / (1.0 + (selfcal_wide_t)node->p_inf) : 1.0;
+/* ------------------------------------------------------------------------------------------------------- long sums */
+
+/* Adds hi + lo, |lo| far below |hi| (Knuth's two-sum, then renormalised). */
+static void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
+    const selfcal_real_t total = sum->hi + hi;
+    const selfcal_real_t part = total - sum->hi;
+    const selfcal_real_t error = ((sum->hi - (total - part)) + (hi - part)) + (sum->lo + lo);
+    sum->hi = total + error;
+    sum->lo = error - (sum->hi - total);
 }
 
-static void fold_node(selfcal_t *self, size_t j, selfcal_wide_t scale) {
-    const size_t axes = self->model->axes;
-    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        self->b[k] += scale * (selfcal_wide_t)self->b_block[k];
-        self->c[k] += scale * (selfcal_wide_t)self->c_block[k];
-        self->b_block[k] = R(0.0);
-        self->c_block[k] = R(0.0);
-    }
+/* Adds scale * value, the product in full. */
+static void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
+    const selfcal_real_t product = scale.hi * value;
+    sum_add(sum, product, r_fma(scale.lo, value, r_fma(scale.hi, value, -product)));
 }
 
-static void fold(selfcal_t *self) {
-    for (size_t j = 0; j < self->model->nodes; j++) {
-        fold_node(self, j, block_scale(&self->node[j]));
-    }
-    self->in_block = 0;
+static selfcal_wide_t sum_value(selfcal_sum_t sum) {
+    return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
+}
+
+/* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */
+static selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
+    const selfcal_real_t s = R(1.0) + node->p_inf;
+    const selfcal_real_t s_lo = node->p_inf >= R(1.0) ? R(1.0) - (s - node->p_inf) : node->p_inf - (s - R(1.0));
+    const selfcal_real_t inv = R(1.0) / s;
+    const selfcal_sum_t result = {inv, inv * r_fma(-inv, s_lo, r_fma(-inv, s, R(1.0)))};
+    return result;
 }
 
 /* Part of the batch without a gap inside. */
@@ -235,20 +242,23 @@ typedef struct {
 
 /* The gain side of a batch, shared by the axes. */
 typedef struct {
-    selfcal_real_t g[SELFCAL_BATCH];  /* phi K + beta */
-    selfcal_real_t u[SELFCAL_BATCH];  /* innovation of "1", over s while s varies */
-    selfcal_real_t inv_s[SELFCAL_BATCH];
+    selfcal_real_t g[SELFCAL_BATCH];     /* phi K + beta */
+    selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1"; over s while s varies */
+    selfcal_real_t inv_s[SELFCAL_BATCH]; /* while s varies */
+    selfcal_sum_t scale_b, scale_c;      /* what the span's sums of nu and nu^2 are still to be multiplied by */
 } gains_t;
 
-static selfcal_real_t next_u(selfcal_real_t u, selfcal_real_t g, selfcal_real_t beta) {
-    /* u' = 1 - x'(1) = u - g u + beta */
-    const selfcal_real_t next = r_fma(-g, u, u) + beta;
-    return r_fabs(next) < U_ZERO ? R(0.0) : next;
+/* a + b - fl(a + b). */
+static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real_t sum) {
+    return r_fabs(a) > r_fabs(b) ? b - (sum - a) : a - (sum - b);
 }
 
+/* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes slowly, and would
+ * tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
 static void gains_varying(const selfcal_t *self, span_t span, selfcal_node_t *node, gains_t *gains) {
-    selfcal_real_t product = R(1.0);
-    selfcal_real_t a = R(0.0);
+    selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
+    selfcal_real_t a = R(0.0), short_of = R(0.0);
+    const selfcal_real_t pull = node->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
     for (uint32_t i = span.from; i < span.to; i++) {
         const selfcal_real_t r = self->r[i];
         const selfcal_real_t p = r_fmax(node->p_inf + node->d, R(0.0));
@@ -258,72 +268,132 @@ static void gains_varying(const selfcal_t *self, span_t span, selfcal_node_t *no
         const selfcal_real_t g = r_fma(gain, -node->beta, gain) + node->beta;
         gains->g[i] = g;
         gains->inv_s[i] = inv_s;
-        gains->u[i] = node->u * inv_s;
-        a = r_fma(node->u, gains->u[i], a);
+        const selfcal_real_t u = node->u_inf + node->e;
+        gains->u[i] = u * inv_s;
+        short_of += r_fma(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
+        a = r_fma(u, gains->u[i], a);
+        node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
         node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
-        node->u = next_u(node->u, g, node->beta);
-        /* One logarithm for as many s as a product holds. */
-        product *= s;
-        if (product > R(1e15) || product < R(1e-15)) {
-            node->ln_s += (selfcal_wide_t)r_log(product);
-            product = R(1.0);
+        const selfcal_real_t s_less_1 = (r - R(1.0)) + p;
+        product_less_1 = r_fma(product_less_1, s_less_1, product_less_1 + s_less_1);
+        if (product_less_1 > R(1e15)) {
+            sum_add(&node->ln_s, r_log1p(product_less_1), R(0.0));
+            product_less_1 = R(0.0);
         }
     }
-    node->ln_s += (selfcal_wide_t)r_log(product);
-    node->a += (selfcal_wide_t)a;
+    sum_add(&node->ln_s, r_log1p(product_less_1), R(0.0));
+    gains->scale_c.hi = R(1.0);
+    gains->scale_c.lo = short_of / (selfcal_real_t)(span.to - span.from);
+    gains->scale_b = gains->scale_c;
+    sum_add_scaled(&node->a, gains->scale_c, a);
 }
 
-static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
-    const selfcal_real_t inv_s = R(1.0) / (R(1.0) + node->p_inf);
-    const selfcal_real_t gain = node->p_inf * inv_s;
-    const selfcal_real_t g = r_fma(gain, -node->beta, gain) + node->beta;
-    selfcal_real_t a = R(0.0);
-    for (uint32_t i = span.from; i < span.to; i++) {
-        gains->g[i] = g;
-        gains->u[i] = node->u;
-        a = r_fma(node->u, node->u, a);
-        node->u = next_u(node->u, g, node->beta);
-    }
-    node->a += (selfcal_wide_t)a / (1.0 + (selfcal_wide_t)node->p_inf);
-    node->steady += span.to - span.from;
+/* The gain of a converged node, phi K + beta. */
+static selfcal_real_t steady_g(const selfcal_node_t *node) {
+    const selfcal_real_t gain = node->p_inf / (R(1.0) + node->p_inf);
+    return r_fma(gain, -node->beta, gain) + node->beta;
 }
+
+/* u of a converged node through the span: the kernels sum plain squares, s being constant. */
+static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
+    const selfcal_real_t g = steady_g(node);
+    selfcal_real_t a = R(0.0);
+    gains->scale_b = gains->scale_c = steady_inv_s(node);
+    for (uint32_t i = span.from; i < span.to; i++) {
+        const selfcal_real_t u = node->u_inf + node->e;
+        gains->u[i] = u;
+        a = r_fma(u, u, a);
+        node->e = r_fma(-g, node->e, node->e);
+    }
+    sum_add_scaled(&node->a, gains->scale_c, a);
+}
+
+/* ... and where u is constant as well, plain nu. */
+static void gains_level(span_t span, selfcal_node_t *node, gains_t *gains) {
+    const selfcal_real_t u = node->u_inf;
+    const selfcal_sum_t inv_s = steady_inv_s(node);
+    const selfcal_real_t product = inv_s.hi * u;
+    gains->scale_c = inv_s;
+    gains->scale_b.hi = product;
+    gains->scale_b.lo = r_fma(inv_s.lo, u, r_fma(inv_s.hi, u, -product));
+    sum_add_scaled(&node->a, inv_s, (selfcal_real_t)(span.to - span.from) * u * u);
+}
+
+/* The kernels: every axis of one node through the span. Sums of a span are short enough for selfcal_real_t; they go into the
+ * long ones scaled in full. */
 
 static void run_axes_varying(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
-    const selfcal_real_t beta = self->node[j].beta;
+    const selfcal_real_t minus_beta = -self->node[j].beta;
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
-        selfcal_real_t x = self->x[k], b = self->b_block[k], c = self->c_block[k];
+        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
         for (uint32_t i = span.from; i < span.to; i++) {
             const selfcal_real_t y = self->y[axis][i];
             const selfcal_real_t nu = y - x;
             b = r_fma(gains->u[i], nu, b);
             c = r_fma(nu, nu * gains->inv_s[i], c);
-            x = r_fma(-beta, y, r_fma(gains->g[i], nu, x));
+            x = r_fma(minus_beta, y, r_fma(gains->g[i], nu, x));
         }
         self->x[k] = x;
-        self->b_block[k] = b;
-        self->c_block[k] = c;
+        sum_add_scaled(&self->b[k], gains->scale_b, b);
+        sum_add_scaled(&self->c[k], gains->scale_c, c);
     }
 }
 
 static void run_axes_steady(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
-    const selfcal_real_t beta = self->node[j].beta;
-    const selfcal_real_t g = gains->g[span.from];
+    const selfcal_real_t minus_beta = -self->node[j].beta;
+    const selfcal_real_t g = steady_g(&self->node[j]);
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
-        selfcal_real_t x = self->x[k], b = self->b_block[k], c = self->c_block[k];
+        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
         for (uint32_t i = span.from; i < span.to; i++) {
             const selfcal_real_t y = self->y[axis][i];
             const selfcal_real_t nu = y - x;
             b = r_fma(gains->u[i], nu, b);
             c = r_fma(nu, nu, c);
-            x = r_fma(-beta, y, r_fma(g, nu, x));
+            x = r_fma(minus_beta, y, r_fma(g, nu, x));
         }
         self->x[k] = x;
-        self->b_block[k] = b;
-        self->c_block[k] = c;
+        sum_add_scaled(&self->b[k], gains->scale_b, b);
+        sum_add_scaled(&self->c[k], gains->scale_c, c);
+    }
+}
+
+/* Nearly all samples of a long record go through here: five arithmetic instructions an axis and sample. By fours, which also
+ * keeps the sums short: squares of lattice values would round to one side (1e-7 of C, seen with 64 in a row). */
+static void run_axes_level(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
+    const selfcal_real_t minus_beta = -self->node[j].beta;
+    const selfcal_real_t g = steady_g(&self->node[j]);
+    const size_t axes = self->model->axes;
+    for (size_t axis = 0; axis < axes; axis++) {
+        const size_t k = j * axes + axis;
+        const selfcal_real_t *y = &self->y[axis][span.from];
+        const selfcal_real_t *const end = y + (span.to - span.from);
+        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
+        for (; end - y >= 4; y += 4) {
+            const selfcal_real_t y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
+            const selfcal_real_t nu0 = y0 - x;
+            x = r_fma(minus_beta, y0, r_fma(g, nu0, x));
+            const selfcal_real_t nu1 = y1 - x;
+            x = r_fma(minus_beta, y1, r_fma(g, nu1, x));
+            const selfcal_real_t nu2 = y2 - x;
+            x = r_fma(minus_beta, y2, r_fma(g, nu2, x));
+            const selfcal_real_t nu3 = y3 - x;
+            x = r_fma(minus_beta, y3, r_fma(g, nu3, x));
+            b += (nu0 + nu1) + (nu2 + nu3);
+            c += r_fma(nu3, nu3, r_fma(nu2, nu2, r_fma(nu1, nu1, nu0 * nu0)));
+        }
+        for (; y < end; y++) {
+            const selfcal_real_t nu = *y - x;
+            b += nu;
+            c = r_fma(nu, nu, c);
+            x = r_fma(minus_beta, *y, r_fma(g, nu, x));
+        }
+        self->x[k] = x;
+        sum_add_scaled(&self->b[k], gains->scale_b, b);
+        sum_add_scaled(&self->c[k], gains->scale_c, c);
     }
 }
 
@@ -332,41 +402,43 @@ static void run_span(selfcal_t *self, span_t span) {
     for (uint32_t i = span.from; i < span.to; i++) {
         whole = whole && self->r[i] == R(1.0);
     }
-    if (!whole) {
-        fold(self); /* steady nodes leave their steady s for these samples */
-    }
     gains_t gains;
     for (size_t j = 0; j < self->model->nodes; j++) {
         selfcal_node_t *node = &self->node[j];
-        if (whole && node->d == R(0.0)) {
+        if (whole && node->level) {
+            gains_level(span, node, &gains);
+            run_axes_level(self, span, j, &gains);
+            node->steady += span.to - span.from;
+        } else if (whole && node->d == R(0.0)) {
             gains_steady(span, node, &gains);
             run_axes_steady(self, span, j, &gains);
-            continue;
-        }
-        gains_varying(self, span, node, &gains);
-        run_axes_varying(self, span, j, &gains);
-        const bool converged = r_fabs(node->d) <= CONVERGED * node->p_inf;
-        if (converged || !whole) {
-            fold_node(self, j, 1.0);
-        }
-        if (converged) {
-            node->d = R(0.0);
+            node->steady += span.to - span.from;
+            if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
+                node->e = R(0.0);
+                node->level = true;
+            }
+        } else {
+            gains_varying(self, span, node, &gains);
+            run_axes_varying(self, span, j, &gains);
+            node->level = false;
+            if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
+                node->d = R(0.0);
+            }
         }
     }
     self->n += span.to - span.from;
-    self->in_block += span.to - span.from;
-    if (self->in_block >= FOLD) {
-        fold(self);
-    }
 }
 
 /* Predicts every node over `count` intervals without a sample: exact, whatever the count. */
 static void run_gap(selfcal_t *self, uint32_t count) {
-    fold(self); /* steady nodes leave their steady s */
     const size_t axes = self->model->axes;
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
     for (size_t j = 0; j < self->model->nodes; j++) {
         selfcal_node_t *node = &self->node[j];
+        if (node->q == R(0.0)) {
+            continue; /* the constant law: nothing changes */
+        }
+        node->level = false;
         if (node->beta == R(0.0)) {
             node->d = (selfcal_real_t)((selfcal_wide_t)node->d + intervals * (selfcal_wide_t)node->q);
             continue; /* the prediction x stays */
@@ -377,7 +449,7 @@ static void run_gap(selfcal_t *self, uint32_t count) {
         const selfcal_wide_t stationary = (selfcal_wide_t)node->q / -expm1(2.0 * ln_phi);
         const selfcal_wide_t d = (selfcal_wide_t)node->d;
         node->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
-        node->u = (selfcal_real_t)((selfcal_wide_t)node->u + less * (1.0 - (selfcal_wide_t)node->u));
+        node->e = (selfcal_real_t)((selfcal_wide_t)node->e + less * (1.0 - (selfcal_wide_t)node->u_inf - (selfcal_wide_t)node->e));
         for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
             self->x[k] = (selfcal_real_t)((selfcal_wide_t)self->x[k] * (1.0 - less));
         }
@@ -461,7 +533,6 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
     const uint16_t columns = hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
     const selfcal_node_t *node = &self->node[index];
     const size_t k = (size_t)index * self->model->axes + axis;
-    const selfcal_wide_t scale = block_scale(node);
     const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
     const selfcal_wide_t phi = 1.0 - beta;
     const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)node->d;
@@ -475,13 +546,13 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
     if (hypothesis->alpha != NULL) {
         view->ln_alpha = (selfcal_wide_t)r_fma((selfcal_real_t)column, self->alpha_step[h], self->alpha_lo[h]);
     }
-    view->a = node->a;
-    view->b = self->b[k] + scale * (selfcal_wide_t)self->b_block[k];
-    view->c = self->c[k] + scale * (selfcal_wide_t)self->c_block[k];
-    view->ln_s = node->ln_s + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
+    view->a = sum_value(node->a);
+    view->b = sum_value(self->b[k]);
+    view->c = sum_value(self->c[k]);
+    view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
     /* The filter holds the prediction for the next interval, phi times the drift now. */
     view->drift = (selfcal_wide_t)self->x[k] / phi;
-    view->bias_left = ((selfcal_wide_t)node->u - beta) / phi;
+    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)node->e - beta) / phi;
     view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);
     return SELFCAL_OK;
 }

@@ -14,6 +14,7 @@
 #define r_exp exp
 #define r_expm1 expm1
 #define r_log log
+#define r_log1p log1p
 #define r_sqrt sqrt
 #define r_fabs fabs
 #define r_fmin fmin
@@ -24,6 +25,7 @@
 #define r_exp expf
 #define r_expm1 expm1f
 #define r_log logf
+#define r_log1p log1pf
 #define r_sqrt sqrtf
 #define r_fabs fabsf
 #define r_fmin fminf

@@ -99,8 +99,13 @@ typedef double selfcal_real_t;
 typedef float selfcal_real_t;
 #endif
 
-/* Long sums and ln-likelihoods: they differ by (n/2) ln(ratio), which float cannot carry beyond n = 10^4. Deliberately
- * double, in software where the FPU has none; touched once per 64 bank samples and in reports, never per sample. */
+/* Sums over the whole record: ln-likelihoods differ by (n/2) ln(ratio), which one float cannot carry beyond n = 10^4. The value
+ * is hi + lo, twice the digits of selfcal_real_t by its own arithmetic (compilers must not reassociate: no -ffast-math). */
+typedef struct {
+    selfcal_real_t hi, lo;
+} selfcal_sum_t;
+
+/* Reports and ln-likelihoods. Deliberately double, in software where the FPU has none; never touched per sample. */
 typedef double selfcal_wide_t;
 
 /* ------------------------------------------------------------------------------------------------------------ model
@@ -188,24 +193,24 @@ typedef struct {
     selfcal_real_t p_inf; /* predicted variance once converged */
     selfcal_real_t c;     /* phi^2 / (1 + p_inf): contraction of d */
     selfcal_real_t d;     /* predicted variance less p_inf; exactly 0 once converged */
-    selfcal_real_t u;     /* innovation of the regressor "1" at the next sample */
+    selfcal_real_t u_inf; /* innovation of the regressor "1" once settled */
+    selfcal_real_t e;     /* that innovation at the next sample less u_inf */
+    bool level;           /* d = e = 0: the kernel sums plain nu */
     uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
-    selfcal_wide_t a;     /* sum u^2 / s */
-    selfcal_wide_t ln_s;  /* sum ln s of the other samples */
+    selfcal_sum_t a;      /* sum u^2 / s */
+    selfcal_sum_t ln_s;   /* sum ln s of the other samples */
 } selfcal_node_t;
 
-/* Bytes of memory selfcal_init() needs: for each node in the float build, 48 and 28 more per axis. */
+/* Bytes of memory selfcal_init() needs: for each node in the float build, 52 and 20 more per axis. */
 #define SELFCAL_SIZE(nodes, axes) \
-    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_wide_t) + 3U * sizeof(selfcal_real_t))))
+    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_sum_t) + sizeof(selfcal_real_t))))
 
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
     selfcal_node_t *node;    /* [nodes] */
-    selfcal_wide_t *b, *c;   /* [nodes][axes]: sums u nu / s and nu^2 / s */
+    selfcal_sum_t *b, *c;    /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_real_t *x;       /* [nodes][axes]: predicted drift of the zero-bias filter */
-    selfcal_real_t *b_block, *c_block; /* [nodes][axes]: the last few samples' share, not yet in b and c */
-    uint32_t in_block;       /* bank samples in b_block, c_block */
     uint32_t n;              /* bank samples in all sums */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
