@@ -1,6 +1,7 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
+#   make soak                   a record of 10^8 bank samples
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
@@ -71,19 +72,23 @@ TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 test: setup
 	@$(BIN)/python tests/run.py
 
+soak: setup
+	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
+
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED)
 
 # One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
-$(BUILD)/c/plain/%: C := -O2
+# The sanitizers' own code draws warnings, so those are left to the plain variant.
+$(BUILD)/c/plain/%: C := -O2 $(WARNINGS)
 $(BUILD)/c/sanitized/%: C := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
-	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(WARNINGS) $(INCLUDES:-I%=-I$(CURDIR)/%) -c $(TESTED:%=$(CURDIR)/%)
-	$(CC) $$(C) -c $(UNITY) -o $$(@D)/objects/unity.o
+	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(CURDIR)/%) -c $(TESTED:%=$(CURDIR)/%)
+	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
 $(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a
-	$(CC) -std=c99 $$(C) -ffp-contract=off $(WARNINGS) $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))

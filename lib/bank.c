@@ -243,8 +243,8 @@ typedef struct {
 /* The gain side of a batch, shared by the axes. */
 typedef struct {
     selfcal_real_t g[SELFCAL_BATCH];     /* phi K + beta */
-    selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1"; over s while s varies */
-    selfcal_real_t inv_s[SELFCAL_BATCH]; /* while s varies */
+    selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1" over s */
+    selfcal_real_t inv_s[SELFCAL_BATCH]; /* 1 where s is constant and left to the scales */
     selfcal_sum_t scale_b, scale_c;      /* what the span's sums of nu and nu^2 are still to be multiplied by */
 } gains_t;
 
@@ -294,13 +294,15 @@ static selfcal_real_t steady_g(const selfcal_node_t *node) {
     return r_fma(gain, -node->beta, gain) + node->beta;
 }
 
-/* u of a converged node through the span: the kernels sum plain squares, s being constant. */
+/* A converged node while u still moves. s is constant and kept out of the sums until they are added. */
 static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
     const selfcal_real_t g = steady_g(node);
     selfcal_real_t a = R(0.0);
     gains->scale_b = gains->scale_c = steady_inv_s(node);
     for (uint32_t i = span.from; i < span.to; i++) {
         const selfcal_real_t u = node->u_inf + node->e;
+        gains->g[i] = g;
+        gains->inv_s[i] = R(1.0);
         gains->u[i] = u;
         a = r_fma(u, u, a);
         node->e = r_fma(-g, node->e, node->e);
@@ -308,7 +310,7 @@ static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
     sum_add_scaled(&node->a, gains->scale_c, a);
 }
 
-/* ... and where u is constant as well, plain nu. */
+/* ... and once u is constant as well: it stays out, too. */
 static void gains_level(span_t span, selfcal_node_t *node, gains_t *gains) {
     const selfcal_real_t u = node->u_inf;
     const selfcal_sum_t inv_s = steady_inv_s(node);
@@ -322,7 +324,7 @@ static void gains_level(span_t span, selfcal_node_t *node, gains_t *gains) {
 /* The kernels: every axis of one node through the span. Sums of a span are short enough for selfcal_real_t; they go into the
  * long ones scaled in full. */
 
-static void run_axes_varying(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
+static void run_axes(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
     const selfcal_real_t minus_beta = -self->node[j].beta;
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
@@ -334,26 +336,6 @@ static void run_axes_varying(selfcal_t *self, span_t span, size_t j, const gains
             b = r_fma(gains->u[i], nu, b);
             c = r_fma(nu, nu * gains->inv_s[i], c);
             x = r_fma(minus_beta, y, r_fma(gains->g[i], nu, x));
-        }
-        self->x[k] = x;
-        sum_add_scaled(&self->b[k], gains->scale_b, b);
-        sum_add_scaled(&self->c[k], gains->scale_c, c);
-    }
-}
-
-static void run_axes_steady(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
-    const selfcal_real_t minus_beta = -self->node[j].beta;
-    const selfcal_real_t g = steady_g(&self->node[j]);
-    const size_t axes = self->model->axes;
-    for (size_t axis = 0; axis < axes; axis++) {
-        const size_t k = j * axes + axis;
-        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
-        for (uint32_t i = span.from; i < span.to; i++) {
-            const selfcal_real_t y = self->y[axis][i];
-            const selfcal_real_t nu = y - x;
-            b = r_fma(gains->u[i], nu, b);
-            c = r_fma(nu, nu, c);
-            x = r_fma(minus_beta, y, r_fma(g, nu, x));
         }
         self->x[k] = x;
         sum_add_scaled(&self->b[k], gains->scale_b, b);
@@ -411,7 +393,7 @@ static void run_span(selfcal_t *self, span_t span) {
             node->steady += span.to - span.from;
         } else if (whole && node->d == R(0.0)) {
             gains_steady(span, node, &gains);
-            run_axes_steady(self, span, j, &gains);
+            run_axes(self, span, j, &gains);
             node->steady += span.to - span.from;
             if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
                 node->e = R(0.0);
@@ -419,7 +401,7 @@ static void run_span(selfcal_t *self, span_t span) {
             }
         } else {
             gains_varying(self, span, node, &gains);
-            run_axes_varying(self, span, j, &gains);
+            run_axes(self, span, j, &gains);
             node->level = false;
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
                 node->d = R(0.0);
