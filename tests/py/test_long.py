@@ -1,7 +1,7 @@
 """Records of any length: float against double, and double against the textbook bank.
 
-n = 10^6 here against the textbook bank node for node; n = 10^7 float against double by what a user sees, the report. `make soak`
-sets SELFCAL_SOAK to 10^8, 28 h at 1 kHz.
+n = 10^6 against the textbook bank node for node, n = 10^7 float against double by the report.
+`make soak` sets SELFCAL_SOAK to 10^8, 28 h at 1 kHz.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def chunks(n: int) -> list[tuple[int, int]]:
 
 
 def piece(seed: int, length: int, law: str, state: float) -> tuple[np.ndarray, float]:
-    """White noise 0.04 with a drift of sigma_m = 0.02 and alpha = 0.02, or none: float32 [length], and the drift at its end."""
+    """White noise 0.04 with a drift of sigma_m = alpha = 0.02, or none: float32 [length]; and the drift at its end."""
     rng = np.random.default_rng([seed, 77])
     white = 0.04 * rng.standard_normal(length)
     if law == "constant":
