@@ -208,7 +208,7 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
 /* ------------------------------------------------------------------------------------------------------- long sums */
 
 /* Adds hi + lo, |lo| far below |hi| (Knuth's two-sum, then renormalised). */
-static void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
+static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
     const selfcal_real_t total = sum->hi + hi;
     const selfcal_real_t part = total - sum->hi;
     const selfcal_real_t error = ((sum->hi - (total - part)) + (hi - part)) + (sum->lo + lo);
@@ -217,7 +217,7 @@ static void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
 }
 
 /* Adds scale * value, the product in full. */
-static void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
+static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
     const selfcal_real_t product = scale.hi * value;
     sum_add(sum, product, r_fma(scale.lo, value, r_fma(scale.hi, value, -product)));
 }
@@ -321,6 +321,11 @@ static void gains_level(span_t span, selfcal_node_t *node, gains_t *gains) {
     sum_add_scaled(&node->a, inv_s, (selfcal_real_t)(span.to - span.from) * u * u);
 }
 
+static void add_span(selfcal_t *self, size_t k, const gains_t *gains, selfcal_real_t b, selfcal_real_t c) {
+    sum_add_scaled(&self->b[k], gains->scale_b, b);
+    sum_add_scaled(&self->c[k], gains->scale_c, c);
+}
+
 /* The kernels: every axis of one node through the span. Sums of a span are short enough for selfcal_real_t; they go into the
  * long ones scaled in full. */
 
@@ -338,8 +343,7 @@ static void run_axes(selfcal_t *self, span_t span, size_t j, const gains_t *gain
             x = r_fma(minus_beta, y, r_fma(gains->g[i], nu, x));
         }
         self->x[k] = x;
-        sum_add_scaled(&self->b[k], gains->scale_b, b);
-        sum_add_scaled(&self->c[k], gains->scale_c, c);
+        add_span(self, k, gains, b, c);
     }
 }
 
@@ -374,8 +378,7 @@ static void run_axes_level(selfcal_t *self, span_t span, size_t j, const gains_t
             x = r_fma(minus_beta, *y, r_fma(g, nu, x));
         }
         self->x[k] = x;
-        sum_add_scaled(&self->b[k], gains->scale_b, b);
-        sum_add_scaled(&self->c[k], gains->scale_c, c);
+        add_span(self, k, gains, b, c);
     }
 }
 
