@@ -98,6 +98,10 @@ def identify(
         float | None, typer.Option(metavar="HZ", help="Rate of the block means instead of the model file's")
     ] = None,
     json: Json = None,
+    export: Annotated[
+        tuple[str, Path] | None,
+        typer.Option(metavar="FORMAT FILE", help="Write noise parameters for kalibr, rotors, px4, orbslam3 or vins"),
+    ] = None,
     rate: Rate = None,
     column: Column = None,
     unit: Unit = None,
@@ -114,6 +118,7 @@ def identify(
         engine=engine.value,
         decimate=decimate,
         json=json,
+        export=export,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),

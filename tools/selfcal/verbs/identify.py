@@ -19,6 +19,7 @@ from rich.table import Table
 
 from selfcal import units as unit_module
 from selfcal.errors import UserError
+from selfcal.export import FORMS, write_export
 from selfcal.model import LAWS, Group, Model
 from selfcal.recording import Recording, Scale, load
 from selfcal.result import AxisResult
@@ -53,6 +54,7 @@ def identify(
     engine: str = "library",
     decimate: float | None = None,
     json: Path | str | None = None,
+    export: tuple[str, Path | str] | None = None,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -62,8 +64,11 @@ def identify(
 
     `engine`: 'library' (the firmware's C code in float, one bank an axis) or 'reference' (the textbook bank in double,
     its grid refined until the probabilities settle). `decimate`: rate of the block means in Hz, else the model's.
+    `export`: a format of `selfcal.export` and the file to write.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
+    if export is not None and export[0] not in FORMS:
+        raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if engine not in ("library", "reference"):
         raise UserError(f"there is no engine '{engine}' (library, reference)")
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
@@ -81,6 +86,8 @@ def identify(
     document = to_document(recording, found)
     if json is not None:
         write_json(document, json)
+    if export is not None:
+        write_export(document, *export)
     return document
 
 
