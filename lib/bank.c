@@ -551,7 +551,7 @@ selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t 
     if (status != SELFCAL_OK) {
         return status;
     }
-    /* bank.md point 2, with x0 about the offset and the square completed: the residual C - B^2/A does not feel the bias, the
+    /* Generalised least squares with x0 about the offset and the square completed: the residual C - B^2/A does not feel the bias, the
      * estimate B/A is weighed against N(-offset, P0). The same number without the cancellation of large terms. */
     const selfcal_wide_t p0 = (selfcal_wide_t)self->model->axis[axis].bias_sd * (selfcal_wide_t)self->model->axis[axis].bias_sd;
     const selfcal_wide_t var = sigma_v * sigma_v;

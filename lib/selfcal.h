@@ -264,7 +264,7 @@ selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis);
 typedef struct {
     selfcal_law_t law;
     selfcal_wide_t ln_rho, ln_alpha; /* the node; NaN where the law has none */
-    selfcal_wide_t a, b, c, ln_s;      /* sums of bank.md: A, B, C about the offset, and D */
+    selfcal_wide_t a, b, c, ln_s;      /* sums A, B, C about the offset, and D, see bank.c */
     selfcal_wide_t drift;     /* at the last interval, if x0 were the offset */
     selfcal_wide_t bias_left; /* change of x0 + drift at the last interval per unit of x0 */
     selfcal_wide_t drift_var; /* variance of the drift there, given x0, over sigma_v^2 */

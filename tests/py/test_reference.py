@@ -1,6 +1,6 @@
 """The textbook bank and its engine against the definition of the model.
 
-Truth is always the multivariate normal density of the record with its covariance written out from the model (bank.md,
+Truth is always the multivariate normal density of the record with its covariance written out from the model (the design notes,
 "The problem"), integrated where needed by Gauss-Legendre or adaptive quadrature: nothing recursive, no filter.
 """
 
@@ -210,7 +210,7 @@ def test_engine_equals_quadrature_over_the_prior_box(prior: str) -> None:
     """10 samples, with gaps and factors r. Quadrature with 16 and 20 points a dimension agrees to 1e-6 nat on this
     record.
 
-    Tolerances: probability 2e-4 (contract.md), ln evidence what the engine refines to, moments 2e-3 posterior sd,
+    Tolerances: probability 2e-4 (the contract), ln evidence what the engine refines to, moments 2e-3 posterior sd,
     quantiles 2e-3 in the share of the posterior below them.
     """
     y, r = a_record(10, seed=4)

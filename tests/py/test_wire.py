@@ -187,7 +187,7 @@ def test_result_is_what_went_in() -> None:
         "random_walk": ["N", "K"],
         "gauss_markov": ["N", "sigma_m", "alpha"],
     }.items():
-        # differences to 0.01 nat (contract.md), whatever the common offset lost in float32
+        # differences to 0.01 nat (the contract), whatever the common offset lost in float32
         difference = result.log_evidence[law] - max(result.log_evidence.values())
         assert abs(difference - (truth[f"{law}_ln_evidence"] - best)) <= 0.001
         assert list(result.parameters[law]) == parameters

@@ -1,7 +1,7 @@
-"""Noise parameters in the form other programs read: one function a format, units and conventions of units.md.
+"""Noise parameters in the form other programs read, one function a format.
 
-Each takes the worst axis of a kind (largest median) and says which in a comment. K is that of the random-walk law; under
-a Gauss-Markov drift it is what the drift does over times short against 1/alpha.
+Each takes the worst axis of a kind (largest median) and says which in a comment. K is that of the random-walk law;
+under a Gauss-Markov drift that is what the drift does over times short against 1/alpha.
 """
 
 from __future__ import annotations
