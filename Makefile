@@ -3,6 +3,7 @@
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
+#   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
 PYTHON ?= python3
@@ -93,6 +94,46 @@ endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))
 
+# -------------------------------------------------------------------------------------------------------------- bench
+
+.PHONY: bench bench-counts bench-images
+BENCH := $(BUILD)/bench
+BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
+BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
+ARM_cortex-m4f := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
+ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb
+MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
+MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+
+bench: setup bench-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
+	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
+
+# What is exact, alone.
+bench-counts: bench-images
+	@$(BIN)/python tests/bench/bench.py
+
+define BENCH_IMAGE
+bench-images: $(BENCH)/$(1)/image.elf
+$(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1)
+$(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1)/selfcal_model.c
+	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
+	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
+	    -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
+	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@D)/image.map,--defsym=$(MAP_$(1)) \
+	    $$(@D)/objects/*.o -lm -o $$@
+endef
+$(eval $(call BENCH_IMAGE,cortex-m4f))
+$(eval $(call BENCH_IMAGE,cortex-m0))
+
+$(BENCH)/host/O2/bench: HOST := -O2
+$(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma
+$(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/bench/record.c $(wildcard lib/*.c) $(MODEL)/selfcal_model.c \
+                       $(BENCH_H) $(wildcard host_sim/*.hpp)
+	@mkdir -p $(@D)
+	cd $(@D) && gcc $(HOST) -std=c99 -ffp-contract=off $(WARNINGS) -I$(CURDIR)/lib -I$(CURDIR)/$(MODEL) -c $(filter %.c,$(^:%=$(CURDIR)/%))
+	g++ $(HOST) -std=c++17 $(filter-out -Wdouble-promotion,$(WARNINGS)) -Ilib -Ihost_sim -I$(MODEL) -isystem /usr/include/eigen3 $(filter %.cpp,$^) $(@D)/*.o -pthread -o $@
+
 # ------------------------------------------------------------------------------------------------------------- checks
 
 CHECKS := check-gcc check-clang check-arm check-c++ check-tidy check-tokens check-ruff check-mypy
@@ -114,8 +155,8 @@ check-clang: $(MODEL)/selfcal_model.c
 # The library as a Cortex-M4F and a Cortex-M0 get it.
 ARM := arm-none-eabi-gcc -std=c99 -O2 $(WARNINGS) -Ilib -c -o /dev/null
 check-arm:
-	$(call each,$(ARM) -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard,$(wildcard lib/*.c))
-	$(call each,$(ARM) -mcpu=cortex-m0 -mthumb,$(wildcard lib/*.c))
+	$(call each,$(ARM) $(ARM_cortex-m4f),$(wildcard lib/*.c))
+	$(call each,$(ARM) $(ARM_cortex-m0),$(wildcard lib/*.c))
 
 check-c++:
 	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
@@ -136,7 +177,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py
 
 clean:
 	rm -rf $(BUILD)

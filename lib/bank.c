@@ -20,6 +20,10 @@
  * less than that many nats. */
 #define CONVERGED R(1e-6)
 
+/* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and neighbours
+ * correlated by 1e-3 are beyond telling from white ones. */
+#define ALPHA_DT_MAX 6.9
+
 /* u has settled when e falls to this part of u_inf; where u_inf is 0 (random walk) at U_ZERO: denormals are slow. */
 #define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
@@ -84,7 +88,7 @@ static void init_node(selfcal_node_t *node, selfcal_law_t law, selfcal_real_t ln
         q = exp(2.0 * (selfcal_wide_t)ln_rho);
         p_first = q; /* x_0 = 0 */
     } else if (law == SELFCAL_GAUSS_MARKOV) {
-        const selfcal_wide_t alpha_dt = exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)dt_s;
+        const selfcal_wide_t alpha_dt = fmin(exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)dt_s, ALPHA_DT_MAX);
         beta = -expm1(-alpha_dt);
         one_less_phi_sq = -expm1(-2.0 * alpha_dt);
         p_first = exp(2.0 * (selfcal_wide_t)ln_rho); /* stationary */
@@ -538,7 +542,13 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
     /* The filter holds the prediction for the next interval, phi times the drift now. */
     view->drift = (selfcal_wide_t)self->x[k] / phi;
     view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)node->e - beta) / phi;
-    view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);
+    if (phi > 0.03) {
+        view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);
+    } else {
+        /* P' = phi^2 P(now) + q has lost P(now): it is that after a sample, unless a gap has just let it grow. */
+        const bool gap = (selfcal_wide_t)node->d > 1e-3 * (selfcal_wide_t)node->p_inf;
+        view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
+    }
     return SELFCAL_OK;
 }
 

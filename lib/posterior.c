@@ -494,10 +494,10 @@ static void begin_sum(selfcal_work_t *work) {
     work->row = 0;
     work->mass = 0.0;
     work->off_grid = 0.0;
-    work->sigma_sq = 0.0;
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
     memset(work->weight, 0, sizeof work->weight);
+    memset(work->weight_sq, 0, sizeof work->weight_sq);
     memset(work->histogram, 0, sizeof work->histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         const selfcal_prior_t *prior = &axis_of(work)->prior[p];
@@ -538,8 +538,9 @@ static void sum_row(selfcal_work_t *work) {
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    selfcal_real_t row_weight[SELFCAL_GRID_MAX];
+    selfcal_real_t row_weight[SELFCAL_GRID_MAX], row_weight_sq[SELFCAL_GRID_MAX];
     memset(row_weight, 0, sizeof row_weight);
+    memset(row_weight_sq, 0, sizeof row_weight_sq);
     row_t row;
     make_row(work, &row);
     /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
@@ -598,6 +599,7 @@ static void sum_row(selfcal_work_t *work) {
             }
         }
         row_mass += (selfcal_wide_t)mass;
+        const selfcal_real_t mass_sq = mass + R(2.0) * n1 + n2; /* times (N / best N)^2 */
         work->off_grid += cell.off_grid ? (selfcal_wide_t)mass : 0.0;
         work->first[SELFCAL_N] += (selfcal_wide_t)n1;
         work->second[SELFCAL_N] += (selfcal_wide_t)n2;
@@ -606,9 +608,11 @@ static void sum_row(selfcal_work_t *work) {
             work->second[drift] += (selfcal_wide_t)d2;
             for (uint16_t k = 0; k < 6U; k++) {
                 row_weight[work->basis_first[i] + k] += mass * work->basis[i][k];
+                row_weight_sq[work->basis_first[i] + k] += mass_sq * work->basis[i][k];
             }
         } else {
             row_weight[0] += mass;
+            row_weight_sq[0] += mass_sq;
         }
     }
     work->mass += row_mass;
@@ -621,6 +625,7 @@ static void sum_row(selfcal_work_t *work) {
     for (uint16_t i = 0; i < rows; i++) {
         for (unsigned j = 0; j < (hypothesis->alpha != NULL ? 6U : 1U); j++) {
             work->weight[(size_t)i * columns + row.basis_first + j] += row_weight[i] * row.basis[j];
+            work->weight_sq[(size_t)i * columns + row.basis_first + j] += row_weight_sq[i] * row.basis[j];
         }
     }
 }
@@ -696,15 +701,15 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
 
 /* Posterior means of the basis functions become weights of the node values, in work->values: the mean of anything the spline
  * interpolates is the sum of its node values under them (the transpose of fit()). */
-static void cardinal_weights(selfcal_work_t *work) {
+static void cardinal_weights(selfcal_work_t *work, const selfcal_real_t of_basis[]) {
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
     const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
     selfcal_wide_t line[SELFCAL_GRID_MAX];
     for (uint16_t i = 0; i < rows; i++) {
         for (uint16_t j = 0; j < columns; j++) {
-            selfcal_wide_t sum = alpha != NULL ? 0.0 : (selfcal_wide_t)work->weight[i];
+            selfcal_wide_t sum = alpha != NULL ? 0.0 : (selfcal_wide_t)of_basis[i];
             for (uint16_t l = 0; alpha != NULL && l < columns; l++) {
-                sum += alpha->fit[l * columns + j] * (selfcal_wide_t)work->weight[i * columns + l];
+                sum += alpha->fit[l * columns + j] * (selfcal_wide_t)of_basis[i * columns + l];
             }
             work->values[i * columns + j] = sum;
         }
@@ -722,35 +727,37 @@ static void cardinal_weights(selfcal_work_t *work) {
     }
 }
 
-/* Moments of x0 + drift now. Their dependence on sigma_v goes through its posterior mean square alone: exact for a wide bias
- * prior but for the correlation of sigma_v^2 with the node. */
+/* Moments of x0 + drift now: the mean over the nodes, the scatter of their means, and their own variance, which goes with
+ * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void finish_bias(selfcal_work_t *work, selfcal_posterior_t *posterior) {
-    const selfcal_wide_t n_mean = exp((selfcal_wide_t)work->best_ln[SELFCAL_N]);
+    const selfcal_wide_t best_n = exp((selfcal_wide_t)work->best_ln[SELFCAL_N]);
+    const selfcal_wide_t best_sq = best_n * best_n / (selfcal_wide_t)work->bank->model->dt_s;
     const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
-    const selfcal_wide_t sigma_sq = n_mean * n_mean * (1.0 + 2.0 * first + second) / (selfcal_wide_t)work->bank->model->dt_s;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
-    const selfcal_wide_t prior_precision = sigma_sq / (sd * sd);
+    const selfcal_wide_t prior_precision = best_sq * (1.0 + 2.0 * first + second) / (sd * sd);
     const selfcal_wide_t offset = selfcal_offset(work->bank, work->axis);
-    cardinal_weights(work);
-    selfcal_wide_t mean = 0.0;
-    for (int pass = 0; pass < 2; pass++) {
-        selfcal_wide_t sum = 0.0;
+    selfcal_wide_t mean = 0.0, scatter = 0.0, own = 0.0;
+    for (int pass = 0; pass < 3; pass++) {
+        if (pass != 1) {
+            cardinal_weights(work, pass == 0 ? work->weight : work->weight_sq);
+        }
         for (uint16_t j = 0; j < nodes_of(work); j++) {
             selfcal_node_view_t v;
             (void)selfcal_node(work->bank, work->axis, (uint16_t)(work->first_node + j), &v);
             const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
-            const selfcal_wide_t bias = (v.b - offset * prior_precision) * variance;
-            const selfcal_wide_t now = v.drift + bias * v.bias_left;
-            sum += work->values[j] * (pass == 0 ? now : (now - mean) * (now - mean) +
-                                                            sigma_sq * (v.drift_var + v.bias_left * v.bias_left * variance));
-        }
-        if (pass == 0) {
-            mean = sum / work->mass;
-        } else {
-            posterior->bias_sd = (float)sqrt(fmax(sum / work->mass, 0.0));
+            const selfcal_wide_t now = v.drift + (v.b - offset * prior_precision) * variance * v.bias_left;
+            const selfcal_wide_t weight = work->values[j] / work->mass;
+            if (pass == 0) {
+                mean += weight * now;
+            } else if (pass == 1) {
+                scatter += weight * (now - mean) * (now - mean);
+            } else {
+                own += weight * best_sq * (v.drift_var + v.bias_left * v.bias_left * variance);
+            }
         }
     }
     posterior->bias_mean = (float)(mean + offset);
+    posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
 }
 
 static selfcal_wide_t ln_prior_density(const selfcal_prior_t *prior) {

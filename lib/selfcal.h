@@ -248,6 +248,8 @@ selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
  * samples counts as their mean with its variance raised by block / used; one with fewer is dropped. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
+/* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */
+
 /* Bank samples in the sums, those of the current batch included. */
 uint32_t selfcal_count(const selfcal_t *self);
 
@@ -322,7 +324,8 @@ typedef struct {
     selfcal_wide_t values[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];
     selfcal_real_t profile[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* B-spline coefficients of the profile ln-likelihood ... */
     selfcal_real_t ln_sigma[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of ln of sigma_v's conditional mode, both less their expectation */
-    selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function */
+    selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function ... */
+    selfcal_real_t weight_sq[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of it times sigma_v^2 over that of the best cell */
     /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
     selfcal_real_t lo[2], width[2];
     selfcal_real_t limit_lo[2], limit_hi[2];
@@ -334,7 +337,7 @@ typedef struct {
     /* sigma_v cells: offsets in ln from the conditional mode, with their weights */
     selfcal_real_t delta[SELFCAL_SIGMA_CELLS], delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS], delta_width;
     /* posterior sums */
-    selfcal_wide_t mass, off_grid, sigma_sq;
+    selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
 } selfcal_work_t;

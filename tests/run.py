@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build"
 #: s; a suite that takes longer hangs.
-TIMEOUT = {"check": 900, "c": 600, "pytest": 3000}
+TIMEOUT = {"check": 900, "c": 600, "bench": 300, "pytest": 3000}
 WORKERS = "2"
 
 
@@ -99,6 +99,17 @@ def c_test(program: Path) -> Count:
     return count
 
 
+def bench() -> Count:
+    """Instruction counts and sizes against the committed ones: exact, so one test."""
+    code, output = run(["make", "--silent", "bench-counts"], TIMEOUT["bench"])
+    skipped = code == 0 and "NOT COMPARED" in output
+    count = Count(skipped=1) if skipped else Count(passed=1) if code == 0 else Count(failed=1)
+    print(f"{'SKIPPED' if skipped else 'ok    ' if code == 0 else 'FAILED'} bench-counts")
+    if not count.passed:
+        print(output)
+    return count
+
+
 def pytest() -> Count:
     """The Python tests; their output is shown as it comes."""
     report = BUILD / "pytest.xml"
@@ -131,7 +142,7 @@ def main() -> None:
     """All suites, each timed; exit code 1 if anything failed."""
     BUILD.mkdir(exist_ok=True)
     total = Count()
-    for suite in (checks, c_tests, pytest):
+    for suite in (checks, c_tests, bench, pytest):
         start = time.monotonic()
         count = suite()
         print(f"{suite.__name__}: {count} ({time.monotonic() - start:.0f} s)", flush=True)

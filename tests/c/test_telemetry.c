@@ -80,7 +80,7 @@ static uint32_t crc_by_division(const selfcal_frame_t *frame)
                                  frame->data[5], (uint8_t)(frame->data[6] & 0x0FU)};
     uint32_t remainder = 0xFFFU;
     for (unsigned bit = 0; bit < 8U * sizeof covered; bit++) {
-        const uint32_t in = covered[bit / 8U] >> (7U - bit % 8U) & 1U;
+        const uint32_t in = ((uint32_t)covered[bit / 8U] >> (7U - bit % 8U)) & 1U;
         const bool subtract = (remainder >> 11 ^ in) == 1U;
         remainder = (remainder << 1 & 0xFFFU) ^ (subtract ? 0xF13U : 0U);
     }

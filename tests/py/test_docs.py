@@ -17,6 +17,12 @@ def test_the_guide_has_the_telemetry_table_of_the_dbc() -> None:
     assert table in (ROOT / "GUIDE.md").read_text(encoding="utf-8")
 
 
+def test_the_guide_has_the_cost_table_of_the_bench() -> None:
+    bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), "--table"]
+    table = subprocess.run(bench, capture_output=True, text=True, check=True).stdout.strip()
+    assert table in (ROOT / "GUIDE.md").read_text(encoding="utf-8")
+
+
 def test_links_of_the_documents_lead_somewhere() -> None:
     for document in ("README.md", "GUIDE.md", "CONTRIBUTING.md"):
         text = (ROOT / document).read_text(encoding="utf-8")

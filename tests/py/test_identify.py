@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from selfcal import _library32
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model, Prior
+from selfcal.model import LAWS, NODES, Model, Prior
 from selfcal.recording import save
 from selfcal.result import AxisResult
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import block_means, identify
+from selfcal.verbs.identify import REPORT_MIN, block_means, identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import shared_recording
@@ -171,6 +172,7 @@ def test_block_means_follow_the_library() -> None:
         ({"engine": "magic"}, "no engine"),
         ({"decimate": 0.0}, "--decimate"),
         ({"decimate": 0.01}, "too short"),
+        ({"decimate": 1e-9}, "outside 1e-06 to 1e+06 Hz"),
         ({"model": "absent.yaml"}, "absent.yaml"),
     ],
 )
@@ -181,6 +183,55 @@ def test_wrong_arguments_are_one_clear_line(arguments: dict[str, object], said: 
         identify(log, **arguments)  # type: ignore[arg-type]
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_slow_records_have_a_bias(tmp_path: Path) -> None:
+    """At 100 s a sample the fastest drift of the prior forgets within one: the answer is still the reference's."""
+    rng = np.random.default_rng(11)
+    log = tmp_path / "slow.csv"
+    save(log, {"gx": ("deg/s", 0.3 + 0.04 * rng.standard_normal(2000))}, 0.01, {})
+    library, dense = (identify(log, engine=engine)["axes"]["gx"] for engine in ("library", "reference"))
+    for law in LAWS:
+        assert library["hypotheses"][law] == pytest.approx(dense["hypotheses"][law], abs=5e-3)
+    assert library["bias_now"]["mean"] == pytest.approx(dense["bias_now"]["mean"], abs=0.05 * dense["bias_now"]["sd"])
+    assert library["bias_now"]["sd"] == pytest.approx(dense["bias_now"]["sd"], rel=0.03)
+
+
+def test_what_is_kept_out_is_counted_and_long_gaps_cost_nothing(tmp_path: Path) -> None:
+    """Saturated, too large for float32, and a gap of 30 years in a record of 2000 samples."""
+    rng = np.random.default_rng(12)
+    y = 0.04 * rng.standard_normal(2000)
+    y[100:120] = 400.0
+    y[500] = 1e39
+    t = np.arange(2000.0)
+    t[1000:] += 1e9
+    log = tmp_path / "gap.csv"
+    save(log, {"gx": ("deg/s", y)}, 1.0, {}, t=t)
+    axis = identify(log)["axes"]["gx"]
+    assert axis["samples_kept_out"] == {"missing": 10**9, "not_finite": 1, "saturated": 20, "stuck": 0}
+    # white noise of 0.04 at 1 Hz, 1979 samples: 4 sd of a variance estimate
+    assert axis["parameters"]["constant"]["N"]["mean"] == pytest.approx(0.04, rel=4 / math.sqrt(2 * 1979))
+    with pytest.raises(UserError, match="too many for the reference"):
+        identify(log, engine="reference")
+
+
+def test_equal_readings_are_said(tmp_path: Path) -> None:
+    log = tmp_path / "stuck.csv"
+    save(log, {"gx": ("deg/s", np.full(500, 0.3))}, 1.0, {})
+    with pytest.raises(UserError, match="all averages are equal"):
+        identify(log)
+
+
+def test_the_model_allows_what_the_library_holds() -> None:
+    assert NODES[1] == _library32.GRID_MAX
+    assert REPORT_MIN == _library32.REPORT_MIN
+
+
+def test_a_model_key_given_twice_is_refused(tmp_path: Path) -> None:
+    model = tmp_path / "model.yaml"
+    model.write_text(Path(MODEL.path).read_text() + "bank_rate_hz: 2.0\n")
+    with pytest.raises(UserError, match="'bank_rate_hz' appears twice"):
+        Model.load(model)
 
 
 def test_noise_beyond_the_prior_is_said(tmp_path: Path) -> None:

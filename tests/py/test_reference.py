@@ -1,7 +1,7 @@
 """The textbook bank and its engine against the definition of the model.
 
-Truth is always the multivariate normal density of the record with its covariance written out from the model (the design notes,
-"The problem"), integrated where needed by Gauss-Legendre or adaptive quadrature: nothing recursive, no filter.
+Truth is always the multivariate normal density of the record with its covariance written out from the model,
+integrated where needed by Gauss-Legendre or adaptive quadrature: nothing recursive, no filter.
 """
 
 from __future__ import annotations

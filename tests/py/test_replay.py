@@ -1,8 +1,8 @@
 """`selfcal replay`: recording, firmware, wire and decoder together, and the host firmware's own manners.
 
 Truth: the same C library over the same float32 samples in one six-axis bank, called directly through the binding. What
-may differ is what the wire rounds: the contract allows 1e-4 in a probability and 0.01 nat in an evidence difference; the
-other numbers travel as float32 and the same code made them, so 1e-3 posterior sd is wide.
+may differ is what the wire rounds: the contract allows 1e-4 in a probability and 0.01 nat in an evidence difference;
+the other numbers travel as float32 and the same code made them, so 1e-3 posterior sd is wide.
 """
 
 from __future__ import annotations

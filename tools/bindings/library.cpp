@@ -193,6 +193,7 @@ private:
 NB_MODULE(MODULE_NAME, m) {
     using MODULE_NAME::Bank;
     m.attr("version") = SELFCAL_VERSION;
+    m.attr("GRID_MAX") = SELFCAL_GRID_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
     m.attr("AT_MIN") = static_cast<int>(SELFCAL_AT_MIN);

@@ -21,6 +21,8 @@ LAWS: dict[str, tuple[str, ...]] = {
     "random_walk": ("N", "K"),
     "gauss_markov": ("N", "sigma_m", "alpha"),
 }
+#: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
+NODES = (6, 16)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
 
@@ -89,6 +91,19 @@ class Model:
         return _Reader(DEFAULT if path is None else Path(path)).model()
 
 
+class _Loader(yaml.SafeLoader):
+    """Safe loading that refuses a key given twice, of which YAML would silently take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, str) and key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key}' appears twice", key_node.start_mark)
+            seen.add(str(key))
+        return super().construct_mapping(node, deep)
+
+
 class _Reader:
     """Walks the YAML tree; every complaint carries the file and the dotted name of the entry."""
 
@@ -106,11 +121,13 @@ class _Reader:
         except UnicodeDecodeError as error:
             raise UserError(f"{self.path}: not a text file") from error
         try:
-            tree = yaml.safe_load(text)
+            tree = yaml.load(text, Loader=_Loader)  # a safe loader
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             line = f"line {mark.line + 1}: " if mark is not None else ""
-            raise UserError(f"{self.path}: {line}not valid YAML") from error
+            twice = str(getattr(error, "problem", ""))
+            what = twice if twice.endswith("appears twice") else "not valid YAML"
+            raise UserError(f"{self.path}: {line}{what}") from error
         if not isinstance(tree, dict):
             raise UserError(f"{self.path}: not a model file (a YAML mapping with schema: {SCHEMA})")
         return tree
@@ -138,9 +155,9 @@ class _Reader:
             raise self.fail(where, f"must be a finite number {bound} {low:g}, not {value!r}")
         return number
 
-    def count(self, value: Any, where: str, low: int) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise self.fail(where, f"must be a whole number of at least {low}, not {value!r}")
+    def count(self, value: Any, where: str, low: int, high: int = 2**31 - 1) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.fail(where, f"must be a whole number from {low} to {high}, not {value!r}")
         return value
 
     def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
@@ -185,8 +202,11 @@ class _Reader:
         if not isinstance(pair, list) or len(pair) != 2:
             raise self.fail(f"{where}.gauss_markov", "must be [rho nodes, alpha nodes]")
         return GridNodes(
-            self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", 6),
-            (self.count(pair[0], f"{where}.gauss_markov", 6), self.count(pair[1], f"{where}.gauss_markov", 6)),
+            self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", *NODES),
+            (
+                self.count(pair[0], f"{where}.gauss_markov", *NODES),
+                self.count(pair[1], f"{where}.gauss_markov", *NODES),
+            ),
         )
 
     def model(self) -> Model:

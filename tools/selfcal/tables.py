@@ -14,6 +14,11 @@ from scipy.interpolate import BSpline
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS, Model
 
+#: Hz; beyond these the bank interval has no meaning for a drift.
+RATE_LIMITS = (1e-6, 1e6)
+#: Samples a bank interval: the float sums of one block lose digits with more.
+MOST_BLOCK = 1_000_000
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -104,8 +109,15 @@ def make_tables(
     if target not in model.nodes:
         raise UserError(f"{model.path}: nodes has no target '{target}' (it has {', '.join(model.nodes)})")
     nodes = model.nodes[target]
+    bank_rate = bank_rate_hz or model.bank_rate_hz
+    for rate, what in ((rate_hz, "the sampling rate"), (bank_rate, "the bank rate")):
+        if not RATE_LIMITS[0] <= rate <= RATE_LIMITS[1]:
+            low, high = RATE_LIMITS
+            raise UserError(f"{what}, {rate:g} Hz, is outside {low:g} to {high:g} Hz")
     names = model.axes if axes is None else axes
-    block = bank_block(rate_hz, bank_rate_hz or model.bank_rate_hz)
+    block = bank_block(rate_hz, bank_rate)
+    if block > MOST_BLOCK:
+        raise UserError(f"{block} samples a bank interval ({rate_hz:g} to {bank_rate:g} Hz) are more than {MOST_BLOCK}")
     axis_tables = []
     for name in names:
         group = model.group_of(name)

@@ -26,6 +26,7 @@ missing_packages() {
     need clang-tidy have clang-tidy
     need gcc-arm-none-eabi have arm-none-eabi-gcc
     need libnewlib-arm-none-eabi header math.h arm-none-eabi-gcc
+    need qemu-system-arm have qemu-system-arm
     need xz-utils have xz
     need python3 have "$PYTHON"
     need python3-venv "$PYTHON" -c 'import ensurepip, venv'

@@ -58,8 +58,9 @@ class Bank:
         if not any(math.isfinite(p) for p in probability.values()):
             prior = self.tables.axes[axis]
             raise UserError(
-                f"axis {prior.name}: the record lies outside the model's priors (white noise N beyond "
-                f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g}); widen them in the model file"
+                f"the record lies outside the model's priors of {prior.name}, whose white noise N runs from "
+                f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz): widen "
+                "them in the model file, or check the unit and whether the sensor was at rest"
             )
         return AxisResult(report["n"], log_evidence, probability, parameters, report["bias_mean"], report["bias_sd"])
 

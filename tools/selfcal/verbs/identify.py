@@ -27,18 +27,23 @@ from selfcal.tables import Tables, make_tables
 
 SCHEMA = "selfcal.identify/1"
 #: The table never folds its numbers: a narrower terminal wraps its lines.
-TABLE_WIDTH = 116
+TABLE_WIDTH = 140
+#: Bank samples a report needs (SELFCAL_REPORT_MIN).
+REPORT_MIN = 3
+#: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
+MOST_DENSE = 10_000_000
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
 
 
 @dataclass(frozen=True)
 class Identified:
-    """One axis: the engine's `result` in `unit`, and the `checks` of its adequacy (value, limit, passed)."""
+    """One axis: the engine's `result` in `unit`, `checks` of its adequacy, and the samples `kept_out`."""
 
     unit: str
     result: AxisResult
     checks: Mapping[str, Mapping[str, Any]]
+    kept_out: Mapping[str, int]
 
     @property
     def adequate(self) -> bool:
@@ -75,13 +80,17 @@ def identify(
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
-    names = chosen_axes(recording, loaded_model, axes)
+    names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified] = {}
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("identify", total=len(names))
         for name in names:
             progress.update(task, description=f"{name} ({engine})")
-            found[name] = identify_axis(recording, name, loaded_model, engine, decimate)
+            try:
+                found[name] = identify_axis(recording, name, loaded_model, engine, decimate)
+            except UserError as error:
+                raise UserError(f"{recording.path}: column {name}: {error}") from error
             progress.advance(task)
     document = to_document(recording, found)
     if json is not None:
@@ -110,8 +119,16 @@ def identify_axis(recording: Recording, name: str, model: Model, engine: str, de
     """One axis by one engine. The record is fed as float32, as the firmware gets it."""
     group = model.group_of(name)
     tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=decimate)
-    samples = recording.in_unit(name, group.unit).astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
+        samples = recording.in_unit(name, group.unit).astype(np.float32)
     blocks = block_means(samples.astype(np.float64), recording.missing_before, tables.block, group)
+    present = blocks.mean[np.isfinite(blocks.mean)]
+    if present.size < REPORT_MIN:
+        kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
+        found = f"{present.size} averages of {tables.dt_s:g} s"
+        raise UserError(f"too short: {found}, {REPORT_MIN} are needed (samples kept out: {kept})")
+    if not present.std() > 0.0:
+        raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
     if engine == "library":
         from selfcal.engines.library import Bank
 
@@ -121,10 +138,12 @@ def identify_axis(recording: Recording, name: str, model: Model, engine: str, de
     else:
         from selfcal.engines import reference
 
+        if blocks.mean.size > MOST_DENSE:
+            raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")
         result = reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r)
     checks = _checks(blocks, tables, group, result)
     unit = recording.columns[name].unit
-    return Identified(unit, in_unit(result, group.unit, unit), checks)
+    return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
 
 
 @dataclass(frozen=True)
@@ -132,31 +151,41 @@ class Blocks:
     """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
-    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block.
+    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
+    samples that were not used, by reason. Blocks beyond MOST_DENSE intervals are not worked out.
     """
 
     mean: NDArray[np.float64]
     r: NDArray[np.float64]
     within_sd: float
+    kept_out: Mapping[str, int]
 
 
 def block_means(
     samples: NDArray[np.float64], missing_before: NDArray[np.int64], block: int, group: Group
 ) -> Blocks:
     """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out."""
-    usable = np.ones(samples.size, bool)
-    if group.range > 0.0:
-        usable &= np.abs(samples) < np.float32(group.range)
+    finite = np.isfinite(samples)
+    limit = np.float32(group.range) if group.range > 0.0 else np.inf
+    saturated = finite & (np.abs(samples) >= limit)
+    stuck = np.zeros(samples.size, bool)
     if group.stuck_limit > 0:
         change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
         run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
-        usable &= run < group.stuck_limit
+        stuck = finite & (run >= group.stuck_limit)
+    usable = finite & ~saturated & ~stuck
+    kept_out = {
+        "missing": int(missing_before.sum()),
+        "not_finite": int((~finite).sum()),
+        "saturated": int(saturated.sum()),
+        "stuck": int(stuck.sum()),
+    }
     at = np.arange(samples.size) + np.cumsum(missing_before)
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
     at -= at[np.argmax(usable)]
     values, index = samples[usable], at[usable] // block
-    count = int(at[-1] + 1) // block
+    count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
     keep = index < count
     values, index = values[keep], index[keep]
     used = np.bincount(index, minlength=count)
@@ -170,13 +199,15 @@ def block_means(
     squares = float(((values - raw[index])[good] ** 2).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within)
+    return Blocks(mean[first:], r[first:], within, kept_out)
 
 
 def _checks(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
     """Are the innovations of the most probable law, at its posterior medians, white, normal and of one variance?"""
     from selfcal import _reference
 
+    if blocks.mean.size > MOST_DENSE:
+        return {}
     law = max(result.probability, key=lambda name: result.probability[name])
     at = {name: estimate.median for name, estimate in result.parameters[law].items()}
     offset = float(np.nanmean(blocks.mean))
@@ -258,6 +289,7 @@ def to_document(recording: Recording, found: Mapping[str, Identified]) -> dict[s
                     for law, estimates in axis.result.parameters.items()
                 },
                 "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
+                "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
                 "checks": {key: dict(check) for key, check in axis.checks.items()},
             }
@@ -300,6 +332,7 @@ def show(document: Mapping[str, Any]) -> None:
     for heading in ("law", "P", "N", "K or sigma_m", "1/alpha, s"):
         table.add_column(heading, no_wrap=True)
     failed: list[str] = []
+    kept: list[str] = []
     for name, axis in document["axes"].items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
@@ -316,14 +349,17 @@ def show(document: Mapping[str, Any]) -> None:
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
+        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
+        if counts:
+            kept.append(f"kept out: {name}: {', '.join(counts)}")
         for check, outcome in axis["checks"].items():
             if not outcome["passed"]:
-                failed.append(f"{name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
+                failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
     console = Console()
     console.width = max(console.width, TABLE_WIDTH)
     console.print(table)
-    for line in failed:
-        console.print(f"not adequate: {line}", highlight=False)
+    for line in (*kept, *failed):
+        console.print(line, highlight=False)
 
 
 def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> str:

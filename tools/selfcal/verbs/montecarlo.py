@@ -67,7 +67,9 @@ def montecarlo(
     jobs = [(law, seed + 1_000_003 * index) for law in loaded.hypotheses for index in range(records)]
     work = partial(_record, loaded, axis, duration_s)
     found: list[Record] = []
-    with Progress(console=Console(stderr=True), transient=True) as progress, multiprocessing.Pool() as pool:
+    console = Console(stderr=True)
+    hidden = not console.is_terminal
+    with Progress(console=console, transient=True, disable=hidden) as progress, multiprocessing.Pool() as pool:
         task = progress.add_task("records", total=len(jobs))
         for record in pool.imap(work, jobs, chunksize=8):
             found.append(record)

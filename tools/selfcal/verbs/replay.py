@@ -28,6 +28,8 @@ from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 MAGIC = b"SELFCAL1"
 REPORTS = 100  # of each axis in a run, unless --report-every says otherwise
 TIMEOUT_S = 60.0  # without a frame
+LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
+PLOT_FORMATS = (".png", ".pdf", ".svg", ".jpg")
 
 
 def replay(
@@ -57,6 +59,8 @@ def replay(
         raise UserError(f"--transport {transport}: this build has the transport slcan only")
     if report_every is not None and not (math.isfinite(report_every) and report_every >= 0.001):
         raise UserError(f"--report-every must be at least 0.001 s, not {report_every:g}")
+    if plot is not None and Path(plot).suffix not in PLOT_FORMATS:
+        raise UserError(f"{plot}: a plot is one of {', '.join(PLOT_FORMATS)}")
     for file in (json, plot):
         if file is not None and not Path(file).parent.is_dir():
             raise UserError(f"{file}: cannot write: there is no such folder")
@@ -126,7 +130,7 @@ def run(
 ) -> dict[str, list[AxisReport]]:
     """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts."""
     block = bank_block(recording.rate_hz, model.bank_rate_hz)
-    period_s = report_every or max(block / recording.rate_hz, recording.duration_s / REPORTS)
+    period_s = report_every or min(max(block / recording.rate_hz, recording.duration_s / REPORTS), LONGEST_PERIOD_S)
     history: dict[str, list[AxisReport]] = {name: [] for name in axes}
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
@@ -182,7 +186,7 @@ def _document(
         if not any(math.isfinite(p) for p in result.probability.values()):
             raise UserError(f"{recording.path}: axis {name}: outside the model's priors; widen them in the model file")
         unit = recording.columns[name].unit
-        found[name] = Identified(unit, in_unit(result, model.group_of(name).unit, unit), {})
+        found[name] = Identified(unit, in_unit(result, model.group_of(name).unit, unit), {}, {})
     document = to_document(recording, found)
     for axis in document["axes"].values():
         axis["adequate"] = None  # telemetry carries no innovations to check

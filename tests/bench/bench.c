@@ -1,0 +1,342 @@
+/* Counts the instructions of the library on a Cortex-M. Prints, for bench.py,
+ *   count NAME TICKS PARTS ROUNDS PER   of SysTick, in PARTS measurements (see image_time_t for ROUNDS), for PER units of work
+ *   value NAME NUMBER
+ * and ends with exit code 0. Every run is the same. */
+#include "image.h"
+#include "paper_float.h"
+#include "record.h"
+
+#include <math.h>
+#include <stdbool.h>
+
+#define AXES SELFCAL_MODEL_AXES /* six: bench.py counts on it */
+/* Bank samples counted at a time: whole batches, and the sums are folded once. */
+#define WINDOW 64U
+/* Bank samples of the record that reports are made of: an hour at 1 Hz. */
+#define HOUR 3600U
+
+static uint64_t memory[(SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES) + 7U) / 8U];
+static selfcal_t bank;
+static selfcal_work_t work;
+static selfcal_report_t report;
+static selfcal_telemetry_t telemetry;
+
+/* ------------------------------------------------------------------------------------------------------------ printing */
+
+/* Some measurements together. */
+typedef struct {
+    uint64_t ticks;
+    uint32_t rounds, parts;
+} taken_t;
+
+static void print_name(const char *kind, const char *name) {
+    image_print(kind);
+    image_print(" ");
+    image_print(name);
+    image_print(" ");
+}
+
+static void print_value(const char *name, uint64_t number) {
+    print_name("value", name);
+    image_print_number(number);
+    image_print("\n");
+}
+
+static void print_count(const char *name, taken_t taken, uint64_t per) {
+    print_name("count", name);
+    image_print_number(taken.ticks);
+    image_print(" ");
+    image_print_number(taken.parts);
+    image_print(" ");
+    image_print_number(taken.rounds);
+    image_print(" ");
+    image_print_number(per);
+    image_print("\n");
+}
+
+static taken_t since(image_time_t start) {
+    const image_time_t now = image_now();
+    const taken_t taken = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
+    return taken;
+}
+
+static void add(taken_t *sum, taken_t part) {
+    sum->ticks += part.ticks;
+    sum->rounds += part.rounds;
+    sum->parts += part.parts;
+}
+
+static void require(bool holds, const char *what) {
+    if (!holds) {
+        print_name("failed", what);
+        image_print("\n");
+        image_exit(2U);
+    }
+}
+
+/* ------------------------------------------------------------------------------------------------------------ measures */
+
+static record_t record;
+static selfcal_model_t model; /* record_model() */
+static float window[WINDOW][AXES];
+
+static void make_window(void) {
+    for (unsigned i = 0; i < WINDOW; i++) {
+        record_next(&record, window[i]);
+    }
+}
+
+static void push_window(unsigned samples) {
+    for (unsigned i = 0; i < samples; i++) {
+        (void)selfcal_push(&bank, window[i]);
+    }
+}
+
+static void init(const selfcal_model_t *which) {
+    record_init(&record);
+    require(selfcal_init(&bank, which, memory, sizeof memory) == SELFCAL_OK, "init");
+}
+
+static void measure_clock(void) {
+    image_time_t start = image_now();
+    print_count("clock.empty", since(start), 1U);
+    start = image_now();
+    image_known_loop(1000U);
+    print_count("clock.loop_1000", since(start), 1U);
+    start = image_now();
+    image_known_loop(2001000U);
+    print_count("clock.loop_2001000", since(start), 1U);
+}
+
+/* The averager alone: one block of the default model. */
+static void measure_push(void) {
+    init(&selfcal_model);
+    taken_t taken = {0, 0, 0};
+    unsigned left = selfcal_model.block;
+    while (left > 0U) {
+        const unsigned samples = left < WINDOW ? left : WINDOW;
+        make_window();
+        const image_time_t start = image_now();
+        push_window(samples);
+        add(&taken, since(start));
+        left -= samples;
+    }
+    require(selfcal_count(&bank) == 1U, "one block");
+    print_count("push", taken, selfcal_model.block);
+}
+
+static void measure_window(const char *name) {
+    make_window();
+    const image_time_t start = image_now();
+    push_window(WINDOW);
+    print_count(name, since(start), (uint64_t)WINDOW * SELFCAL_MODEL_NODES * AXES);
+}
+
+static void measure_steady(void) {
+    selfcal_axis_t axis[AXES];
+    const selfcal_model_t fast = record_narrow_model(true, axis);
+    init(&fast);
+    while (record_settled(&bank) < SELFCAL_MODEL_NODES) {
+        require(selfcal_count(&bank) < 5000U, "every filter settles");
+        make_window();
+        push_window(WINDOW);
+    }
+    measure_window("bank.steady");
+    /* The worst sample is that which fills a batch and has the sums folded. */
+    make_window();
+    push_window(WINDOW - 1U);
+    image_time_t start = image_now();
+    (void)selfcal_push(&bank, window[WINDOW - 1U]);
+    print_count("bank.steady.worst_push", since(start), 1U);
+
+    selfcal_node_view_t view;
+    (void)selfcal_skip(&bank, 10U);
+    start = image_now();
+    (void)selfcal_node(&bank, 0U, 0U, &view); /* runs the gap; the view itself is small beside it */
+    print_count("bank.gap", since(start), 1U);
+}
+
+static void measure_varying(void) {
+    selfcal_axis_t axis[AXES];
+    const selfcal_model_t slow = record_narrow_model(false, axis);
+    init(&slow);
+    make_window();
+    push_window(SELFCAL_BATCH - 1U);
+    image_time_t start = image_now();
+    (void)selfcal_push(&bank, window[SELFCAL_BATCH - 1U]);
+    print_count("bank.first_batch", since(start), 1U);
+    make_window();
+    push_window(WINDOW - SELFCAL_BATCH);
+    measure_window("bank.varying");
+    require(record_settled(&bank) == 1U, "all filters but the constant one vary");
+}
+
+/* An hour at 1 Hz under the default priors. */
+static void measure_hour(void) {
+    init(&model);
+    taken_t hour = {0, 0, 0};
+    while (selfcal_count(&bank) < HOUR) {
+        make_window();
+        const unsigned left = HOUR - selfcal_count(&bank);
+        const image_time_t start = image_now();
+        push_window(left < WINDOW ? left : WINDOW);
+        add(&hour, since(start));
+    }
+    print_count("bank.hour", hour, (uint64_t)HOUR * SELFCAL_MODEL_NODES * AXES);
+    print_value("bank.hour.settled", record_settled(&bank));
+}
+
+static void measure_report(void) {
+    static const char *const stage_name[][3] = {
+        {"report.fields", "report.fields.worst_step", "report.fields.steps"},
+        {"report.fit", "report.fit.worst_step", "report.fit.steps"},
+        {"report.scan", "report.scan.worst_step", "report.scan.steps"},
+        {"report.sum", "report.sum.worst_step", "report.sum.steps"},
+        {"report.finish", "report.finish.worst_step", "report.finish.steps"},
+    };
+    enum { STAGES = sizeof stage_name / sizeof stage_name[0] };
+    taken_t sum[STAGES] = {{0, 0, 0}}, worst[STAGES] = {{0, 0, 0}};
+    unsigned steps[STAGES] = {0};
+    image_time_t start = image_now();
+    require(selfcal_report_begin(&work, &bank, 0U, &report) == SELFCAL_OK, "report begins");
+    taken_t total = since(start);
+    selfcal_status_t status = SELFCAL_BUSY;
+    while (status == SELFCAL_BUSY) {
+        const unsigned stage = work.stage;
+        require(stage < STAGES, "the stages of posterior.c");
+        start = image_now();
+        status = selfcal_report_step(&work, &report);
+        const taken_t taken = since(start);
+        steps[stage]++;
+        add(&sum[stage], taken);
+        add(&total, taken);
+        if (taken.ticks > worst[stage].ticks) {
+            worst[stage] = taken;
+        }
+    }
+    require(status == SELFCAL_OK, "report ends");
+    print_count("report", total, 1U);
+    for (unsigned stage = 0; stage < STAGES; stage++) {
+        print_count(stage_name[stage][0], sum[stage], 1U);
+        print_count(stage_name[stage][1], worst[stage], 1U);
+        print_value(stage_name[stage][2], steps[stage]);
+    }
+}
+
+static void measure_telemetry(void) {
+    require(selfcal_telemetry_init(&telemetry, &selfcal_model, selfcal_model_axis_name) == SELFCAL_OK, "telemetry");
+    const image_time_t start = image_now();
+    (void)selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank), HOUR * 1000U);
+    unsigned frames = 0;
+    selfcal_frame_t frame;
+    while (selfcal_telemetry_next(&telemetry, &frame)) {
+        frames++;
+    }
+    print_count("telemetry", since(start), frames);
+}
+
+#ifdef __ARM_FP
+
+/* The paper's recursion over some nodes of the bank, times a grid of sigma_v, on one axis; then the weights of both. */
+enum { PAPER_NODES = 12, PAPER_SIGMAS = 12, PAPER_FILTERS = PAPER_NODES * PAPER_SIGMAS, PAPER_SAMPLES = 1000 };
+
+static paper_filter_t paper[PAPER_FILTERS];
+static selfcal_wide_t ln_likelihood[PAPER_FILTERS];
+
+static uint16_t paper_node(unsigned i) {
+    return (uint16_t)(i * (SELFCAL_MODEL_NODES - 1U) / (PAPER_NODES - 1U));
+}
+
+/* 12 values a factor 1.01 apart about what made the record, so that several keep some weight. */
+static selfcal_wide_t paper_sigma(unsigned k) {
+    return 0.04 * exp(0.01 * ((selfcal_wide_t)k - 0.5 * (PAPER_SIGMAS - 1)));
+}
+
+static void paper_init(paper_filter_t *f, const selfcal_node_view_t *node, selfcal_wide_t sigma_v) {
+    const selfcal_wide_t bias_sd = (selfcal_wide_t)model.axis[0].bias_sd;
+    selfcal_wide_t phi = 1.0, q = 0.0, p_first = 0.0; /* before the first prediction */
+    if (node->law == SELFCAL_RANDOM_WALK) {
+        q = exp(2.0 * node->ln_rho);
+    } else if (node->law == SELFCAL_GAUSS_MARKOV) {
+        const selfcal_wide_t alpha_dt = exp(node->ln_alpha) * (selfcal_wide_t)model.dt_s;
+        phi = exp(-alpha_dt);
+        p_first = exp(2.0 * node->ln_rho);
+        q = p_first * -expm1(-2.0 * alpha_dt);
+    }
+    const selfcal_wide_t r = sigma_v * sigma_v;
+    const paper_filter_t start = {(float)phi, (float)(q * r), (float)r, 0.0F, 0.0F, (float)(p_first * r), 0.0F,
+                                  (float)(bias_sd * bias_sd), 0.0F};
+    *f = start;
+}
+
+static void measure_paper(void) {
+    init(&model);
+    for (unsigned i = 0; i < PAPER_SAMPLES; i++) {
+        float sample[AXES];
+        record_next(&record, sample);
+        (void)selfcal_push(&bank, sample);
+    }
+    for (unsigned i = 0; i < PAPER_NODES; i++) {
+        selfcal_node_view_t node;
+        require(selfcal_node(&bank, 0U, paper_node(i), &node) == SELFCAL_OK, "node");
+        for (unsigned k = 0; k < PAPER_SIGMAS; k++) {
+            const unsigned j = i * PAPER_SIGMAS + k;
+            paper_init(&paper[j], &node, paper_sigma(k));
+            require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k), &ln_likelihood[j]) == SELFCAL_OK, "likelihood");
+        }
+    }
+    record_init(&record);
+    taken_t taken = {0, 0, 0};
+    for (unsigned i = 0; i < PAPER_SAMPLES; i++) {
+        float sample[AXES];
+        record_next(&record, sample);
+        const image_time_t start = image_now();
+        paper_sample(paper, PAPER_FILTERS, sample[0]);
+        add(&taken, since(start));
+    }
+    print_count("paper", taken, (uint64_t)PAPER_SAMPLES * PAPER_FILTERS);
+
+    selfcal_wide_t highest = (selfcal_wide_t)-INFINITY, sum = 0.0, worst = 0.0, heaviest = 0.0;
+    for (unsigned j = 0; j < PAPER_FILTERS; j++) {
+        highest = fmax(highest, ln_likelihood[j]);
+    }
+    for (unsigned j = 0; j < PAPER_FILTERS; j++) {
+        sum += exp(ln_likelihood[j] - highest);
+    }
+    for (unsigned j = 0; j < PAPER_FILTERS; j++) {
+        const selfcal_wide_t weight = exp(ln_likelihood[j] - highest) / sum;
+        heaviest = fmax(heaviest, weight);
+        worst = fmax(worst, fabs(weight - exp((selfcal_wide_t)paper[j].ln_weight)));
+    }
+    print_value("paper.worst_weight_difference_1e9", (uint64_t)(1e9 * worst));
+    print_value("paper.heaviest_weight_1e9", (uint64_t)(1e9 * heaviest));
+}
+
+#endif
+
+static void measure_sizes(void) {
+    print_value("ram.selfcal_t", sizeof bank);
+    print_value("ram.selfcal_work_t", sizeof work);
+    print_value("ram.selfcal_report_t", sizeof report);
+    print_value("ram.selfcal_telemetry_t", sizeof telemetry);
+    print_value("ram.SELFCAL_SIZE", SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES));
+    print_value("nodes", SELFCAL_MODEL_NODES);
+    print_value("block", selfcal_model.block);
+}
+
+int main(void) {
+    image_start_clock();
+    model = record_model();
+    measure_sizes();
+    measure_clock();
+    measure_push();
+    measure_steady();
+    measure_varying();
+    measure_hour();
+    measure_report();
+    measure_telemetry();
+#ifdef __ARM_FP
+    measure_paper();
+#endif
+    return 0;
+}

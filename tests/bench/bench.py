@@ -1,0 +1,337 @@
+"""What the library costs: exact instructions on emulated Cortex-M, bytes, and on request ns on this machine.
+
+Compares with counts.json beside this file: growth above 2 % fails. Run by `make bench`, which builds the images first.
+Counts of another compiler than that of counts.json are not compared; a line `NOT COMPARED` says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TypedDict
+
+ROOT = Path(__file__).resolve().parents[2]
+BUILD = ROOT / "build" / "bench"
+REFERENCE = Path(__file__).with_name("counts.json")
+GROWTH = Fraction(2, 100)
+#: s; an image that takes longer hangs.
+TIMEOUT = 120
+#: Instructions of the SysTick handler in image.c, and of the known loop's turns.
+HANDLER, TURN = 5, 3
+#: `-icount shift=6`: an instruction takes 2^6 ns.
+SECONDS_PER_INSTRUCTION = Fraction(2**6, 10**9)
+#: The default model's samples; axes of the images.
+RATE_HZ, AXES = Fraction(8192, 10), 6
+#: sigma_v nodes of the paper's grid.
+SIGMAS = 12
+#: Filters of the paper's recursion and of the library may give weights that differ by this part of the heaviest: with
+#: P0 = (10 deg/s)^2 the first plain float update p_00 - k h leaves a rounding error of 2^-24 P0, 0.4 % of sigma_v^2.
+WEIGHT_TOLERANCE = 4e-3
+
+
+class Figures(TypedDict):
+    """Of one target. `counts`: [instructions, units of work]; `sizes`: bytes; `facts`: what they go with."""
+
+    counts: dict[str, list[int]]
+    sizes: dict[str, int]
+    facts: dict[str, int]
+
+
+class Bench(TypedDict):
+    """All that is exact."""
+
+    compiler: str
+    targets: dict[str, Figures]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What QEMU emulates for a target."""
+
+    board: str
+    options: tuple[str, ...]
+    systick_hz: int
+
+
+MACHINES = {
+    "cortex-m4f": Machine("netduinoplus2", (), 168_000_000),
+    # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
+    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000),
+}
+
+
+class BenchError(Exception):
+    """What went wrong, in one line."""
+
+
+def run(command: list[str]) -> str:
+    """Output of a command, standard error included. Raises BenchError if it fails or hangs."""
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=TIMEOUT,
+            text=True,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BenchError(f"{command[0]}: {error}") from error
+    if done.returncode != 0:
+        raise BenchError(f"{' '.join(command)}: exit code {done.returncode}\n{done.stdout}")
+    return done.stdout
+
+
+# ------------------------------------------------------------------------------------------------------------ measuring
+
+
+def run_image(target: str) -> tuple[dict[str, list[int]], dict[str, int]]:
+    """Counts and values that the image of a target prints."""
+    machine = MACHINES[target]
+    output = run(
+        [
+            *("qemu-system-arm", "-M", machine.board, *machine.options, "-display", "none", "-monitor", "none"),
+            *("-serial", "none", "-icount", "shift=6,sleep=off", "-semihosting-config", "enable=on,target=native"),
+            *("-kernel", str(BUILD / target / "image.elf")),
+        ]
+    )
+    values = {name: int(number) for name, number in re.findall(r"^value (\S+) (\d+)$", output, re.MULTILINE)}
+    raw = {
+        name: [int(number) for number in numbers.split()]
+        for name, numbers in re.findall(r"^count (\S+) ([\d ]+)$", output, re.MULTILINE)
+    }
+    ticks_per_instruction = machine.systick_hz * SECONDS_PER_INSTRUCTION
+    empty = raw.pop("clock.empty")[0]
+
+    def instructions(ticks: int, parts: int, rounds: int) -> int:
+        return round((ticks - parts * empty) / ticks_per_instruction) - HANDLER * rounds
+
+    short, long = (instructions(*raw.pop(f"clock.loop_{turns}")[:3]) for turns in (1000, 2001000))
+    if abs(long - short - TURN * 2_000_000) > 1:  # one for the rounding of either
+        raise BenchError(f"{target}: SysTick does not count instructions: {long - short} for {TURN * 2_000_000}")
+    return {name: [instructions(*numbers[:3]), numbers[3]] for name, numbers in raw.items()}, values
+
+
+def text_sizes(target: str) -> dict[str, int]:
+    """Bytes of flash (code and constants): the library's objects, what the linker kept of them and drew in."""
+    library = sorted(path.stem for path in (ROOT / "lib").glob("*.c"))
+    objects = [str(BUILD / target / "objects" / f"{name}.o") for name in library]
+    sizes = {}
+    for line in run(["arm-none-eabi-size", *objects]).splitlines()[1:]:
+        text, *_, path = line.split()
+        sizes[f"text.{Path(path).stem}"] = int(text)
+    sizes["text.library"] = sum(sizes.values())
+    kept = {"library": 0, "tables": 0, "runtime": 0}
+    linked = (BUILD / target / "image.map").read_text().partition("Linker script and memory map")[2]
+    section = re.compile(r"^ \.(?:text|rodata)\S*\s+0x[0-9a-f]+\s+0x([0-9a-f]+)\s+(\S.*)$", re.MULTILINE)
+    for size, path in section.findall(linked):
+        if Path(path).stem in library:
+            kept["library"] += int(size, 16)
+        elif Path(path).stem == "selfcal_model":
+            kept["tables"] += int(size, 16)
+        elif ".a(" in path:
+            kept["runtime"] += int(size, 16)
+    return sizes | {f"linked.{room}": size for room, size in kept.items()}
+
+
+def measure(target: str) -> Figures:
+    """All exact figures of a target. Raises BenchError."""
+    counts, values = run_image(target)
+    sizes = {name: value for name, value in values.items() if name.startswith("ram.")}
+    facts = {name: value for name, value in values.items() if name not in sizes}
+    if "paper" in counts:
+        difference, heaviest = facts["paper.worst_weight_difference_1e9"], facts["paper.heaviest_weight_1e9"]
+        if difference > WEIGHT_TOLERANCE * heaviest:
+            raise BenchError(
+                f"{target}: posterior weights of the library and of the paper's recursion differ by {difference}e-9, "
+                f"more than {WEIGHT_TOLERANCE:g} of the heaviest, {heaviest}e-9"
+            )
+    return {"counts": counts, "sizes": text_sizes(target) | sizes, "facts": facts}
+
+
+def measure_host() -> dict[str, dict[str, float]]:
+    """ns per (node, sample, axis) of the library and of one textbook filter, by compiler flags."""
+    found = {}
+    for variant in ("O2", "O3-avx2"):
+        if variant == "O3-avx2" and not {"avx2", "fma"} <= set(Path("/proc/cpuinfo").read_text().split()):
+            continue
+        lines = run([str(BUILD / "host" / variant / "bench")]).splitlines()
+        found[variant] = {name: float(ns) for name, ns in (line.split() for line in lines)}
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------ comparing
+
+
+def costs(figures: Figures) -> dict[str, Fraction]:
+    """What may not grow: instructions per unit of work, bytes. The baseline is not the library's."""
+    counts = {name: Fraction(count, per) for name, (count, per) in figures["counts"].items() if name != "paper"}
+    return counts | {name: Fraction(size) for name, size in figures["sizes"].items()}
+
+
+def compare(now: Bench, before: Bench) -> list[str]:
+    """Complaints: what grew by more than GROWTH, is new or gone. Prints what shrank by as much."""
+    complaints = []
+    for target in MACHINES:
+        old = costs(before["targets"][target]) if target in before["targets"] else {}
+        new = costs(now["targets"][target])
+        for name in sorted(old.keys() | new.keys()):
+            if name not in old or name not in new:
+                complaints.append(f"{'new' if name in new else 'gone'}: {target} {name}")
+                continue
+            change = new[name] / old[name] - 1
+            line = f"{target} {name}: {float(old[name]):.6g} -> {float(new[name]):.6g} ({float(change):+.1%})"
+            if change > GROWTH:
+                complaints.append(f"grew: {line}")
+            elif change < -GROWTH:
+                print(f"shrank: {line}")
+    return complaints
+
+
+# ------------------------------------------------------------------------------------------------------------- printing
+
+
+def table(bench: Bench) -> str:
+    """The figures as a markdown table."""
+    targets = bench["targets"]
+    rows: list[tuple[str, list[str]]] = []
+
+    def row(title: str, cells: dict[str, str]) -> None:
+        rows.append((title, [cells.get(target, "") for target in targets]))
+
+    def per(title: str, name: str, form: str = ",.0f") -> None:
+        counts = {target: figures["counts"].get(name) for target, figures in targets.items()}
+        row(title, {target: format(count[0] / count[1], form) for target, count in counts.items() if count})
+
+    def number(title: str, kind: str, name: str) -> None:
+        rows_of = {t: f["sizes"] if kind == "sizes" else f["facts"] for t, f in targets.items()}
+        row(title, {target: f"{of[name]:,}" for target, of in rows_of.items() if name in of})
+
+    row("**instructions**", {})
+    number("filters (nodes) of the default model", "facts", "nodes")
+    per("`selfcal_push()`, six axes, averaging only", "push", ".1f")
+    per("bank, every filter settled, per (node, sample, axis)", "bank.steady", ".2f")
+    per("bank, every filter but one varying, per (node, sample, axis)", "bank.varying", ".2f")
+    per("bank, first 3600 samples, per (node, sample, axis)", "bank.hour", ".2f")
+    number("filters settled after them", "facts", "bank.hour.settled")
+    shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}
+    for target, figures in targets.items():
+        seconds = RATE_HZ / MACHINES[target].systick_hz
+        push = Fraction(*figures["counts"]["push"])
+        bank = Fraction(*figures["counts"]["bank.steady"]) * figures["facts"]["nodes"] * AXES
+        shares["push"][target] = f"{float(seconds * (push + bank / figures['facts']['block'])):.2%}"
+        shares["bank"][target] = f"{float(seconds * bank):.1%}"
+    clocks = ", ".join(f"{MACHINES[target].systick_hz // 10**6} MHz" for target in targets)
+    row(f"share of the core ({clocks}), six axes at {float(RATE_HZ)} Hz averaged to 1 Hz", shares["push"])
+    row("… with every sample a bank sample", shares["bank"])
+    per("push that fills a batch, every filter settled", "bank.steady.worst_push")
+    per("push that fills the first batch and places the nodes", "bank.first_batch")
+    per("gap, every filter", "bank.gap")
+    per("report of one axis", "report")
+    for stage, title in (
+        ("fields", "node fields"),
+        ("fit", "spline fits"),
+        ("scan", "search for the box, by rows"),
+        ("sum", "integral, by rows"),
+        ("finish", "moments and quantiles"),
+    ):
+        steps = max(figures["facts"][f"report.{stage}.steps"] for figures in targets.values())
+        per(f"… {title}, {steps} steps", f"report.{stage}")
+        per("… the longest step of them", f"report.{stage}.worst_step")
+    row("telemetry frames of one axis's report", {t: str(f["counts"]["telemetry"][1]) for t, f in targets.items()})
+    per("one telemetry frame", "telemetry")
+    per("the paper's recursion in plain float C, per (node, σv, sample, axis)", "paper", ".1f")
+    ratios = {
+        t: Fraction(*f["counts"]["paper"]) / Fraction(*f["counts"]["bank.steady"])
+        for t, f in targets.items()
+        if "paper" in f["counts"]
+    }
+    row("… times as many as the settled bank's, one σv node", {t: f"{float(r):.1f}" for t, r in ratios.items()})
+    row(f"… and with {SIGMAS} σv nodes", {t: f"{float(SIGMAS * r):.0f}" for t, r in ratios.items()})
+    row("**bytes**", {})
+    for path in sorted((ROOT / "lib").glob("*.c")):
+        number(f"flash, {path.name}", "sizes", f"text.{path.stem}")
+    number("flash, library", "sizes", "text.library")
+    number("… linked with `--gc-sections`", "sizes", "linked.library")
+    number("… and what it draws from libm, libc, libgcc", "sizes", "linked.runtime")
+    number("flash, tables of the model", "sizes", "linked.tables")
+    number("RAM, `SELFCAL_SIZE`, six axes", "sizes", "ram.SELFCAL_SIZE")
+    for name in ("selfcal_t", "selfcal_work_t", "selfcal_report_t", "selfcal_telemetry_t"):
+        number(f"RAM, `{name}`", "sizes", f"ram.{name}")
+    heading = ["", *(f"{target.capitalize().replace('-m', '-M')}" for target in targets)]
+    width = max(len(title) for title, _ in rows)
+    lines = [f"| {heading[0]:{width}} |" + "".join(f" {name:>13} |" for name in heading[1:])]
+    lines += [f"|{'-' * (width + 2)}|" + f"{'-' * 14}:|" * len(targets)]
+    lines += [f"| {title:{width}} |" + "".join(f" {cell:>13} |" for cell in cells) for title, cells in rows]
+    return "\n".join(lines)
+
+
+def host_table(host: dict[str, dict[str, float]]) -> str:
+    """ns on this machine as a markdown table."""
+    lines = [
+        "| ns per (node, sample, axis), one thread | library, settled | textbook filter (Eigen) "
+        f"| ratio | with {SIGMAS} σv nodes |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for variant, ns in host.items():
+        ratio = ns["textbook"] / ns["library"]
+        lines += [f"| {variant} | {ns['library']:.3f} | {ns['textbook']:.2f} | {ratio:.0f} | {SIGMAS * ratio:.0f} |"]
+    return "\n".join(lines)
+
+
+def read_reference() -> Bench:
+    """counts.json; nothing in it if it is not there yet."""
+    if not REFERENCE.exists():
+        return {"compiler": "", "targets": {}}
+    reference: Bench = json.loads(REFERENCE.read_text(encoding="utf-8"))
+    return reference
+
+
+def main() -> int:
+    """Measure, print, compare."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser.add_argument("--table", action="store_true", help="print counts.json as markdown; measure nothing")
+    parser.add_argument("--host", action="store_true", help="measure ns on this machine as well")
+    parser.add_argument("--accept", action="store_true", help="write counts.json anew")
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(table(read_reference()))
+        return 0
+    with ThreadPoolExecutor() as pool:
+        figures = dict(zip(MACHINES, pool.map(measure, MACHINES), strict=True))
+    compiler = run(["arm-none-eabi-gcc", "-dumpfullversion"]).strip()
+    now: Bench = {"compiler": f"arm-none-eabi-gcc {compiler}", "targets": figures}
+    host = measure_host() if arguments.host else {}  # after the emulators, which would disturb it
+    (BUILD.parent / "bench.json").write_text(json.dumps(now | {"host_ns": host}, indent=1) + "\n", encoding="utf-8")
+    print(table(now))
+    if host:
+        print(f"\n{host_table(host)}")
+    if arguments.accept:
+        REFERENCE.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
+        return 0
+    before = read_reference()
+    if before["compiler"] not in ("", now["compiler"]):
+        print(f"NOT COMPARED: {REFERENCE.name} was made with {before['compiler']}, this is {now['compiler']}")
+        return 0
+    complaints = compare(now, before)
+    for line in complaints:
+        print(line)
+    if complaints:
+        print("Not as in counts.json. If that is meant, `make bench ACCEPT=1` and say why in the commit.")
+    return 1 if complaints else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except BenchError as failure:
+        print(f"bench: {failure}", file=sys.stderr)
+        sys.exit(1)
