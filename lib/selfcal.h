@@ -137,7 +137,7 @@ typedef struct {
  * to either end). Even steps make its matrix the same wherever the nodes lie. */
 typedef struct {
     uint16_t nodes;
-    const selfcal_wide_t *fit; /* [nodes][nodes]: node values to B-spline coefficients */
+    const selfcal_real_t *fit; /* [nodes][nodes]: node values to B-spline coefficients */
 } selfcal_grid_t;
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
@@ -310,18 +310,26 @@ typedef struct {
 #define SELFCAL_HISTOGRAM 128
 #define SELFCAL_SIGMA_CELLS 24
 
+/* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
+typedef struct {
+    selfcal_real_t variance, rate; /* of the drift over sigma_v^2; 1 - its pole */
+    selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
+    bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
+} selfcal_truth_t;
+
 /* Scratch of a report under way. Private; may be shared by all axes and reused. */
 typedef struct {
     selfcal_t *bank;
     uint8_t axis, hypothesis, stage, pass;
-    uint16_t row, first_node;
+    uint16_t first_node;
+    uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
+    uint16_t best_node;
     bool refined;            /* the expectation is about the peak, no longer about the best node */
-    selfcal_real_t truth[2]; /* drift variance over sigma_v^2 and 1 - pole that the expectation supposes */
-    selfcal_real_t ln_v_peak;
-    selfcal_wide_t values[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];
+    selfcal_truth_t truth, truth_before;
+    selfcal_real_t values[2][SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* at the nodes: both fields less their expectation; later weights */
     selfcal_real_t profile[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* B-spline coefficients of the profile ln-likelihood ... */
     selfcal_real_t ln_sigma[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of ln of sigma_v's conditional mode, both less their expectation */
     selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function ... */
@@ -340,6 +348,8 @@ typedef struct {
     selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+    selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
+    selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
 } selfcal_work_t;
 
 /* Starts a report on one axis. Do not push or skip between this and the last step. SELFCAL_TOO_SHORT if there are too few samples. */

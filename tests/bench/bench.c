@@ -187,12 +187,22 @@ static void measure_hour(void) {
 }
 
 static void measure_report(void) {
+    /* in the order of the stages in posterior.c */
     static const char *const stage_name[][3] = {
-        {"report.fields", "report.fields.worst_step", "report.fields.steps"},
-        {"report.fit", "report.fit.worst_step", "report.fit.steps"},
+        {"report.peak", "report.peak.worst_step", "report.peak.steps"},
+        {"report.sigma", "report.sigma.worst_step", "report.sigma.steps"},
+        {"report.values", "report.values.worst_step", "report.values.steps"},
+        {"report.shift", "report.shift.worst_step", "report.shift.steps"},
+        {"report.spline_profile", "report.spline_profile.worst_step", "report.spline_profile.steps"},
+        {"report.spline_sigma", "report.spline_sigma.worst_step", "report.spline_sigma.steps"},
         {"report.scan", "report.scan.worst_step", "report.scan.steps"},
         {"report.sum", "report.sum.worst_step", "report.sum.steps"},
-        {"report.finish", "report.finish.worst_step", "report.finish.steps"},
+        {"report.weights", "report.weights.worst_step", "report.weights.steps"},
+        {"report.weights_sq", "report.weights_sq.worst_step", "report.weights_sq.steps"},
+        {"report.bias", "report.bias.worst_step", "report.bias.steps"},
+        {"report.estimates", "report.estimates.worst_step", "report.estimates.steps"},
+        {"report.evidence", "report.evidence.worst_step", "report.evidence.steps"},
+        {"report.whole", "report.whole.worst_step", "report.whole.steps"},
     };
     enum { STAGES = sizeof stage_name / sizeof stage_name[0] };
     taken_t sum[STAGES] = {{0, 0, 0}}, worst[STAGES] = {{0, 0, 0}};

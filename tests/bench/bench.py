@@ -237,11 +237,19 @@ def table(bench: Bench) -> str:
     per("gap, every filter", "bank.gap")
     per("report of one axis", "report")
     for stage, title in (
-        ("fields", "node fields"),
-        ("fit", "spline fits"),
-        ("scan", "search for the box, by rows"),
-        ("sum", "integral, by rows"),
-        ("finish", "moments and quantiles"),
+        ("peak", "best node"),
+        ("sigma", "cells of σv"),
+        ("values", "node values"),
+        ("shift", "node values about the peak"),
+        ("spline_profile", "spline fit of the profile"),
+        ("spline_sigma", "spline fit of σv's mode, first box"),
+        ("scan", "search for the box"),
+        ("sum", "integral"),
+        ("weights", "node weights"),
+        ("bias", "bias"),
+        ("estimates", "moments and quantiles"),
+        ("evidence", "evidence"),
+        ("whole", "probabilities"),
     ):
         steps = max(figures["facts"][f"report.{stage}.steps"] for figures in targets.values())
         per(f"… {title}, {steps} steps", f"report.{stage}")

@@ -23,11 +23,11 @@ using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::o
 namespace MODULE_NAME {
 
 struct Grid {
-    explicit Grid(const GridTuple &t) : fit(std::get<1>(t)), grid{std::get<0>(t), fit.data()} {
+    explicit Grid(const GridTuple &t) : fit(std::get<1>(t).begin(), std::get<1>(t).end()), grid{std::get<0>(t), fit.data()} {
         if (fit.size() != size_t{grid.nodes} * grid.nodes)
             throw std::invalid_argument("the spline matrix does not fit its nodes");
     }
-    std::vector<double> fit;
+    std::vector<selfcal_real_t> fit;
     selfcal_grid_t grid;
 };
 
