@@ -14,7 +14,7 @@
  *   u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf: e' = (1 - g) e - (g - g_inf) u_inf, where
  *   g - g_inf = phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
  */
-#include "internal.h"
+#include "kernel.h"
 
 /* A node counts as converged when d falls to this part of p_inf: what is left of the gain's error moves a ln-likelihood by
  * less than that many nats. */
@@ -209,49 +209,6 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     return SELFCAL_OK;
 }
 
-/* ------------------------------------------------------------------------------------------------------- long sums */
-
-/* Adds hi + lo, |lo| far below |hi| (Knuth's two-sum, then renormalised). */
-static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
-    const selfcal_real_t total = sum->hi + hi;
-    const selfcal_real_t part = total - sum->hi;
-    const selfcal_real_t error = ((sum->hi - (total - part)) + (hi - part)) + (sum->lo + lo);
-    sum->hi = total + error;
-    sum->lo = error - (sum->hi - total);
-}
-
-/* Adds scale * value, the product in full. */
-static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
-    const selfcal_real_t product = scale.hi * value;
-    sum_add(sum, product, r_fma(scale.lo, value, r_fma(scale.hi, value, -product)));
-}
-
-static selfcal_wide_t sum_value(selfcal_sum_t sum) {
-    return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
-}
-
-/* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */
-static selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
-    const selfcal_real_t s = R(1.0) + node->p_inf;
-    const selfcal_real_t s_lo = node->p_inf >= R(1.0) ? R(1.0) - (s - node->p_inf) : node->p_inf - (s - R(1.0));
-    const selfcal_real_t inv = R(1.0) / s;
-    const selfcal_sum_t result = {inv, inv * r_fma(-inv, s_lo, r_fma(-inv, s, R(1.0)))};
-    return result;
-}
-
-/* Part of the batch without a gap inside. */
-typedef struct {
-    uint32_t from, to;
-} span_t;
-
-/* The gain side of a batch, shared by the axes. */
-typedef struct {
-    selfcal_real_t g[SELFCAL_BATCH];     /* phi K + beta */
-    selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1" over s */
-    selfcal_real_t inv_s[SELFCAL_BATCH]; /* 1 where s is constant and left to the scales */
-    selfcal_sum_t scale_b, scale_c;      /* what the span's sums of nu and nu^2 are still to be multiplied by */
-} gains_t;
-
 /* a + b - fl(a + b). */
 static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real_t sum) {
     return r_fabs(a) > r_fabs(b) ? b - (sum - a) : a - (sum - b);
@@ -259,7 +216,8 @@ static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real
 
 /* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes slowly, and would
  * tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
-static void gains_varying(const selfcal_t *self, span_t span, selfcal_node_t *node, gains_t *gains) {
+static void gains_varying(const selfcal_t *self, selfcal_node_t *node, gains_t *gains) {
+    const span_t span = gains->span;
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
     selfcal_real_t a = R(0.0), short_of = R(0.0);
     const selfcal_real_t pull = node->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
@@ -286,23 +244,18 @@ static void gains_varying(const selfcal_t *self, span_t span, selfcal_node_t *no
         }
     }
     sum_add(&node->ln_s, r_log1p(product_less_1), R(0.0));
-    gains->scale_c.hi = R(1.0);
-    gains->scale_c.lo = short_of / (selfcal_real_t)(span.to - span.from);
-    gains->scale_b = gains->scale_c;
-    sum_add_scaled(&node->a, gains->scale_c, a);
+    gains->scale.hi = R(1.0);
+    gains->scale.lo = short_of / (selfcal_real_t)(span.to - span.from);
+    sum_add_scaled(&node->a, gains->scale, a);
 }
 
-/* The gain of a converged node, phi K + beta. */
-static selfcal_real_t steady_g(const selfcal_node_t *node) {
-    const selfcal_real_t gain = node->p_inf / (R(1.0) + node->p_inf);
-    return r_fma(gain, -node->beta, gain) + node->beta;
-}
-
-/* A converged node while u still moves. s is constant and kept out of the sums until they are added. */
-static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
+/* A converged node while u still moves (selfcal_kernel_level() once it does not). s is constant and kept out of the sums until they
+ * are added. */
+static void gains_steady(selfcal_node_t *node, gains_t *gains) {
+    const span_t span = gains->span;
     const selfcal_real_t g = steady_g(node);
     selfcal_real_t a = R(0.0);
-    gains->scale_b = gains->scale_c = steady_inv_s(node);
+    gains->scale = steady_inv_s(node);
     for (uint32_t i = span.from; i < span.to; i++) {
         const selfcal_real_t u = node->u_inf + node->e;
         gains->g[i] = g;
@@ -311,79 +264,7 @@ static void gains_steady(span_t span, selfcal_node_t *node, gains_t *gains) {
         a = r_fma(u, u, a);
         node->e = r_fma(-g, node->e, node->e);
     }
-    sum_add_scaled(&node->a, gains->scale_c, a);
-}
-
-/* ... and once u is constant as well: it stays out, too. */
-static void gains_level(span_t span, selfcal_node_t *node, gains_t *gains) {
-    const selfcal_real_t u = node->u_inf;
-    const selfcal_sum_t inv_s = steady_inv_s(node);
-    const selfcal_real_t product = inv_s.hi * u;
-    gains->scale_c = inv_s;
-    gains->scale_b.hi = product;
-    gains->scale_b.lo = r_fma(inv_s.lo, u, r_fma(inv_s.hi, u, -product));
-    sum_add_scaled(&node->a, inv_s, (selfcal_real_t)(span.to - span.from) * u * u);
-}
-
-static void add_span(selfcal_t *self, size_t k, const gains_t *gains, selfcal_real_t b, selfcal_real_t c) {
-    sum_add_scaled(&self->b[k], gains->scale_b, b);
-    sum_add_scaled(&self->c[k], gains->scale_c, c);
-}
-
-/* The kernels: every axis of one node through the span. Sums of a span are short enough for selfcal_real_t; they go into the
- * long ones scaled in full. */
-
-static void run_axes(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
-    const selfcal_real_t minus_beta = -self->node[j].beta;
-    const size_t axes = self->model->axes;
-    for (size_t axis = 0; axis < axes; axis++) {
-        const size_t k = j * axes + axis;
-        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
-        for (uint32_t i = span.from; i < span.to; i++) {
-            const selfcal_real_t y = self->y[axis][i];
-            const selfcal_real_t nu = y - x;
-            b = r_fma(gains->u[i], nu, b);
-            c = r_fma(nu, nu * gains->inv_s[i], c);
-            x = r_fma(minus_beta, y, r_fma(gains->g[i], nu, x));
-        }
-        self->x[k] = x;
-        add_span(self, k, gains, b, c);
-    }
-}
-
-/* Nearly all samples of a long record go through here: five arithmetic instructions an axis and sample. By fours, which also
- * keeps the sums short: squares of lattice values would round to one side (1e-7 of C, seen with 64 in a row). */
-static void run_axes_level(selfcal_t *self, span_t span, size_t j, const gains_t *gains) {
-    const selfcal_real_t minus_beta = -self->node[j].beta;
-    const selfcal_real_t g = steady_g(&self->node[j]);
-    const size_t axes = self->model->axes;
-    for (size_t axis = 0; axis < axes; axis++) {
-        const size_t k = j * axes + axis;
-        const selfcal_real_t *y = &self->y[axis][span.from];
-        const selfcal_real_t *const end = y + (span.to - span.from);
-        selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
-        for (; end - y >= 4; y += 4) {
-            const selfcal_real_t y0 = y[0], y1 = y[1], y2 = y[2], y3 = y[3];
-            const selfcal_real_t nu0 = y0 - x;
-            x = r_fma(minus_beta, y0, r_fma(g, nu0, x));
-            const selfcal_real_t nu1 = y1 - x;
-            x = r_fma(minus_beta, y1, r_fma(g, nu1, x));
-            const selfcal_real_t nu2 = y2 - x;
-            x = r_fma(minus_beta, y2, r_fma(g, nu2, x));
-            const selfcal_real_t nu3 = y3 - x;
-            x = r_fma(minus_beta, y3, r_fma(g, nu3, x));
-            b += (nu0 + nu1) + (nu2 + nu3);
-            c += r_fma(nu3, nu3, r_fma(nu2, nu2, r_fma(nu1, nu1, nu0 * nu0)));
-        }
-        for (; y < end; y++) {
-            const selfcal_real_t nu = *y - x;
-            b += nu;
-            c = r_fma(nu, nu, c);
-            x = r_fma(minus_beta, *y, r_fma(g, nu, x));
-        }
-        self->x[k] = x;
-        add_span(self, k, gains, b, c);
-    }
+    sum_add_scaled(&node->a, gains->scale, a);
 }
 
 static void run_span(selfcal_t *self, span_t span) {
@@ -392,35 +273,42 @@ static void run_span(selfcal_t *self, span_t span) {
         whole = whole && self->r[i] == R(1.0);
     }
     gains_t gains;
-    for (size_t j = 0; j < self->model->nodes; j++) {
+    gains.span = span;
+    const size_t nodes = self->model->nodes;
+    size_t j = 0;
+    while (j < nodes) {
         selfcal_node_t *node = &self->node[j];
         if (whole && node->level) {
-            gains_level(span, node, &gains);
-            run_axes_level(self, span, j, &gains);
-            node->steady += span.to - span.from;
-        } else if (whole && node->d == R(0.0)) {
-            gains_steady(span, node, &gains);
-            run_axes(self, span, j, &gains);
+            const size_t first = j;
+            while (j < nodes && self->node[j].level) {
+                j++;
+            }
+            selfcal_kernel_level(self, span, first, j);
+            continue;
+        }
+        if (whole && node->d == R(0.0)) {
+            gains_steady(node, &gains);
+            selfcal_kernel_run(self, j, &gains);
             node->steady += span.to - span.from;
             if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
                 node->e = R(0.0);
                 node->level = true;
             }
         } else {
-            gains_varying(self, span, node, &gains);
-            run_axes(self, span, j, &gains);
+            gains_varying(self, node, &gains);
+            selfcal_kernel_run(self, j, &gains);
             node->level = false;
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
                 node->d = R(0.0);
             }
         }
+        j++;
     }
     self->n += span.to - span.from;
 }
 
 /* Predicts every node over `count` intervals without a sample: exact, whatever the count. */
 static void run_gap(selfcal_t *self, uint32_t count) {
-    const size_t axes = self->model->axes;
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
     for (size_t j = 0; j < self->model->nodes; j++) {
         selfcal_node_t *node = &self->node[j];
@@ -439,9 +327,7 @@ static void run_gap(selfcal_t *self, uint32_t count) {
         const selfcal_wide_t d = (selfcal_wide_t)node->d;
         node->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
         node->e = (selfcal_real_t)((selfcal_wide_t)node->e + less * (1.0 - (selfcal_wide_t)node->u_inf - (selfcal_wide_t)node->e));
-        for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-            self->x[k] = (selfcal_real_t)((selfcal_wide_t)self->x[k] * (1.0 - less));
-        }
+        selfcal_kernel_gap(self, j, less);
     }
 }
 
