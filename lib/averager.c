@@ -99,6 +99,7 @@ selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
     if (self == NULL || sample == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    (void)selfcal_bank_run(self, self->push_nodes);
     if (!usable(self, sample)) {
         pass(self, 1U);
         return SELFCAL_OK;

@@ -47,6 +47,25 @@ static uint16_t hypothesis_nodes(const selfcal_hypothesis_t *hypothesis) {
     return (uint16_t)nodes;
 }
 
+selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
+    const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
+    uint8_t h = 0;
+    while (index >= hypothesis_nodes(&hypothesis[h])) {
+        index = (uint16_t)(index - hypothesis_nodes(&hypothesis[h]));
+        h++;
+    }
+    const uint16_t columns = hypothesis[h].alpha != NULL ? hypothesis[h].alpha->nodes : 1U;
+    const uint16_t row = (uint16_t)(index / columns), column = (uint16_t)(index % columns);
+    selfcal_place_t place = {h, NAN, NAN};
+    if (hypothesis[h].rho != NULL) {
+        place.ln_rho = r_fma((selfcal_real_t)row, self->rho_step[h], self->rho_lo[h]);
+    }
+    if (hypothesis[h].alpha != NULL) {
+        place.ln_alpha = r_fma((selfcal_real_t)column, self->alpha_step[h], self->alpha_lo[h]);
+    }
+    return place;
+}
+
 static bool valid_model(const selfcal_model_t *model) {
     if (!(model->dt_s > 0.0F) || !isfinite(model->dt_s) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
@@ -79,19 +98,22 @@ static bool valid_model(const selfcal_model_t *model) {
 }
 
 /* Node of a law at (rho, alpha), at the instant of its first sample. */
-static void init_node(selfcal_node_t *node, selfcal_law_t law, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, float dt_s) {
+static void init_node(selfcal_t *self, uint16_t index) {
+    const selfcal_place_t place = selfcal_bank_place(self, index);
+    const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
+    selfcal_node_t *node = &self->node[index];
     selfcal_wide_t q = 0.0;       /* drift variance per interval */
     selfcal_wide_t p_first = 0.0; /* predicted drift variance at the first sample */
     selfcal_wide_t one_less_phi_sq = 0.0;
     selfcal_wide_t beta = 0.0;
     if (law == SELFCAL_RANDOM_WALK) {
-        q = exp(2.0 * (selfcal_wide_t)ln_rho);
+        q = exp(2.0 * (selfcal_wide_t)place.ln_rho);
         p_first = q; /* x_0 = 0 */
     } else if (law == SELFCAL_GAUSS_MARKOV) {
-        const selfcal_wide_t alpha_dt = fmin(exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)dt_s, ALPHA_DT_MAX);
+        const selfcal_wide_t alpha_dt = fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, ALPHA_DT_MAX);
         beta = -expm1(-alpha_dt);
         one_less_phi_sq = -expm1(-2.0 * alpha_dt);
-        p_first = exp(2.0 * (selfcal_wide_t)ln_rho); /* stationary */
+        p_first = exp(2.0 * (selfcal_wide_t)place.ln_rho); /* stationary */
         q = p_first * one_less_phi_sq;
     }
     /* Fixed point of P' = phi^2 P/(1 + P) + q: P^2 + b P - q = 0, in the form without cancellation. */
@@ -117,21 +139,22 @@ typedef struct {
     selfcal_real_t lo, hi;
 } ln_range_t;
 
-static ln_range_t first_ln_sigma(const selfcal_t *self, uint8_t axis) {
-    const selfcal_real_t *y = self->y[axis];
+static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
+    const selfcal_batch_t *batch = waiting(self);
+    const selfcal_real_t *y = batch->y[axis];
     selfcal_real_t square = R(0.0), product = R(0.0), mean = R(0.0), spread = R(0.0);
     uint32_t squares = 0, products = 0;
-    for (uint32_t i = 0; i < self->in_batch; i++) {
+    for (uint32_t i = 0; i < batch->count; i++) {
         const selfcal_real_t off = y[i] - mean; /* Welford's recursion */
         mean += off / (selfcal_real_t)(i + 1U);
         spread = r_fma(off, y[i] - mean, spread);
-        if (i == 0U || self->gap[i] > 0U) {
+        if (i == 0U || batch->gap[i] > 0U) {
             continue;
         }
         const selfcal_real_t step = y[i] - y[i - 1U];
         square += R(0.5) * step * step;
         squares++;
-        if (i > 1U && self->gap[i - 1U] == 0U) {
+        if (i > 1U && batch->gap[i - 1U] == 0U) {
             product -= step * (y[i - 1U] - y[i - 2U]);
             products++;
         }
@@ -142,7 +165,7 @@ static ln_range_t first_ln_sigma(const selfcal_t *self, uint8_t axis) {
     ln_range_t range = {least, least};
     if (square > R(0.0)) {
         square /= (selfcal_real_t)squares;
-        spread /= (selfcal_real_t)(self->in_batch - 1U);
+        spread /= (selfcal_real_t)(batch->count - 1U);
         product = products > 0U && spread > R(2.0) * square ? product / (selfcal_real_t)products : square;
         range.hi = r_fmin(r_fmax(R(0.5) * r_log(square), least), most);
         range.lo = r_fmin(r_fmax(R(0.5) * r_log(r_fmax(product, R(0.01) * square)), least), range.hi);
@@ -152,11 +175,10 @@ static ln_range_t first_ln_sigma(const selfcal_t *self, uint8_t axis) {
     return range;
 }
 
-/* Places the rho nodes of every hypothesis for the axes' white noise, and starts all filters. */
+/* Places the rho nodes of every hypothesis for the axes' white noise. */
 static void place_nodes(selfcal_t *self) {
     const selfcal_model_t *model = self->model;
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)model->dt_s);
-    selfcal_node_t *node = self->node;
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
         selfcal_real_t rho_lo = INFINITY, rho_hi = -INFINITY, alpha_lo = INFINITY, alpha_hi = -INFINITY;
@@ -178,13 +200,6 @@ static void place_nodes(selfcal_t *self) {
         self->rho_step[h] = rows > 1U ? (rho_hi - rho_lo) / (selfcal_real_t)(rows - 1U) : R(0.0);
         self->alpha_lo[h] = alpha_lo;
         self->alpha_step[h] = columns > 1U ? (alpha_hi - alpha_lo) / (selfcal_real_t)(columns - 1U) : R(0.0);
-        for (uint16_t i = 0; i < rows; i++) {
-            for (uint16_t j = 0; j < columns; j++) {
-                init_node(node, hypothesis->law, r_fma((selfcal_real_t)i, self->rho_step[h], rho_lo),
-                          r_fma((selfcal_real_t)j, self->alpha_step[h], alpha_lo), model->dt_s);
-                node++;
-            }
-        }
     }
 }
 
@@ -206,6 +221,10 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     self->b = (selfcal_sum_t *)(void *)(self->node + model->nodes);
     self->c = self->b + cells;
     self->x = (selfcal_real_t *)(void *)(self->c + cells);
+    /* Twice what would do, since the blocks of a batch may have lost up to half of their samples. */
+    const uint64_t pushes = (uint64_t)model->block * SELFCAL_BATCH;
+    const uint64_t needed = (2U * (uint64_t)model->nodes + pushes - 1U) / pushes;
+    self->push_nodes = (uint16_t)(needed > SELFCAL_PUSH_NODES ? needed : SELFCAL_PUSH_NODES);
     return SELFCAL_OK;
 }
 
@@ -216,13 +235,13 @@ static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real
 
 /* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes slowly, and would
  * tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
-static void gains_varying(const selfcal_t *self, selfcal_node_t *node, gains_t *gains) {
+static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, gains_t *gains) {
     const span_t span = gains->span;
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
     selfcal_real_t a = R(0.0), short_of = R(0.0);
     const selfcal_real_t pull = node->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_real_t r = self->r[i];
+        const selfcal_real_t r = batch->r[i];
         const selfcal_real_t p = r_fmax(node->p_inf + node->d, R(0.0));
         const selfcal_real_t s = r + p;
         const selfcal_real_t inv_s = R(1.0) / s;
@@ -267,15 +286,14 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
     sum_add_scaled(&node->a, gains->scale, a);
 }
 
-static void run_span(selfcal_t *self, span_t span) {
+static void run_span(selfcal_t *self, span_t span, size_t j, size_t nodes) {
+    const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
     for (uint32_t i = span.from; i < span.to; i++) {
-        whole = whole && self->r[i] == R(1.0);
+        whole = whole && batch->r[i] == R(1.0);
     }
     gains_t gains;
     gains.span = span;
-    const size_t nodes = self->model->nodes;
-    size_t j = 0;
     while (j < nodes) {
         selfcal_node_t *node = &self->node[j];
         if (whole && node->level) {
@@ -295,7 +313,7 @@ static void run_span(selfcal_t *self, span_t span) {
                 node->level = true;
             }
         } else {
-            gains_varying(self, node, &gains);
+            gains_varying(batch, node, &gains);
             selfcal_kernel_run(self, j, &gains);
             node->level = false;
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
@@ -304,13 +322,12 @@ static void run_span(selfcal_t *self, span_t span) {
         }
         j++;
     }
-    self->n += span.to - span.from;
 }
 
-/* Predicts every node over `count` intervals without a sample: exact, whatever the count. */
-static void run_gap(selfcal_t *self, uint32_t count) {
+/* Predicts nodes over `count` intervals without a sample: exact, whatever the count. */
+static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
-    for (size_t j = 0; j < self->model->nodes; j++) {
+    for (size_t j = from; j < to; j++) {
         selfcal_node_t *node = &self->node[j];
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
@@ -331,39 +348,83 @@ static void run_gap(selfcal_t *self, uint32_t count) {
     }
 }
 
-void selfcal_bank_flush(selfcal_t *self) {
-    if (self->n == 0U && self->in_batch > 0U) {
-        place_nodes(self);
+/* The nodes `from` to `to` - 1 over the batch that waits. */
+static void run_batch(selfcal_t *self, uint16_t from, uint16_t to) {
+    const selfcal_batch_t *batch = waiting(self);
+    for (uint16_t j = from; self->n == 0U && j < to; j++) {
+        init_node(self, j);
     }
     span_t span = {0, 0};
-    while (span.from < self->in_batch) {
-        if (self->gap[span.from] > 0U) {
-            run_gap(self, self->gap[span.from]);
+    while (span.from < batch->count) {
+        if (batch->gap[span.from] > 0U) {
+            run_gap(self, batch->gap[span.from], from, to);
         }
         span.to = span.from + 1U;
-        while (span.to < self->in_batch && self->gap[span.to] == 0U) {
+        while (span.to < batch->count && batch->gap[span.to] == 0U) {
             span.to++;
         }
-        run_span(self, span);
+        run_span(self, span, from, to);
         span.from = span.to;
     }
-    self->in_batch = 0;
-    if (self->pending_gap > 0U) {
-        run_gap(self, self->pending_gap);
-        self->pending_gap = 0;
+    if (batch->gap_after > 0U) {
+        run_gap(self, batch->gap_after, from, to);
     }
 }
 
-void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r) {
-    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        self->y[axis][self->in_batch] = y[axis];
+bool selfcal_bank_run(selfcal_t *self, uint16_t nodes) {
+    selfcal_batch_t *batch = waiting(self);
+    if (batch->count == 0U && batch->gap_after == 0U) {
+        return false;
     }
-    self->r[self->in_batch] = r;
-    self->gap[self->in_batch] = self->pending_gap;
+    const uint16_t all = self->model->nodes;
+    const uint16_t to = all - self->ran > nodes ? (uint16_t)(self->ran + nodes) : all;
+    run_batch(self, self->ran, to);
+    self->ran = to;
+    if (to == all) {
+        self->n += batch->count;
+        batch->count = 0;
+        batch->gap_after = 0;
+        self->ran = 0;
+    }
+    return true;
+}
+
+bool selfcal_bank_hand_over(selfcal_t *self) {
+    selfcal_batch_t *batch = &self->batch[self->gathering];
+    if (batch->count == 0U && self->pending_gap == 0U) {
+        return false;
+    }
+    batch->gap_after = self->pending_gap;
     self->pending_gap = 0;
-    self->in_batch++;
-    if (self->in_batch == SELFCAL_BATCH) {
-        selfcal_bank_flush(self);
+    self->gathering = (uint8_t)(1U - self->gathering);
+    self->batches++;
+    if (self->n == 0U) {
+        place_nodes(self);
+    }
+    return true;
+}
+
+void selfcal_bank_flush(selfcal_t *self) {
+    do {
+        while (selfcal_bank_run(self, self->model->nodes)) {
+        }
+    } while (selfcal_bank_hand_over(self));
+}
+
+void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r) {
+    selfcal_batch_t *batch = &self->batch[self->gathering];
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        batch->y[axis][batch->count] = y[axis];
+    }
+    batch->r[batch->count] = r;
+    batch->gap[batch->count] = self->pending_gap;
+    self->pending_gap = 0;
+    batch->count++;
+    if (batch->count == SELFCAL_BATCH) {
+        while (selfcal_bank_run(self, self->model->nodes)) {
+            /* late: samples were skipped that would have run the nodes */
+        }
+        (void)selfcal_bank_hand_over(self);
     }
 }
 
@@ -376,7 +437,11 @@ void selfcal_bank_gap(selfcal_t *self, uint64_t count) {
 }
 
 uint32_t selfcal_count(const selfcal_t *self) {
-    return self->n + self->in_batch;
+    return self->n + self->batch[0].count + self->batch[1].count;
+}
+
+uint32_t selfcal_room(const selfcal_t *self) {
+    return SELFCAL_BATCH - 1U - self->batch[self->gathering].count;
 }
 
 selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis) {
@@ -384,43 +449,16 @@ selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis) {
     return (selfcal_wide_t)self->origin[axis] + (selfcal_wide_t)self->offset[axis];
 }
 
-/* The hypothesis of a node; `index` becomes its place there. */
-static uint8_t locate(const selfcal_model_t *model, uint16_t *index) {
-    uint8_t h = 0;
-    while (*index >= hypothesis_nodes(&model->hypothesis[h])) {
-        *index = (uint16_t)(*index - hypothesis_nodes(&model->hypothesis[h]));
-        h++;
-    }
-    return h;
-}
-
-selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
-    if (self == NULL || view == NULL || axis >= self->model->axes || index >= self->model->nodes) {
-        return SELFCAL_BAD_ARGUMENT;
-    }
-    selfcal_bank_flush(self);
-    if (self->n == 0U) {
-        return SELFCAL_TOO_SHORT; /* the nodes have no place yet */
-    }
-    uint16_t at = index;
-    const uint8_t h = locate(self->model, &at);
-    const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[h];
-    const uint16_t columns = hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
+void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
+    const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_node_t *node = &self->node[index];
     const size_t k = (size_t)index * self->model->axes + axis;
     const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
     const selfcal_wide_t phi = 1.0 - beta;
     const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)node->d;
-    view->law = hypothesis->law;
-    const uint16_t row = (uint16_t)(at / columns), column = (uint16_t)(at % columns);
-    view->ln_rho = (selfcal_wide_t)NAN;
-    view->ln_alpha = (selfcal_wide_t)NAN;
-    if (hypothesis->rho != NULL) {
-        view->ln_rho = (selfcal_wide_t)r_fma((selfcal_real_t)row, self->rho_step[h], self->rho_lo[h]);
-    }
-    if (hypothesis->alpha != NULL) {
-        view->ln_alpha = (selfcal_wide_t)r_fma((selfcal_real_t)column, self->alpha_step[h], self->alpha_lo[h]);
-    }
+    view->law = self->model->hypothesis[place.hypothesis].law;
+    view->ln_rho = (selfcal_wide_t)place.ln_rho;
+    view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
     view->a = sum_value(node->a);
     view->b = sum_value(self->b[k]);
     view->c = sum_value(self->c[k]);
@@ -435,6 +473,17 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
         const bool gap = (selfcal_wide_t)node->d > 1e-3 * (selfcal_wide_t)node->p_inf;
         view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
     }
+}
+
+selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
+    if (self == NULL || view == NULL || axis >= self->model->axes || index >= self->model->nodes) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    selfcal_bank_flush(self);
+    if (self->n == 0U) {
+        return SELFCAL_TOO_SHORT; /* the nodes have no place yet */
+    }
+    selfcal_bank_view(self, axis, index, view);
     return SELFCAL_OK;
 }
 

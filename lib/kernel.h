@@ -19,6 +19,11 @@ typedef struct {
     selfcal_sum_t scale;                 /* what the span's sums of nu and nu^2 are still to be multiplied by */
 } gains_t;
 
+/* The batch that the nodes run over. */
+static inline selfcal_batch_t *waiting(selfcal_t *self) {
+    return &self->batch[1U - self->gathering];
+}
+
 /* Every axis of node `j` through the span. */
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains);
 

@@ -4,13 +4,14 @@
 
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     const span_t span = gains->span;
+    const selfcal_batch_t *batch = waiting(self);
     const selfcal_real_t minus_beta = -self->node[j].beta;
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
         selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
         for (uint32_t i = span.from; i < span.to; i++) {
-            const selfcal_real_t y = self->y[axis][i];
+            const selfcal_real_t y = batch->y[axis][i];
             const selfcal_real_t nu = y - x;
             b = r_fma(gains->u[i], nu, b);
             c = r_fma(nu, nu * gains->inv_s[i], c);
@@ -26,6 +27,7 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
  * keeps the sums short: squares of lattice values would round to one side (1e-7 of C, seen with 64 in a row). */
 static inline void run_level(selfcal_t *self, span_t span, size_t j) {
     selfcal_node_t *node = &self->node[j];
+    const selfcal_batch_t *batch = waiting(self);
     const selfcal_real_t u = node->u_inf;
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t product = inv_s.hi * u;
@@ -37,7 +39,7 @@ static inline void run_level(selfcal_t *self, span_t span, size_t j) {
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
-        const selfcal_real_t *y = &self->y[axis][span.from];
+        const selfcal_real_t *y = &batch->y[axis][span.from];
         const selfcal_real_t *const end = y + count, *const fours = y + count / 4U * 4U;
         selfcal_real_t x = self->x[k], b = R(0.0), c = R(0.0);
         for (; y < fours; y += 4) {

@@ -15,7 +15,7 @@
 #include "internal.h"
 
 /* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
-enum { PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
+enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_SHIFTED_NODES 32U
 #define STEP_SCANNED_CELLS 16U
@@ -81,9 +81,9 @@ static uint8_t basis_at(uint16_t nodes, selfcal_real_t z, selfcal_real_t out[6])
     return (uint8_t)(span - 5U);
 }
 
-static selfcal_real_t dot(const selfcal_real_t a[], const selfcal_real_t b[], uint16_t count) {
+static selfcal_real_t dot(const selfcal_real_t a[], const selfcal_real_t b[], size_t count) {
     selfcal_real_t sum = R(0.0);
-    for (uint16_t i = 0; i < count; i++) {
+    for (size_t i = 0; i < count; i++) {
         sum = r_fma(a[i], b[i], sum);
     }
     return sum;
@@ -92,19 +92,19 @@ static selfcal_real_t dot(const selfcal_real_t a[], const selfcal_real_t b[], ui
 /* Node values [rho][alpha] become spline coefficients in `out`. */
 static void fit(const selfcal_work_t *work, const selfcal_real_t values[], selfcal_real_t out[]) {
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
-    const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
+    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
     selfcal_real_t line[SELFCAL_GRID_MAX];
-    for (uint16_t i = 0; i < rows; i++) {
-        for (uint16_t j = 0; j < columns; j++) {
+    for (size_t i = 0; i < rows; i++) {
+        for (size_t j = 0; j < columns; j++) {
             const selfcal_real_t *value = &values[i * columns];
             out[i * columns + j] = alpha != NULL ? dot(&alpha->fit[j * columns], value, columns) : value[j];
         }
     }
-    for (uint16_t j = 0; rho != NULL && j < columns; j++) {
-        for (uint16_t i = 0; i < rows; i++) {
+    for (size_t j = 0; rho != NULL && j < columns; j++) {
+        for (size_t i = 0; i < rows; i++) {
             line[i] = out[i * columns + j];
         }
-        for (uint16_t i = 0; i < rows; i++) {
+        for (size_t i = 0; i < rows; i++) {
             out[i * columns + j] = dot(&rho->fit[i * rows], line, rows);
         }
     }
@@ -190,9 +190,9 @@ typedef struct {
 
 /* Profile ln-likelihood of the hypothesis's node k and ln of the conditional mode of sigma_v, for the given n_eff. */
 static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
-    selfcal_t *bank = work->bank;
+    const selfcal_t *bank = work->bank;
     selfcal_node_view_t v;
-    (void)selfcal_node(bank, work->axis, (uint16_t)(work->first_node + k), &v);
+    selfcal_bank_view(bank, work->axis, (uint16_t)(work->first_node + k), &v);
     const selfcal_wide_t n = (selfcal_wide_t)bank->n;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t p0 = sd * sd;
@@ -252,13 +252,9 @@ static uint16_t nodes_of(const selfcal_work_t *work) {
     return (uint16_t)(grid_nodes(hypothesis_of(work)->rho) * grid_nodes(hypothesis_of(work)->alpha));
 }
 
-/* ln of a node's rho and alpha. */
-static selfcal_real_t node_ln_rho(const selfcal_work_t *work, uint16_t row) {
-    return r_fma((selfcal_real_t)row, work->bank->rho_step[work->hypothesis], work->bank->rho_lo[work->hypothesis]);
-}
-
-static selfcal_real_t node_ln_alpha(const selfcal_work_t *work, uint16_t column) {
-    return r_fma((selfcal_real_t)column, work->bank->alpha_step[work->hypothesis], work->bank->alpha_lo[work->hypothesis]);
+/* Where the hypothesis's node k lies. */
+static selfcal_place_t place_of(const selfcal_work_t *work, uint16_t k) {
+    return selfcal_bank_place(work->bank, (uint16_t)(work->first_node + k));
 }
 
 /* End of this step's part of `whole`, from work->at, which moves there. */
@@ -287,17 +283,16 @@ static void step_peak(selfcal_work_t *work) {
 }
 
 static void step_sigma(selfcal_work_t *work) {
-    const uint16_t columns = grid_nodes(hypothesis_of(work)->alpha);
     sigma_cells(work);
     if (hypothesis_of(work)->rho != NULL) {
-        set_truth(work, node_ln_rho(work, (uint16_t)(work->best_node / columns)),
-                  node_ln_alpha(work, (uint16_t)(work->best_node % columns)));
+        const selfcal_place_t place = place_of(work, work->best_node);
+        set_truth(work, place.ln_rho, place.ln_alpha);
     }
 }
 
 static expectation_t node_expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, uint16_t k) {
-    const uint16_t columns = grid_nodes(hypothesis_of(work)->alpha);
-    return expectation(work, truth, node_ln_rho(work, (uint16_t)(k / columns)), node_ln_alpha(work, (uint16_t)(k % columns)));
+    const selfcal_place_t place = place_of(work, k);
+    return expectation(work, truth, place.ln_rho, place.ln_alpha);
 }
 
 /* What the splines have to carry at the nodes. */
@@ -692,7 +687,7 @@ static void step_sum(selfcal_work_t *work) {
         work->first[drift] += (selfcal_wide_t)sum.d1; /* zero without a drift */
         work->second[drift] += (selfcal_wide_t)sum.d2;
         const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.n1 + sum.n2; /* times (N / best N)^2 */
-        for (uint16_t k = 0; k < (has_drift ? 6U : 1U); k++) {
+        for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
             const selfcal_real_t basis = has_drift ? work->basis[i][k] : R(1.0);
             const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
             weight[at] += sum.mass * basis;
@@ -792,25 +787,25 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
  * the sum of its node values under them (the transpose of fit()). */
 static void cardinal_weights(const selfcal_work_t *work, const selfcal_real_t of_basis[], selfcal_real_t out[]) {
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
-    const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
+    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
     selfcal_real_t line[SELFCAL_GRID_MAX];
-    for (uint16_t i = 0; i < rows; i++) {
-        for (uint16_t j = 0; j < columns; j++) {
+    for (size_t i = 0; i < rows; i++) {
+        for (size_t j = 0; j < columns; j++) {
             selfcal_real_t sum = alpha != NULL ? R(0.0) : of_basis[i];
-            for (uint16_t l = 0; alpha != NULL && l < columns; l++) {
+            for (size_t l = 0; alpha != NULL && l < columns; l++) {
                 sum = r_fma(alpha->fit[l * columns + j], of_basis[i * columns + l], sum);
             }
             out[i * columns + j] = sum;
         }
     }
-    for (uint16_t j = 0; rho != NULL && j < columns; j++) {
-        for (uint16_t i = 0; i < rows; i++) {
+    for (size_t j = 0; rho != NULL && j < columns; j++) {
+        for (size_t i = 0; i < rows; i++) {
             line[i] = R(0.0);
-            for (uint16_t k = 0; k < rows; k++) {
+            for (size_t k = 0; k < rows; k++) {
                 line[i] = r_fma(rho->fit[k * rows + i], out[k * columns + j], line[i]);
             }
         }
-        for (uint16_t i = 0; i < rows; i++) {
+        for (size_t i = 0; i < rows; i++) {
             out[i * columns + j] = line[i];
         }
     }
@@ -828,7 +823,7 @@ static void step_bias(selfcal_work_t *work) {
     const bool begins = work->at == 0U;
     for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
         selfcal_node_view_t v;
-        (void)selfcal_node(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
+        selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
         const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
         const selfcal_wide_t now = v.drift + (v.b - offset * prior_precision) * variance * v.bias_left;
         if (begins && k == 0U) {
@@ -910,17 +905,15 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
     if (work == NULL || self == NULL || report == NULL || axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    selfcal_bank_flush(self);
-    if (self->n < SELFCAL_REPORT_MIN) {
+    if (selfcal_count(self) < SELFCAL_REPORT_MIN) {
         return SELFCAL_TOO_SHORT;
     }
     memset(work, 0, sizeof *work);
     work->bank = self;
     work->axis = axis;
-    work->stage = PEAK;
+    work->stage = GATHER;
     memset(report, 0, sizeof *report);
     report->axis = axis;
-    report->n = self->n;
     for (int h = 0; h < SELFCAL_HYPOTHESES_MAX; h++) {
         selfcal_posterior_t *posterior = &report->hypothesis[h];
         posterior->bias_mean = NAN;
@@ -931,6 +924,21 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
         }
     }
     return SELFCAL_OK;
+}
+
+/* Runs the nodes over what the bank has gathered when the report begins; true when the sums are at rest. */
+static bool step_gather(selfcal_work_t *work) {
+    if (selfcal_bank_run(work->bank, STEP_NODES)) {
+        return false;
+    }
+    if (!work->gathered) {
+        work->gathered = true;
+        if (selfcal_bank_hand_over(work->bank)) {
+            return false;
+        }
+    }
+    work->batches = work->bank->batches;
+    return true;
 }
 
 static void go_to(selfcal_work_t *work, int stage) {
@@ -966,6 +974,10 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     if (work == NULL || report == NULL || work->bank == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    if (work->stage > GATHER && work->batches != work->bank->batches) {
+        work->bank = NULL;
+        return SELFCAL_OVERTAKEN;
+    }
     if (work->stage == WHOLE) {
         finish_report(work, report);
         work->bank = NULL;
@@ -974,6 +986,12 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     selfcal_posterior_t *posterior = &report->hypothesis[work->hypothesis];
     const uint16_t nodes = nodes_of(work), row = cells(hypothesis_of(work)->rho);
     switch (work->stage) {
+    case GATHER:
+        if (step_gather(work)) {
+            report->n = work->bank->n;
+            go_to(work, PEAK);
+        }
+        break;
     case PEAK:
         step_peak(work);
         if (work->at == nodes) {

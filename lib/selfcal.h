@@ -12,8 +12,9 @@
  *   1. `selfcal codegen MODEL.yaml -o DIR` writes the model tables (const, for flash).
  *   2. Give selfcal_init() the model and SELFCAL_SIZE(nodes, axes) bytes; the memory stays yours, nothing is allocated.
  *   3. selfcal_push() every sample, selfcal_skip() every missing one. Cost is even: SELFCAL_BATCH bank samples are
- *      gathered, then every node runs over them.
+ *      gathered, and while the next ones are, some nodes run over them at every push.
  *   4. When a report is wanted: selfcal_report_begin(), then selfcal_report_step() until it no longer says SELFCAL_BUSY.
+ *      Samples may be pushed in between, as long as selfcal_room() says that there is room.
  *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only.
  *
  * THREADS AND INTERRUPTS
@@ -63,12 +64,20 @@ extern "C" {
 #error "SELFCAL_HYPOTHESES_MAX must be 1 to 16"
 #endif
 
-/* Bank samples gathered before the nodes run over them. More: fewer loads per sample, a longer worst sample. */
+/* Bank samples gathered before the nodes run over them. More: fewer loads per sample and more time for a report, 56 bytes each. */
 #ifndef SELFCAL_BATCH
 #define SELFCAL_BATCH 16
 #endif
 #if SELFCAL_BATCH < 8 || SELFCAL_BATCH > 64
 #error "SELFCAL_BATCH must be 8 (the first batch places the nodes) to 64"
+#endif
+
+/* Nodes that one sample runs at least while a batch waits; more if the batches would come faster than that. More: less overhead. */
+#ifndef SELFCAL_PUSH_NODES
+#define SELFCAL_PUSH_NODES 1
+#endif
+#if SELFCAL_PUSH_NODES < 1 || SELFCAL_PUSH_NODES > 65535
+#error "SELFCAL_PUSH_NODES must be 1 to 65535"
 #endif
 
 /* Cells a dimension that a report integrates over. */
@@ -168,6 +177,7 @@ typedef enum {
     SELFCAL_OK = 0,
     SELFCAL_BUSY = 1,            /* a report has more steps to go */
     SELFCAL_TOO_SHORT = 2,       /* fewer bank samples than a report needs (SELFCAL_REPORT_MIN) */
+    SELFCAL_OVERTAKEN = 3,       /* the sums have moved under a report, which is given up */
     SELFCAL_BAD_ARGUMENT = -1,   /* null pointer, axis or node out of range, sigma_v not positive */
     SELFCAL_BAD_MODEL = -2,      /* tables contradict themselves or exceed a configured maximum */
     SELFCAL_BAD_MEMORY = -3      /* too small, or not aligned to 8 bytes */
@@ -205,6 +215,15 @@ typedef struct {
 #define SELFCAL_SIZE(nodes, axes) \
     ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_sum_t) + sizeof(selfcal_real_t))))
 
+/* Bank samples on their way into the sums. Private. */
+typedef struct {
+    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
+    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over that of a whole block */
+    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
+    uint32_t gap_after;
+    uint32_t count;
+} selfcal_batch_t;
+
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
@@ -214,12 +233,13 @@ typedef struct {
     uint32_t n;              /* bank samples in all sums */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
-    /* batch */
-    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
-    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over that of a whole block */
-    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
-    uint32_t pending_gap;            /* ... and after the last */
-    uint32_t in_batch;
+    /* One batch is gathered while the nodes run, some at every push, over the one before. */
+    selfcal_batch_t batch[2];
+    uint8_t gathering;    /* which of them is gathered */
+    uint16_t ran;         /* nodes that have run over the other */
+    uint16_t push_nodes;  /* to run at a push */
+    uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
+    uint32_t batches;     /* that the nodes have begun with */
     /* averager */
     bool started;
     float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
@@ -240,8 +260,8 @@ typedef struct {
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
 /* One sample of every axis, in the model's axis order, in the model's units. A value that is not finite, at the range limit
- * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes); every
- * block * SELFCAL_BATCH samples O(nodes * axes * SELFCAL_BATCH). */
+ * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes), and SELFCAL_BATCH
+ * bank samples of all axes for SELFCAL_PUSH_NODES nodes, or 2 nodes / (block * SELFCAL_BATCH) if that is more: the work is even. */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
 
 /* `count` samples are missing. The prediction over the gap is exact, however long it is. A block with half or more of its
@@ -250,8 +270,11 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */
 
-/* Bank samples in the sums, those of the current batch included. */
+/* Bank samples in the sums, those on their way into them included. */
 uint32_t selfcal_count(const selfcal_t *self);
+
+/* Bank samples that may still come before the nodes have to run on, which ends a report under way (SELFCAL_OVERTAKEN). */
+uint32_t selfcal_room(const selfcal_t *self);
 
 const selfcal_counters_t *selfcal_counters(const selfcal_t *self);
 
@@ -323,6 +346,8 @@ typedef struct {
     uint8_t axis, hypothesis, stage, pass;
     uint16_t first_node;
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
+    uint32_t batches; /* of the bank, when the sums came to rest */
+    bool gathered;    /* the nodes run over the last batch */
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
@@ -352,10 +377,12 @@ typedef struct {
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
 } selfcal_work_t;
 
-/* Starts a report on one axis. Do not push or skip between this and the last step. SELFCAL_TOO_SHORT if there are too few samples. */
+/* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. */
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
-/* One slice of it. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. */
+/* One slice of it, below 60 000 instructions on a Cortex-M4F. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is
+ * whole. It first runs the nodes over what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a
+ * call that looks at the sums, it is SELFCAL_OVERTAKEN; begin anew. */
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);
 
 /* All steps in a row. */

@@ -232,11 +232,13 @@ def table(bench: Bench) -> str:
     clocks = ", ".join(f"{MACHINES[target].systick_hz // 10**6} MHz" for target in targets)
     row(f"share of the core ({clocks}), six axes at {float(RATE_HZ)} Hz averaged to 1 Hz", shares["push"])
     row("… with every sample a bank sample", shares["bank"])
-    per("push that fills a batch, every filter settled", "bank.steady.worst_push")
-    per("push that fills the first batch and places the nodes", "bank.first_batch")
+    per("the dearest push, averaged to 1 Hz", "push.worst")
+    per("the dearest push, every sample a bank sample, filters settled", "bank.steady.worst_push")
+    per("… over the first batch, which places the nodes", "bank.first.worst_push")
     per("gap, every filter", "bank.gap")
     per("report of one axis", "report")
     for stage, title in (
+        ("gather", "nodes over the last samples"),
         ("peak", "best node"),
         ("sigma", "cells of σv"),
         ("values", "node values"),
