@@ -37,14 +37,7 @@ static bool valid_grid(const selfcal_grid_t *grid) {
 }
 
 static uint16_t hypothesis_nodes(const selfcal_hypothesis_t *hypothesis) {
-    uint32_t nodes = 1U;
-    if (hypothesis->rho != NULL) {
-        nodes *= hypothesis->rho->nodes;
-    }
-    if (hypothesis->alpha != NULL) {
-        nodes *= hypothesis->alpha->nodes;
-    }
-    return (uint16_t)nodes;
+    return (uint16_t)(grid_rows(hypothesis) * grid_columns(hypothesis));
 }
 
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
@@ -54,7 +47,7 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
         index = (uint16_t)(index - hypothesis_nodes(&hypothesis[h]));
         h++;
     }
-    const uint16_t columns = hypothesis[h].alpha != NULL ? hypothesis[h].alpha->nodes : 1U;
+    const uint16_t columns = grid_columns(&hypothesis[h]);
     const uint16_t row = (uint16_t)(index / columns), column = (uint16_t)(index % columns);
     selfcal_place_t place = {h, NAN, NAN};
     if (hypothesis[h].rho != NULL) {
@@ -97,23 +90,24 @@ static bool valid_model(const selfcal_model_t *model) {
     return nodes == model->nodes;
 }
 
-/* Node of a law at (rho, alpha), at the instant of its first sample. */
+/* A node at the instant of its first sample. */
 static void init_node(selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
     selfcal_node_t *node = &self->node[index];
+    const selfcal_wide_t variance = law != SELFCAL_CONSTANT ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
+    selfcal_wide_t beta = 0.0;
+    if (law == SELFCAL_GAUSS_MARKOV) {
+        beta = -expm1(-fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, ALPHA_DT_MAX));
+    }
+    const selfcal_wide_t one_less_phi_sq = beta * (2.0 - beta);
     selfcal_wide_t q = 0.0;       /* drift variance per interval */
     selfcal_wide_t p_first = 0.0; /* predicted drift variance at the first sample */
-    selfcal_wide_t one_less_phi_sq = 0.0;
-    selfcal_wide_t beta = 0.0;
     if (law == SELFCAL_RANDOM_WALK) {
-        q = exp(2.0 * (selfcal_wide_t)place.ln_rho);
+        q = variance;
         p_first = q; /* x_0 = 0 */
     } else if (law == SELFCAL_GAUSS_MARKOV) {
-        const selfcal_wide_t alpha_dt = fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, ALPHA_DT_MAX);
-        beta = -expm1(-alpha_dt);
-        one_less_phi_sq = -expm1(-2.0 * alpha_dt);
-        p_first = exp(2.0 * (selfcal_wide_t)place.ln_rho); /* stationary */
+        p_first = variance; /* stationary */
         q = p_first * one_less_phi_sq;
     }
     /* Fixed point of P' = phi^2 P/(1 + P) + q: P^2 + b P - q = 0, in the form without cancellation. */
@@ -179,6 +173,10 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
 static void place_nodes(selfcal_t *self) {
     const selfcal_model_t *model = self->model;
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)model->dt_s);
+    ln_range_t sigma[SELFCAL_AXES_MAX];
+    for (uint8_t axis = 0; axis < model->axes; axis++) {
+        sigma[axis] = first_ln_sigma(self, axis);
+    }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
         selfcal_real_t rho_lo = INFINITY, rho_hi = -INFINITY, alpha_lo = INFINITY, alpha_hi = -INFINITY;
@@ -188,14 +186,12 @@ static void place_nodes(selfcal_t *self) {
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
-            const ln_range_t sigma = first_ln_sigma(self, axis);
-            rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - sigma.hi - R(0.5));
-            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - sigma.lo + R(0.5));
+            rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - sigma[axis].hi - R(0.5));
+            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - sigma[axis].lo + R(0.5));
             alpha_lo = r_fmin(alpha_lo, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min);
             alpha_hi = r_fmax(alpha_hi, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max);
         }
-        const uint16_t rows = hypothesis->rho != NULL ? hypothesis->rho->nodes : 1U;
-        const uint16_t columns = hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
+        const uint16_t rows = grid_rows(hypothesis), columns = grid_columns(hypothesis);
         self->rho_lo[h] = rho_lo;
         self->rho_step[h] = rows > 1U ? (rho_hi - rho_lo) / (selfcal_real_t)(rows - 1U) : R(0.0);
         self->alpha_lo[h] = alpha_lo;
@@ -217,10 +213,10 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     memset(self, 0, sizeof *self);
     memset(memory, 0, SELFCAL_SIZE(model->nodes, model->axes));
     self->model = model;
-    self->node = memory;
-    self->b = (selfcal_sum_t *)(void *)(self->node + model->nodes);
+    self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
-    self->x = (selfcal_real_t *)(void *)(self->c + cells);
+    self->node = (selfcal_node_t *)(void *)(self->c + cells);
+    self->x = (selfcal_drift_t *)(void *)(self->node + model->nodes);
     /* Twice what would do, since the blocks of a batch may have lost up to half of their samples. */
     const uint64_t pushes = (uint64_t)model->block * SELFCAL_BATCH;
     const uint64_t needed = (2U * (uint64_t)model->nodes + pushes - 1U) / pushes;
@@ -286,22 +282,32 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
     sum_add_scaled(&node->a, gains->scale, a);
 }
 
-static void run_span(selfcal_t *self, span_t span, size_t j, size_t nodes) {
+/* A level node is no longer so. What its constant u added to A comes due. */
+static void leave_level(selfcal_node_t *node) {
+    if (node->level) {
+        const selfcal_wide_t a = level_a(node);
+        const selfcal_real_t hi = (selfcal_real_t)a;
+        sum_add(&node->a, hi, (selfcal_real_t)(a - (selfcal_wide_t)hi));
+        node->level = false;
+        node->level_from = 0;
+    }
+}
+
+static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
     for (uint32_t i = span.from; i < span.to; i++) {
         whole = whole && batch->r[i] == R(1.0);
     }
+    if (whole) {
+        selfcal_kernel_level(self, span, from, to);
+    }
     gains_t gains;
     gains.span = span;
-    while (j < nodes) {
+    for (size_t j = from; j < to; j++) {
         selfcal_node_t *node = &self->node[j];
         if (whole && node->level) {
-            const size_t first = j;
-            while (j < nodes && self->node[j].level) {
-                j++;
-            }
-            selfcal_kernel_level(self, span, first, j);
+            node->steady += span.to - span.from;
             continue;
         }
         if (whole && node->d == R(0.0)) {
@@ -311,16 +317,16 @@ static void run_span(selfcal_t *self, span_t span, size_t j, size_t nodes) {
             if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
                 node->e = R(0.0);
                 node->level = true;
+                node->level_from = node->steady;
             }
         } else {
+            leave_level(node);
             gains_varying(batch, node, &gains);
             selfcal_kernel_run(self, j, &gains);
-            node->level = false;
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
                 node->d = R(0.0);
             }
         }
-        j++;
     }
 }
 
@@ -332,18 +338,17 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
-        node->level = false;
+        leave_level(node);
+        const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)node->d, e = (selfcal_wide_t)node->e;
         if (node->beta == R(0.0)) {
-            node->d = (selfcal_real_t)((selfcal_wide_t)node->d + intervals * (selfcal_wide_t)node->q);
+            node->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);
             continue; /* the prediction x stays */
         }
-        const selfcal_wide_t ln_phi = log1p(-(selfcal_wide_t)node->beta);
-        const selfcal_wide_t less = -expm1(intervals * ln_phi);          /* 1 - phi^count */
-        const selfcal_wide_t less_sq = -expm1(2.0 * intervals * ln_phi); /* 1 - phi^(2 count) */
-        const selfcal_wide_t stationary = (selfcal_wide_t)node->q / -expm1(2.0 * ln_phi);
-        const selfcal_wide_t d = (selfcal_wide_t)node->d;
+        const selfcal_wide_t less = -expm1(intervals * log1p(-beta)); /* 1 - phi^count */
+        const selfcal_wide_t less_sq = less * (2.0 - less);
+        const selfcal_wide_t stationary = (selfcal_wide_t)node->q / (beta * (2.0 - beta));
         node->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
-        node->e = (selfcal_real_t)((selfcal_wide_t)node->e + less * (1.0 - (selfcal_wide_t)node->u_inf - (selfcal_wide_t)node->e));
+        node->e = (selfcal_real_t)(e + less * (1.0 - (selfcal_wide_t)node->u_inf - e));
         selfcal_kernel_gap(self, j, less);
     }
 }
@@ -459,12 +464,12 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
     view->law = self->model->hypothesis[place.hypothesis].law;
     view->ln_rho = (selfcal_wide_t)place.ln_rho;
     view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
-    view->a = sum_value(node->a);
-    view->b = sum_value(self->b[k]);
-    view->c = sum_value(self->c[k]);
+    view->a = sum_value(node->a) + level_a(node);
+    selfcal_wide_t x;
+    selfcal_kernel_view(self, k, &view->b, &view->c, &x);
     view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
     /* The filter holds the prediction for the next interval, phi times the drift now. */
-    view->drift = (selfcal_wide_t)self->x[k] / phi;
+    view->drift = x / phi;
     view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)node->e - beta) / phi;
     if (phi > 0.03) {
         view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);

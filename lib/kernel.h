@@ -27,11 +27,23 @@ static inline selfcal_batch_t *waiting(selfcal_t *self) {
 /* Every axis of node `j` through the span. */
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains);
 
-/* The same for the nodes `from` to `to` - 1, all level: g, u and 1/s are constant; their sums A go on as well. */
+/* The same for the level ones of the nodes `from` to `to` - 1: g, u and 1/s are constant. */
 void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
 
 /* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
 void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
+
+/* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
+void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
+
+/* Nodes of a hypothesis: `rows` of rho times `columns` of alpha, which changes fastest. */
+static inline uint16_t grid_rows(const selfcal_hypothesis_t *hypothesis) {
+    return hypothesis->rho != NULL ? hypothesis->rho->nodes : 1U;
+}
+
+static inline uint16_t grid_columns(const selfcal_hypothesis_t *hypothesis) {
+    return hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
+}
 
 /* ------------------------------------------------------------------------------------------------------- long sums */
 
@@ -69,6 +81,12 @@ static inline selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
 static inline selfcal_real_t steady_g(const selfcal_node_t *node) {
     const selfcal_real_t gain = node->p_inf / (R(1.0) + node->p_inf);
     return r_fma(gain, -node->beta, gain) + node->beta;
+}
+
+/* What a level node's samples have added to A since it became level. */
+static inline selfcal_wide_t level_a(const selfcal_node_t *node) {
+    const selfcal_wide_t u = (selfcal_wide_t)node->u_inf;
+    return node->level ? (selfcal_wide_t)(node->steady - node->level_from) * u * u / (1.0 + (selfcal_wide_t)node->p_inf) : 0.0;
 }
 
 #endif

@@ -26,13 +26,12 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
 /* Nearly all samples of a long record go through here: five arithmetic instructions an axis and sample. By fours, which also
  * keeps the sums short: squares of lattice values would round to one side (1e-7 of C, seen with 64 in a row). */
 static inline void run_level(selfcal_t *self, span_t span, size_t j) {
-    selfcal_node_t *node = &self->node[j];
+    const selfcal_node_t *node = &self->node[j];
     const selfcal_batch_t *batch = waiting(self);
     const selfcal_real_t u = node->u_inf;
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t product = inv_s.hi * u;
     const selfcal_sum_t u_inv_s = {product, r_fma(inv_s.lo, u, r_fma(inv_s.hi, u, -product))};
-    sum_add_scaled(&node->a, inv_s, (selfcal_real_t)(span.to - span.from) * u * u);
     const selfcal_real_t minus_beta = -node->beta;
     const selfcal_real_t g = steady_g(node);
     const size_t count = span.to - span.from;
@@ -69,8 +68,9 @@ static inline void run_level(selfcal_t *self, span_t span, size_t j) {
 
 void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) {
     for (size_t j = from; j < to; j++) {
-        run_level(self, span, j);
-        self->node[j].steady += span.to - span.from;
+        if (self->node[j].level) {
+            run_level(self, span, j);
+        }
     }
 }
 
@@ -79,4 +79,10 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
         self->x[k] = (selfcal_real_t)((selfcal_wide_t)self->x[k] * (1.0 - less));
     }
+}
+
+void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
+    *b = sum_value(self->b[k]);
+    *c = sum_value(self->c[k]);
+    *x = (selfcal_wide_t)self->x[k];
 }

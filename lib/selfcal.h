@@ -114,6 +114,10 @@ typedef struct {
     selfcal_real_t hi, lo;
 } selfcal_sum_t;
 
+/* What a kernel keeps for each (node, axis): its predicted drift, and its sums. */
+typedef selfcal_real_t selfcal_drift_t;
+typedef selfcal_sum_t selfcal_total_t;
+
 /* Reports and ln-likelihoods. Deliberately double, in software where the FPU has none; never touched per sample. */
 typedef double selfcal_wide_t;
 
@@ -207,13 +211,14 @@ typedef struct {
     selfcal_real_t e;     /* that innovation at the next sample less u_inf */
     bool level;           /* d = e = 0: the kernel sums plain nu */
     uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
+    uint32_t level_from;  /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;      /* sum u^2 / s */
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
 } selfcal_node_t;
 
-/* Bytes of memory selfcal_init() needs: for each node in the float build, 52 and 20 more per axis. */
+/* Bytes of memory selfcal_init() needs: for each node in the float build, 56 and 20 more per axis. */
 #define SELFCAL_SIZE(nodes, axes) \
-    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_sum_t) + sizeof(selfcal_real_t))))
+    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
 
 /* Bank samples on their way into the sums. Private. */
 typedef struct {
@@ -228,8 +233,8 @@ typedef struct {
 typedef struct {
     const selfcal_model_t *model;
     selfcal_node_t *node;    /* [nodes] */
-    selfcal_sum_t *b, *c;    /* [nodes][axes]: sums u nu / s and nu^2 / s */
-    selfcal_real_t *x;       /* [nodes][axes]: predicted drift of the zero-bias filter */
+    selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
+    selfcal_drift_t *x;      /* [nodes][axes]: predicted drift of the zero-bias filter */
     uint32_t n;              /* bank samples in all sums */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
