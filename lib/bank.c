@@ -161,6 +161,9 @@ static void place_nodes(selfcal_t *self) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
         selfcal_real_t rho_lo = INFINITY, rho_hi = -INFINITY, alpha_lo = INFINITY, alpha_hi = -INFINITY;
         for (uint8_t axis = 0; axis < model->axes; axis++) {
+            if (selfcal_retired(self, axis)) {
+                continue; /* dead before the first batch: it must not draw the nodes away from the others */
+            }
             const selfcal_prior_t *prior = model->axis[axis].prior;
             const bool markov = hypothesis->law == SELFCAL_GAUSS_MARKOV;
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
@@ -202,6 +205,8 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     memset(self, 0, sizeof *self);
     memset(memory, 0, SELFCAL_SIZE(model->nodes, model->axes));
     self->model = model;
+    self->block = model->block;
+    self->variance_ratio = R(1.0);
     self->node = memory;
     self->b = (selfcal_sum_t *)(void *)(self->node + model->nodes);
     self->c = self->b + cells;
@@ -511,6 +516,9 @@ static uint8_t locate(const selfcal_model_t *model, uint16_t *index) {
 selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     if (self == NULL || view == NULL || axis >= self->model->axes || index >= self->model->nodes) {
         return SELFCAL_BAD_ARGUMENT;
+    }
+    if (selfcal_retired(self, axis)) {
+        return SELFCAL_AXIS_RETIRED;
     }
     selfcal_bank_flush(self);
     if (self->n == 0U) {

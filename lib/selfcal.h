@@ -87,6 +87,14 @@ extern "C" {
 #error "SELFCAL_GRID_MAX must be 6 (a quintic spline needs six) to 64"
 #endif
 
+/* Bank intervals in a row that an axis may spoil before it is retired, see selfcal_push(); 0: no axis is ever retired. */
+#ifndef SELFCAL_RETIRE_BLOCKS
+#define SELFCAL_RETIRE_BLOCKS 60
+#endif
+#if SELFCAL_RETIRE_BLOCKS < 0
+#error "SELFCAL_RETIRE_BLOCKS must be 0 or above"
+#endif
+
 #ifndef SELFCAL_ASSERT
 #define SELFCAL_ASSERT(condition) ((void)0)
 #endif
@@ -168,6 +176,7 @@ typedef enum {
     SELFCAL_OK = 0,
     SELFCAL_BUSY = 1,            /* a report has more steps to go */
     SELFCAL_TOO_SHORT = 2,       /* fewer bank samples than a report needs (SELFCAL_REPORT_MIN) */
+    SELFCAL_AXIS_RETIRED = 3,    /* the axis failed for SELFCAL_RETIRE_BLOCKS: it has no sums any more */
     SELFCAL_BAD_ARGUMENT = -1,   /* null pointer, axis or node out of range, sigma_v not positive */
     SELFCAL_BAD_MODEL = -2,      /* tables contradict themselves or exceed a configured maximum */
     SELFCAL_BAD_MEMORY = -3      /* too small, or not aligned to 8 bytes */
@@ -180,6 +189,7 @@ typedef struct {
     uint32_t gaps;          /* runs of missing or rejected samples */
     uint32_t blocks_lost;   /* bank intervals without a value: fewer than half of their samples were usable */
     uint32_t blocks_part;   /* bank intervals averaged from part of their samples */
+    uint32_t blocks_moving; /* those of blocks_lost that selfcal_moving() dropped */
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
@@ -224,14 +234,21 @@ typedef struct {
     bool started;
     float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
     selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
+    uint32_t block;                          /* samples a bank interval now has */
+    selfcal_real_t variance_ratio;           /* r of a whole block */
     float first[SELFCAL_AXES_MAX];           /* this block's first sample: its sums are taken about it */
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX];
     uint32_t position, used; /* samples of this block: passed, and usable */
+    bool dropped;            /* the rest of it counts for nothing */
     selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
     uint64_t within_dof;
     float last[SELFCAL_AXES_MAX];
     uint32_t equal[SELFCAL_AXES_MAX];
     bool in_gap;
+    uint32_t retired;        /* a bit for each axis */
+    uint32_t watched;        /* samples looked at since the axes were last judged ... */
+    uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
+    uint32_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
     selfcal_counters_t counters;
 } selfcal_t;
 
@@ -239,14 +256,42 @@ typedef struct {
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
+/* |sample| from here on counts as saturated whatever the range: the most for which no sum can overflow (averager.c), 2^40. */
+#define SELFCAL_SAMPLE_MAX 1.099511627776e12F
+
 /* One sample of every axis, in the model's axis order, in the model's units. A value that is not finite, at the range limit
  * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes); every
- * block * SELFCAL_BATCH samples O(nodes * axes * SELFCAL_BATCH). */
+ * block * SELFCAL_BATCH samples O(nodes * axes * SELFCAL_BATCH).
+ *
+ * An axis that is at fault in more than half of a bank interval's samples spoils the interval for all. After
+ * SELFCAL_RETIRE_BLOCKS such intervals in a row it is retired: the others go on without it, exactly as if the model did not have
+ * it; its values are looked at for the fault counters only; its reports and node views say SELFCAL_AXIS_RETIRED. It stays so
+ * until selfcal_init(), even if it comes back. Samples in which every axis fails count for nobody, and the last axis is never
+ * retired: a sensor that is unplugged and back goes on after a gap. (Intervals are here counted in samples pushed: missing
+ * ones neither help nor harm an axis.) */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
+
+/* True once an axis is retired. */
+bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
 /* `count` samples are missing. The prediction over the gap is exact, however long it is. A block with half or more of its
  * samples counts as their mean with its variance raised by block / used; one with fewer is dropped. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
+
+/* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
+ * Nothing happens at the start of an interval. For selfcal_gate_push(): call this before the window's last sample goes to
+ * selfcal_push(), and selfcal_skip() while the gate says moving. No window then reaches back into an interval that is already
+ * closed, provided that the block is a multiple of the window and that both began together. */
+selfcal_status_t selfcal_moving(selfcal_t *self);
+
+/* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
+ * yields no value. `variance_ratio`: white-noise variance of a whole block's mean over what it is for the model's block at the
+ * model's rate. It is 1 where the sensor's own averaging keeps the noise density, and model->block / block where single samples
+ * stay as noisy as before. sigma_v and N remain those of the model's block: the likelihood is exact, though any ratio but 1
+ * costs the full gain computation for every sample. SELFCAL_BAD_ARGUMENT, and nothing changes, on a block of 0 or a ratio beyond
+ * SELFCAL_VARIANCE_RATIO_MAX or below its inverse. selfcal_within_sd() starts anew. */
+#define SELFCAL_VARIANCE_RATIO_MAX 1024.0F
+selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ratio);
 
 /* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */
 
@@ -255,7 +300,7 @@ uint32_t selfcal_count(const selfcal_t *self);
 
 const selfcal_counters_t *selfcal_counters(const selfcal_t *self);
 
-/* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1 or before the first whole block.
+/* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1, before the first whole block, of a retired axis.
  * White noise would make it sigma_v * sqrt(block): more says coloured noise or vibration within the blocks. */
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis);
 

@@ -79,6 +79,16 @@ public:
         }
     }
 
+    void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
+    void moving() { check(selfcal_moving(&bank_)); }
+    void rate(uint32_t block, float variance_ratio) { check(selfcal_rate(&bank_, block, variance_ratio)); }
+
+    bool retired(uint8_t axis) const {
+        if (axis >= axes_.size())
+            throw std::invalid_argument("axis out of range");
+        return selfcal_retired(&bank_, axis);
+    }
+
     nb::dict report(uint8_t axis) {
         selfcal_report_t r{};
         {
@@ -140,6 +150,7 @@ public:
         d["gaps"] = c->gaps;
         d["blocks_lost"] = c->blocks_lost;
         d["blocks_part"] = c->blocks_part;
+        d["blocks_moving"] = c->blocks_moving;
         d["not_finite"] = list(c->not_finite);
         d["saturated"] = list(c->saturated);
         d["stuck"] = list(c->stuck);
@@ -170,6 +181,8 @@ private:
             return;
         case SELFCAL_TOO_SHORT:
             throw std::length_error("too few bank samples for a report");
+        case SELFCAL_AXIS_RETIRED:
+            throw std::domain_error("the axis is retired: it failed for too long");
         case SELFCAL_BAD_ARGUMENT:
             throw std::invalid_argument("argument out of range");
         case SELFCAL_BAD_MODEL:
@@ -202,6 +215,10 @@ NB_MODULE(MODULE_NAME, m) {
     nb::class_<Bank>(m, "Bank")
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &>())
         .def("push", &Bank::push)
+        .def("skip", &Bank::skip)
+        .def("moving", &Bank::moving)
+        .def("rate", &Bank::rate)
+        .def("retired", &Bank::retired)
         .def("report", &Bank::report)
         .def("node", &Bank::node)
         .def("log_likelihood", &Bank::log_likelihood)
