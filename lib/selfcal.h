@@ -396,6 +396,97 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
 /* All steps in a row. */
 selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
+/* ------------------------------------------------------------------------------------------------------------- gate
+ * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both); gate.c
+ * states the hypotheses, the statistics and their distributions. Independent of selfcal_t. */
+
+typedef enum { SELFCAL_MOVING = 0, SELFCAL_RESTING = 1 } selfcal_motion_t;
+
+typedef struct {
+    uint8_t axes;
+    uint32_t window;   /* samples, 2 or more; a divisor of the bank's block, see selfcal_moving() */
+    float false_alarm; /* probability that a window of rest is taken for motion, up to 0.1; 0: never, to measure the noise */
+    uint32_t hold;     /* windows in a row, after a first one, that must be quiet and on one level before motion is over; 1 or more */
+    uint32_t settle;   /* likewise to take a new gyro level for rest; below `hold` it does nothing, 0: never */
+    uint32_t memory;   /* windows that the level at rest is averaged over, 1 or more; over as many the bias must not drift by more
+                          than the noise of a window's mean. A rotation is found by its distance from that level. */
+    float sigma[SELFCAL_AXES_MAX];  /* noise of one sample at rest: N sqrt(sampling rate); INFINITY leaves the axis out */
+    bool is_rate[SELFCAL_AXES_MAX]; /* a gyro: after a motion it must read what it read before. Others may rest at a new level. */
+} selfcal_gate_config_t;
+
+/* Noise of one axis at rest; the factors are 1 where it is white. */
+typedef struct {
+    float sigma;  /* of one sample, unit; INFINITY leaves the axis out (absent, retired) */
+    float within; /* mean square about the window's mean over sigma^2 */
+    float spread; /* variance of that mean square over what it is for white noise */
+    float level;  /* variance of a window's mean over sigma^2/window */
+} selfcal_gate_noise_t;
+
+/* Monotonic since selfcal_gate_init(). */
+typedef struct {
+    uint64_t windows;
+    uint64_t shaken; /* windows that scatter too much */
+    uint64_t moved;  /* windows off the level of the rest, or of the quiet windows, before */
+    uint64_t blind;  /* windows with a sample that is no number (or at SELFCAL_SAMPLE_MAX), or less than half full */
+    uint64_t alarms; /* times that rest ended by a shaken or moved window */
+} selfcal_gate_counters_t;
+
+/* A level and its variance over sigma^2 of each axis. Private. */
+typedef struct {
+    float mean[SELFCAL_AXES_MAX];
+    selfcal_real_t gamma;
+} selfcal_level_t;
+
+/* Private but for reading `state`, `counters`, and the last window's statistics with their thresholds. */
+typedef struct {
+    selfcal_gate_config_t config;
+    selfcal_gate_noise_t axis[SELFCAL_AXES_MAX];
+    selfcal_motion_t state;
+    selfcal_gate_counters_t counters;
+    float t1, t2;
+    float shaken_above, moved_above, rate_moved_above; /* for windows of threshold_n samples */
+    uint32_t threshold_n;                              /* 0: to be worked out */
+    bool started;
+    float origin[SELFCAL_AXES_MAX]; /* the first sample: gravity or a turn-on bias costs no digits */
+    /* window in progress */
+    float first[SELFCAL_AXES_MAX];
+    selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
+    uint32_t position, used;
+    bool blind;
+    /* levels: of the rest, and of the quiet windows since motion */
+    selfcal_level_t rest, found;
+    bool rested;
+    uint32_t quiet;
+    /* measured over whole windows of rest */
+    uint64_t measured;
+    selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
+} selfcal_gate_t;
+
+/* Starts as moving. SELFCAL_BAD_ARGUMENT if the configuration is not as said above. */
+selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_config_t *config);
+
+/* One sample of every axis. Returns the state: that of the last whole window, so with a sample's last window, known one window
+ * late at most. The window is judged with its last sample. A sample that is no number ends rest at once.
+ *   resting -> moving: one window that scatters too much or is off the level of the rest; a blind window.
+ *   moving -> resting: `hold` windows after a first quiet one, all on one level, the gyros' that of the last rest. A gyro that
+ *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro.
+ * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes); the first window with another count of samples, or after a change of noise,
+ * works out its thresholds: O(sqrt(axes * window)) in selfcal_wide_t. */
+selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]);
+
+/* `count` samples are missing; windows keep their grid. One with half or more of its samples is judged by those. O(1) + a window's. */
+selfcal_motion_t selfcal_gate_skip(selfcal_gate_t *gate, uint64_t count);
+
+/* Takes the noise of an axis from now on, say once N is identified. SELFCAL_BAD_ARGUMENT: null pointer, no such axis, a value that
+ * is not above 0, or a factor that is infinite. */
+selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise);
+
+/* The noise as measured over the whole windows of rest so far, for selfcal_gate_noise(): run with false_alarm 0 while the sensor
+ * is known to rest, and with the sigma that is to be used. Each factor's relative error is about sqrt(2/windows), that of
+ * `within` less. SELFCAL_TOO_SHORT below SELFCAL_GATE_MEASURED_MIN windows. */
+#define SELFCAL_GATE_MEASURED_MIN 30U
+selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise);
+
 /* -------------------------------------------------------------------------------------------------------- telemetry
  * Reports as classical CAN frames of 8 bytes with 11-bit ids. selfcal.dbc describes every item, its unit and its bits, and
  * is the one source of selfcal_frames.h and of the decoders. Each frame carries one value and its item number, a counter
