@@ -181,6 +181,9 @@ static void place_nodes(selfcal_t *self) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
         selfcal_real_t rho_lo = INFINITY, rho_hi = -INFINITY, alpha_lo = INFINITY, alpha_hi = -INFINITY;
         for (uint8_t axis = 0; axis < model->axes; axis++) {
+            if (selfcal_retired(self, axis)) {
+                continue; /* dead before the first batch: it must not draw the nodes away from the others */
+            }
             const selfcal_prior_t *prior = model->axis[axis].prior;
             const bool markov = hypothesis->law == SELFCAL_GAUSS_MARKOV;
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
@@ -199,6 +202,14 @@ static void place_nodes(selfcal_t *self) {
     }
 }
 
+void selfcal_bank_pace(selfcal_t *self, uint32_t block) {
+    /* Twice what would do, since the blocks of a batch may have lost up to half of their samples. */
+    const uint64_t pushes = (uint64_t)block * SELFCAL_BATCH;
+    const uint64_t needed = (2U * (uint64_t)self->model->nodes + pushes - 1U) / pushes;
+    self->block = block;
+    self->push_nodes = (uint16_t)(needed > SELFCAL_PUSH_NODES ? needed : SELFCAL_PUSH_NODES);
+}
+
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size) {
     if (self == NULL || model == NULL || memory == NULL) {
         return SELFCAL_BAD_ARGUMENT;
@@ -213,14 +224,12 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     memset(self, 0, sizeof *self);
     memset(memory, 0, SELFCAL_SIZE(model->nodes, model->axes));
     self->model = model;
+    self->variance_ratio = R(1.0);
     self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
     self->node = (selfcal_node_t *)(void *)(self->c + cells);
     self->x = (selfcal_drift_t *)(void *)(self->node + model->nodes);
-    /* Twice what would do, since the blocks of a batch may have lost up to half of their samples. */
-    const uint64_t pushes = (uint64_t)model->block * SELFCAL_BATCH;
-    const uint64_t needed = (2U * (uint64_t)model->nodes + pushes - 1U) / pushes;
-    self->push_nodes = (uint16_t)(needed > SELFCAL_PUSH_NODES ? needed : SELFCAL_PUSH_NODES);
+    selfcal_bank_pace(self, model->block);
     return SELFCAL_OK;
 }
 
@@ -483,6 +492,9 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
 selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     if (self == NULL || view == NULL || axis >= self->model->axes || index >= self->model->nodes) {
         return SELFCAL_BAD_ARGUMENT;
+    }
+    if (selfcal_retired(self, axis)) {
+        return SELFCAL_AXIS_RETIRED;
     }
     selfcal_bank_flush(self);
     if (self->n == 0U) {

@@ -44,6 +44,8 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* `count` bank intervals without a sample. */
 void selfcal_bank_gap(selfcal_t *self, uint64_t count);
+/* From now on `block` samples make a bank interval: how many nodes a push has to run follows. */
+void selfcal_bank_pace(selfcal_t *self, uint32_t block);
 /* Runs up to `nodes` nodes over the batch that waits; false with none waiting. */
 bool selfcal_bank_run(selfcal_t *self, uint16_t nodes);
 /* Hands over what has been gathered, a batch that is not yet full or a gap after it; false if that is nothing. None may wait. */

@@ -905,6 +905,9 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
     if (work == NULL || self == NULL || report == NULL || axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    if (selfcal_retired(self, axis)) {
+        return SELFCAL_AXIS_RETIRED;
+    }
     if (selfcal_count(self) < SELFCAL_REPORT_MIN) {
         return SELFCAL_TOO_SHORT;
     }

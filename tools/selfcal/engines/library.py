@@ -43,7 +43,12 @@ class Bank:
         self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64))
 
     def report(self, axis: int) -> AxisResult:
-        """Posterior of one axis now. Raises UserError with fewer bank samples than a report needs."""
+        """Posterior of one axis now. Raises UserError of an axis that failed, or with too few bank samples."""
+        if self.raw.retired(axis):
+            raise UserError(
+                f"{self.tables.axes[axis].name} was out of range or stuck for too long and is left out: choose the "
+                "others with --axis"
+            )
         try:
             report = self.raw.report(axis)
         except ValueError as error:  # std::length_error
