@@ -88,6 +88,17 @@ extern "C" {
 #error "SELFCAL_REPORT_CELLS must be 16 to 255"
 #endif
 
+/* Cells of sigma_v in each of those, and bins of a parameter's histogram, which its quantiles are read from. */
+#ifndef SELFCAL_SIGMA_CELLS
+#define SELFCAL_SIGMA_CELLS 24
+#endif
+#ifndef SELFCAL_HISTOGRAM
+#define SELFCAL_HISTOGRAM 128
+#endif
+#if SELFCAL_SIGMA_CELLS < 8 || SELFCAL_HISTOGRAM < 32
+#error "SELFCAL_SIGMA_CELLS must be 8 and SELFCAL_HISTOGRAM 32 at least"
+#endif
+
 /* Nodes one grid dimension holds at most. */
 #ifndef SELFCAL_GRID_MAX
 #define SELFCAL_GRID_MAX 16
@@ -379,9 +390,6 @@ typedef struct {
     float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit */
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
-
-#define SELFCAL_HISTOGRAM 128
-#define SELFCAL_SIGMA_CELLS 24
 
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {

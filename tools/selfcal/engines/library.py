@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _library32, _library64
+from selfcal import _dense, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS
 from selfcal.result import AxisResult, Estimate
@@ -22,11 +22,11 @@ def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
 
 
 class Bank:
-    """A bank over the axes of `tables`; `double` picks the verification build."""
+    """A bank over the axes of `tables`; `double` picks the verification build, `dense` that for up to 64 nodes a dimension."""
 
-    def __init__(self, tables: Tables, *, double: bool = False) -> None:
+    def __init__(self, tables: Tables, *, double: bool = False, dense: bool = False) -> None:
         self.tables = tables
-        self.raw: Any = (_library64 if double else _library32).Bank(
+        self.raw: Any = (_dense if dense else _library64 if double else _library32).Bank(
             tables.dt_s,
             tables.block,
             [
