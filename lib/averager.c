@@ -1,19 +1,30 @@
-/* Front end: keeps bad samples out and averages `block` samples into one bank sample.
+/* Front end: keeps bad samples and dead axes out and averages a block of samples into one bank sample.
  *
  * A boxcar turns white noise of variance V into V/block and leaves slow drift as it is; drift faster than the block is
- * smoothed. Sums are taken about the block's first sample, so that gravity or a turn-on bias costs no digits. */
+ * smoothed. Sums are taken about the block's first sample, so that gravity or a turn-on bias costs no digits.
+ *
+ * Why no sum overflows a float while |sample| < L = SELFCAL_SAMPLE_MAX = 2^40: a block sums at most 2^32 squares of at most 2 L
+ * about its first sample, 2^114 in all. Bank samples are differences of block means, |y| <= 2 L; the prediction x is a weighted
+ * mean of such values and 0, so |nu| <= 4 L; s >= r >= 2^-10 (SELFCAL_VARIANCE_RATIO_MAX); a record has at most 2^32 bank samples.
+ * So C = sum nu^2/s <= 2^(32 + 84 + 10) = 2^126 < FLT_MAX = 2^128, and B = sum u nu/s is less (|u| <= 1). */
 #include "internal.h"
 
 static void start_block(selfcal_t *self) {
     self->position = 0;
     self->used = 0;
+    self->dropped = false;
     memset(self->sum, 0, sizeof self->sum);
     memset(self->sum_sq, 0, sizeof self->sum_sq);
 }
 
+bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
+    SELFCAL_ASSERT(axis < self->model->axes);
+    return (self->retired >> axis & 1U) != 0U;
+}
+
 static void close_block(selfcal_t *self) {
-    const uint32_t block = self->model->block;
-    if (self->used * 2U < block) {
+    const uint32_t block = self->block;
+    if (self->used < block - self->used) {
         self->counters.blocks_lost++;
         selfcal_bank_gap(self, 1U);
         start_block(self);
@@ -22,6 +33,10 @@ static void close_block(selfcal_t *self) {
     selfcal_real_t y[SELFCAL_AXES_MAX];
     const bool first = selfcal_count(self) == 0U;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        if (selfcal_retired(self, axis)) {
+            y[axis] = R(0.0); /* harmless to its filters, unseen by the others */
+            continue;
+        }
         const selfcal_real_t mean = self->sum[axis] / (selfcal_real_t)self->used;
         const selfcal_real_t level = (selfcal_real_t)(self->first[axis] - self->origin[axis]) + mean;
         if (first) {
@@ -34,8 +49,15 @@ static void close_block(selfcal_t *self) {
     if (self->used < block) {
         self->counters.blocks_part++;
     }
-    selfcal_bank_sample(self, y, (selfcal_real_t)block / (selfcal_real_t)self->used);
+    selfcal_bank_sample(self, y, self->variance_ratio * ((selfcal_real_t)block / (selfcal_real_t)self->used));
     start_block(self);
+}
+
+static void open_gap(selfcal_t *self) {
+    if (!self->in_gap) {
+        self->counters.gaps++;
+        self->in_gap = true;
+    }
 }
 
 /* Time passes by `count` samples without a value. */
@@ -43,11 +65,8 @@ static void pass(selfcal_t *self, uint64_t count) {
     if (!self->started || count == 0U) {
         return;
     }
-    if (!self->in_gap) {
-        self->counters.gaps++;
-        self->in_gap = true;
-    }
-    const uint32_t block = self->model->block;
+    open_gap(self);
+    const uint32_t block = self->block;
     const uint32_t left = block - self->position;
     if (count < left) {
         self->position += (uint32_t)count;
@@ -70,49 +89,121 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
     return SELFCAL_OK;
 }
 
-/* Counts what is wrong with a sample; true if nothing is. */
-static bool usable(selfcal_t *self, const float sample[]) {
-    bool good = true;
+/* Forgets what the block in progress holds; the rest of it will pass without a value. */
+static void drop_block(selfcal_t *self) {
+    const uint32_t position = self->position;
+    start_block(self);
+    self->position = position;
+    self->dropped = position > 0U;
+}
+
+selfcal_status_t selfcal_moving(selfcal_t *self) {
+    if (self == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (self->position > 0U && !self->dropped) {
+        self->counters.blocks_moving++;
+        open_gap(self);
+        drop_block(self);
+    }
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ratio) {
+    if (self == NULL || block == 0U || !(variance_ratio >= 1.0F / SELFCAL_VARIANCE_RATIO_MAX) ||
+        !(variance_ratio <= SELFCAL_VARIANCE_RATIO_MAX)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (self->position > 0U) {
+        open_gap(self);
+        drop_block(self);
+        self->position = (uint32_t)((uint64_t)self->position * block / self->block); /* the same part of the interval has passed */
+    }
+    selfcal_bank_pace(self, block);
+    self->variance_ratio = (selfcal_real_t)variance_ratio;
+    memset(self->within, 0, sizeof self->within);
+    self->within_dof = 0;
+    return SELFCAL_OK;
+}
+
+/* Counts what is wrong with a sample; a bit for each axis at fault. */
+static uint32_t faults(selfcal_t *self, const float sample[]) {
+    uint32_t bad = 0;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_axis_t *limits = &self->model->axis[axis];
         const float value = sample[axis];
         if (!isfinite(value)) {
             self->counters.not_finite[axis]++;
-            good = false;
+            bad |= 1U << axis;
             continue;
         }
-        if (limits->range > 0.0F && fabsf(value) >= limits->range) {
+        if ((limits->range > 0.0F && fabsf(value) >= limits->range) || fabsf(value) >= SELFCAL_SAMPLE_MAX) {
             self->counters.saturated[axis]++;
-            good = false;
+            bad |= 1U << axis;
         }
         self->equal[axis] = value == self->last[axis] ? self->equal[axis] + 1U : 1U;
         self->last[axis] = value;
         if (limits->stuck_limit > 0U && self->equal[axis] >= limits->stuck_limit) {
             self->counters.stuck[axis]++;
-            good = false;
+            bad |= 1U << axis;
         }
     }
-    return good;
+    return bad;
+}
+
+/* Retires the axes that keep the others waiting. `bad`, `live`: axes at fault, and not yet retired. Only samples in which some
+ * live axis is sound are counted: where all fail (the sensor unplugged) nobody is kept waiting by anybody. */
+static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
+    if (bad == live) {
+        return;
+    }
+    const uint8_t axes = self->model->axes;
+    for (uint8_t axis = 0; bad != 0U && axis < axes; axis++) {
+        self->bad[axis] += bad >> axis & 1U;
+    }
+    self->watched++;
+    if (self->watched < self->block) {
+        return;
+    }
+    for (uint8_t axis = 0; axis < axes; axis++) {
+        const bool mostly = self->bad[axis] > self->watched - self->bad[axis];
+        self->bad_blocks[axis] = mostly ? self->bad_blocks[axis] + 1U : 0U;
+        if (SELFCAL_RETIRE_BLOCKS > 0 && self->bad_blocks[axis] >= SELFCAL_RETIRE_BLOCKS && live != 1U << axis) {
+            live &= ~(1U << axis); /* but never the last one */
+            self->retired |= 1U << axis;
+        }
+        self->bad[axis] = 0;
+    }
+    self->watched = 0;
 }
 
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
     if (self == NULL || sample == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!usable(self, sample)) {
+    (void)selfcal_bank_run(self, self->push_nodes);
+    const uint8_t axes = self->model->axes;
+    const uint32_t live = ((1U << axes) - 1U) & ~self->retired;
+    const uint32_t bad = faults(self, sample) & live;
+    retire(self, bad, live);
+    if (bad != 0U || self->dropped) {
         pass(self, 1U);
         return SELFCAL_OK;
     }
-    const uint8_t axes = self->model->axes;
     self->in_gap = false;
     if (!self->started) {
         self->started = true;
-        memcpy(self->origin, sample, axes * sizeof sample[0]);
+        for (uint8_t axis = 0; axis < axes; axis++) {
+            self->origin[axis] = selfcal_retired(self, axis) ? 0.0F : sample[axis];
+        }
     }
     if (self->used == 0U) {
         memcpy(self->first, sample, axes * sizeof sample[0]);
     }
     for (uint8_t axis = 0; axis < axes; axis++) {
+        if (selfcal_retired(self, axis)) {
+            continue;
+        }
         const selfcal_real_t from_first = (selfcal_real_t)sample[axis] - (selfcal_real_t)self->first[axis];
         self->sum[axis] += from_first;
         self->sum_sq[axis] = r_fma(from_first, from_first, self->sum_sq[axis]);
@@ -120,7 +211,7 @@ selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
     self->counters.samples++;
     self->used++;
     self->position++;
-    if (self->position == self->model->block) {
+    if (self->position == self->block) {
         close_block(self);
     }
     return SELFCAL_OK;
@@ -132,5 +223,5 @@ const selfcal_counters_t *selfcal_counters(const selfcal_t *self) {
 
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis) {
     SELFCAL_ASSERT(axis < self->model->axes);
-    return self->within_dof > 0U ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof) : NAN;
+    return self->within_dof > 0U && !selfcal_retired(self, axis) ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof) : NAN;
 }

@@ -44,8 +44,21 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* `count` bank intervals without a sample. */
 void selfcal_bank_gap(selfcal_t *self, uint64_t count);
-/* Runs the nodes over what is waiting: a batch that is not yet full, a gap after it. */
+/* From now on `block` samples make a bank interval: how many nodes a push has to run follows. */
+void selfcal_bank_pace(selfcal_t *self, uint32_t block);
+/* Runs up to `nodes` nodes over the batch that waits; false with none waiting. */
+bool selfcal_bank_run(selfcal_t *self, uint16_t nodes);
+/* Hands over what has been gathered, a batch that is not yet full or a gap after it; false if that is nothing. None may wait. */
+bool selfcal_bank_hand_over(selfcal_t *self);
+/* Both, to the end. */
 void selfcal_bank_flush(selfcal_t *self);
-
+/* Where a node lies: its hypothesis, and ln of its rho and alpha; NaN where the law has none. */
+typedef struct {
+    uint8_t hypothesis;
+    selfcal_real_t ln_rho, ln_alpha;
+} selfcal_place_t;
+selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index);
+/* selfcal_node() of the sums as they are, without what has only been gathered. */
+void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 
 #endif

@@ -14,8 +14,12 @@
  * they leave, so the interpolated thing is always the likelihood alone. */
 #include "internal.h"
 
-/* Stages of a report. */
-enum { FIELDS, FIT, SCAN, SUM, FINISH };
+/* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
+enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
+#define STEP_NODES 3U
+#define STEP_SHIFTED_NODES 32U
+#define STEP_SCANNED_CELLS 16U
+#define STEP_SUMMED_CELLS 6U
 
 /* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
 #define DEPTH R(20.0)
@@ -23,7 +27,7 @@ enum { FIELDS, FIT, SCAN, SUM, FINISH };
 #define SHRINK R(0.7)
 #define PASSES_MAX 8U
 /* n_eff (delta + e^(-2 delta)/2 - 1/2) at the ends of the sigma_v cells. */
-#define SIGMA_DEPTH 13.0
+#define SIGMA_DEPTH R(13.0)
 
 static const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {
     return &work->bank->model->hypothesis[work->hypothesis];
@@ -77,74 +81,105 @@ static uint8_t basis_at(uint16_t nodes, selfcal_real_t z, selfcal_real_t out[6])
     return (uint8_t)(span - 5U);
 }
 
-/* Node values [rho][alpha] in work->values become spline coefficients in `out`. */
-static void fit(selfcal_work_t *work, selfcal_real_t out[]) {
-    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    selfcal_wide_t line[SELFCAL_GRID_MAX];
-    for (uint16_t j = 0; hypothesis->rho != NULL && j < columns; j++) {
-        for (uint16_t i = 0; i < rows; i++) {
-            line[i] = 0.0;
-            for (uint16_t k = 0; k < rows; k++) {
-                line[i] += hypothesis->rho->fit[i * rows + k] * work->values[k * columns + j];
-            }
-        }
-        for (uint16_t i = 0; i < rows; i++) {
-            work->values[i * columns + j] = line[i];
+static selfcal_real_t dot(const selfcal_real_t a[], const selfcal_real_t b[], size_t count) {
+    selfcal_real_t sum = R(0.0);
+    for (size_t i = 0; i < count; i++) {
+        sum = r_fma(a[i], b[i], sum);
+    }
+    return sum;
+}
+
+/* Node values [rho][alpha] become spline coefficients in `out`. */
+static void fit(const selfcal_work_t *work, const selfcal_real_t values[], selfcal_real_t out[]) {
+    const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
+    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
+    selfcal_real_t line[SELFCAL_GRID_MAX];
+    for (size_t i = 0; i < rows; i++) {
+        for (size_t j = 0; j < columns; j++) {
+            const selfcal_real_t *value = &values[i * columns];
+            out[i * columns + j] = alpha != NULL ? dot(&alpha->fit[j * columns], value, columns) : value[j];
         }
     }
-    for (uint16_t i = 0; i < rows; i++) {
-        for (uint16_t j = 0; j < columns; j++) {
-            selfcal_wide_t sum = 0.0;
-            for (uint16_t k = 0; hypothesis->alpha != NULL && k < columns; k++) {
-                sum += hypothesis->alpha->fit[j * columns + k] * work->values[i * columns + k];
-            }
-            out[i * columns + j] = (selfcal_real_t)(hypothesis->alpha != NULL ? sum : work->values[i * columns + j]);
+    for (size_t j = 0; rho != NULL && j < columns; j++) {
+        for (size_t i = 0; i < rows; i++) {
+            line[i] = out[i * columns + j];
+        }
+        for (size_t i = 0; i < rows; i++) {
+            out[i * columns + j] = dot(&rho->fit[i * rows], line, rows);
         }
     }
 }
 
 /* ---------------------------------------------------------------------------------------------------------- expectation */
 
-typedef struct {
-    selfcal_real_t ln_v; /* ln of the innovations' variance over sigma_v^2 of the data */
-    selfcal_real_t ln_s; /* ln of what the filter itself takes it to be, over its own sigma_v^2 */
-} expected_t;
+/* In selfcal_real_t, which is right to some 2e-7 n/2 ln V nats, and in selfcal_wide_t for what is longer than that. */
+#define NAME(name) name
+#define T selfcal_real_t
+#define T_(x) R(x)
+#define T_exp r_exp
+#define T_expm1 r_expm1
+#define T_log1p r_log1p
+#define T_sqrt r_sqrt
+#include "expected.h"
+#undef NAME
+#undef T
+#undef T_
+#undef T_exp
+#undef T_expm1
+#undef T_log1p
+#undef T_sqrt
+#define NAME(name) name##_wide
+#define T selfcal_wide_t
+#define T_(x) x
+#define T_exp exp
+#define T_expm1 expm1
+#define T_log1p log1p
+#define T_sqrt sqrt
+#include "expected.h"
 
-/* The converged filter of (rho, alpha) over white noise and a first-order drift of deviation sqrt(truth[0]) and pole
- * 1 - truth[1]. Its innovations are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the delay; their variance is that of an
- * ARMA(2,1) process, here written so that nothing cancels when the poles are close to 1. */
-static expected_t expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
-    selfcal_real_t beta = R(0.0), q = r_exp(R(2.0) * ln_rho);
-    if (hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV) {
-        beta = -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s);
-        q *= beta * (R(2.0) - beta);
-    }
-    const selfcal_real_t b = beta * (R(2.0) - beta) - q;
-    const selfcal_real_t root = r_sqrt(b * b + R(4.0) * q);
-    const selfcal_real_t p_inf = b > R(0.0) ? R(2.0) * q / (b + root) : R(0.5) * (root - b);
-    const selfcal_real_t gain = (R(1.0) - beta) * p_inf / (R(1.0) + p_inf); /* phi K */
-    const selfcal_real_t p = gain + beta;                                   /* 1 - psi */
-    const selfcal_real_t c = work->truth[1];
-    const selfcal_real_t white = R(1.0) + gain * gain / (p * (R(2.0) - p));
-    const selfcal_real_t drift = (beta * beta * (R(1.0) + (R(1.0) - p) * (R(1.0) - c)) + R(2.0) * (R(1.0) - beta) * p * c) /
-                                 (p * (R(2.0) - p) * (p + c - p * c));
-    const expected_t e = {r_log(r_fma(work->truth[0], drift, white)), r_log(R(1.0) + p_inf)};
-    return e;
-}
+/* n ln V beyond which selfcal_real_t would cost 0.02 nat. */
+#define WIDE_BEYOND R(2e5)
 
 /* Takes (rho, alpha) as what made the data. A drift slower than the record looks like a random walk within it, and its level
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->n;
+    const selfcal_wide_t dt = (selfcal_wide_t)work->bank->model->dt_s;
+    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
     selfcal_real_t rate = R(0.0), variance = r_exp(R(2.0) * ln_rho);
-    if (hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV) {
-        rate = r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s;
+    if (pole) {
+        rate = r_exp(ln_alpha) * (selfcal_real_t)dt;
     }
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
-    work->truth[0] = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV ? variance * rate / slow : variance / (R(2.0) * slow);
-    work->truth[1] = -r_expm1(-slow);
-    work->ln_v_peak = expected(work, ln_rho, ln_alpha).ln_v;
+    selfcal_truth_t *truth = &work->truth;
+    truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
+    truth->rate = -r_expm1(-slow);
+    truth->ln_v = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, dt, truth).ln_v;
+    truth->wide = (selfcal_real_t)work->bank->n * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
+}
+
+/* What the expectation says of the two fields; the splines hold the rest. */
+typedef struct {
+    selfcal_real_t profile, ln_sigma;
+} expectation_t;
+
+static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
+    expectation_t result = {R(0.0), R(0.0)};
+    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    const float dt = work->bank->model->dt_s;
+    if (hypothesis_of(work)->rho == NULL) {
+        return result;
+    }
+    if (truth->wide) {
+        const expected_t_wide e = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, (selfcal_wide_t)dt, truth);
+        result.profile = (selfcal_real_t)(-0.5 * (selfcal_wide_t)work->bank->n * (e.ln_v - truth->ln_v));
+        result.ln_sigma = (selfcal_real_t)(0.5 * (e.ln_v - e.ln_s));
+    } else {
+        const expected_t e = expected(ln_rho, ln_alpha, pole, (selfcal_real_t)dt, truth);
+        result.profile = R(-0.5) * (selfcal_real_t)work->bank->n * (e.ln_v - (selfcal_real_t)truth->ln_v);
+        result.ln_sigma = R(0.5) * (e.ln_v - e.ln_s);
+    }
+    return result;
 }
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
@@ -153,11 +188,11 @@ typedef struct {
     selfcal_wide_t ln_sigma, profile;
 } field_t;
 
-/* Profile ln-likelihood of a node and ln of the conditional mode of sigma_v, for the given n_eff. */
-static field_t node_field(selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
-    selfcal_t *bank = work->bank;
+/* Profile ln-likelihood of the hypothesis's node k and ln of the conditional mode of sigma_v, for the given n_eff. */
+static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
+    const selfcal_t *bank = work->bank;
     selfcal_node_view_t v;
-    (void)selfcal_node(bank, work->axis, index, &v);
+    selfcal_bank_view(bank, work->axis, (uint16_t)(work->first_node + k), &v);
     const selfcal_wide_t n = (selfcal_wide_t)bank->n;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t p0 = sd * sd;
@@ -174,16 +209,25 @@ static field_t node_field(selfcal_work_t *work, uint16_t index, selfcal_wide_t n
     return field;
 }
 
-/* n_eff (delta + e^(-2 delta)/2 - 1/2), and where it reaches SIGMA_DEPTH. */
-static selfcal_wide_t sigma_shape(selfcal_wide_t n_eff, selfcal_wide_t delta) {
-    return n_eff * (delta + 0.5 * expm1(-2.0 * delta));
+/* delta + e^(-2 delta)/2 - 1/2; by its series where that would cancel. */
+static selfcal_real_t sigma_shape(selfcal_real_t delta) {
+    if (r_fabs(delta) > R(0.1)) {
+        return delta + R(0.5) * r_expm1(R(-2.0) * delta);
+    }
+    selfcal_real_t term = delta * delta, sum = R(0.0);
+    for (int k = 3; k < 12; k++) {
+        sum += term;
+        term *= R(-2.0) * delta / (selfcal_real_t)k;
+    }
+    return sum;
 }
 
-static selfcal_wide_t sigma_end(selfcal_wide_t n_eff, selfcal_wide_t sign) {
-    selfcal_wide_t inside = 0.0, outside = sign * (SIGMA_DEPTH / n_eff + 1.0);
-    for (int i = 0; i < 40; i++) {
-        const selfcal_wide_t middle = 0.5 * (inside + outside);
-        if (sigma_shape(n_eff, middle) < SIGMA_DEPTH) {
+/* Where n_eff times that reaches SIGMA_DEPTH, on one side of 0. */
+static selfcal_real_t sigma_end(selfcal_real_t n_eff, selfcal_real_t sign) {
+    selfcal_real_t inside = R(0.0), outside = sign * (SIGMA_DEPTH / n_eff + R(1.0));
+    for (int i = 0; i < 30; i++) {
+        const selfcal_real_t middle = R(0.5) * (inside + outside);
+        if (n_eff * sigma_shape(middle) < SIGMA_DEPTH) {
             inside = middle;
         } else {
             outside = middle;
@@ -193,14 +237,14 @@ static selfcal_wide_t sigma_end(selfcal_wide_t n_eff, selfcal_wide_t sign) {
 }
 
 static void sigma_cells(selfcal_work_t *work) {
-    const selfcal_wide_t lo = sigma_end(work->n_eff, -1.0), hi = sigma_end(work->n_eff, 1.0);
-    const selfcal_wide_t width = (hi - lo) / SELFCAL_SIGMA_CELLS;
-    work->delta_width = (selfcal_real_t)width;
+    const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
+    const selfcal_real_t lo = sigma_end(n_eff, R(-1.0)), hi = sigma_end(n_eff, R(1.0));
+    work->delta_width = (hi - lo) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        const selfcal_wide_t delta = lo + ((selfcal_wide_t)k + 0.5) * width;
-        work->delta[k] = (selfcal_real_t)delta;
-        work->delta_expm1[k] = (selfcal_real_t)expm1(delta);
-        work->delta_weight[k] = (selfcal_real_t)(exp(-sigma_shape(work->n_eff, delta)) * width);
+        const selfcal_real_t delta = lo + ((selfcal_real_t)k + R(0.5)) * work->delta_width;
+        work->delta[k] = delta;
+        work->delta_expm1[k] = r_expm1(delta);
+        work->delta_weight[k] = r_exp(-n_eff * sigma_shape(delta)) * work->delta_width;
     }
 }
 
@@ -208,70 +252,66 @@ static uint16_t nodes_of(const selfcal_work_t *work) {
     return (uint16_t)(grid_nodes(hypothesis_of(work)->rho) * grid_nodes(hypothesis_of(work)->alpha));
 }
 
-/* ln of a node's rho and alpha. */
-static selfcal_real_t node_ln_rho(const selfcal_work_t *work, uint16_t row) {
-    return r_fma((selfcal_real_t)row, work->bank->rho_step[work->hypothesis], work->bank->rho_lo[work->hypothesis]);
+/* Where the hypothesis's node k lies. */
+static selfcal_place_t place_of(const selfcal_work_t *work, uint16_t k) {
+    return selfcal_bank_place(work->bank, (uint16_t)(work->first_node + k));
 }
 
-static selfcal_real_t node_ln_alpha(const selfcal_work_t *work, uint16_t column) {
-    return r_fma((selfcal_real_t)column, work->bank->alpha_step[work->hypothesis], work->bank->alpha_lo[work->hypothesis]);
+/* End of this step's part of `whole`, from work->at, which moves there. */
+static uint16_t part(selfcal_work_t *work, unsigned step, uint16_t whole) {
+    const uint16_t from = work->at;
+    work->at = (uint16_t)(from + step < whole ? from + step : whole);
+    return from;
 }
 
 /* The best node settles n_eff, by the share of the bias there, and is the first guess of what made the data. */
-static void stage_fields(selfcal_work_t *work) {
+static void step_peak(selfcal_work_t *work) {
     const selfcal_wide_t n = (selfcal_wide_t)work->bank->n;
-    const uint16_t rows = grid_nodes(hypothesis_of(work)->rho), columns = grid_nodes(hypothesis_of(work)->alpha);
-    selfcal_wide_t share = 1.0;
-    selfcal_real_t ln_rho = R(0.0), ln_alpha = R(0.0);
-    uint16_t index = work->first_node;
-    work->peak = (selfcal_wide_t)-INFINITY;
-    for (uint16_t i = 0; i < rows; i++) {
-        for (uint16_t j = 0; j < columns; j++) {
-            selfcal_wide_t node_share;
-            const field_t field = node_field(work, index++, n - 1.0, &node_share);
-            if (field.profile > work->peak) {
-                work->peak = field.profile;
-                share = node_share;
-                ln_rho = node_ln_rho(work, i);
-                ln_alpha = node_ln_alpha(work, j);
-            }
+    if (work->at == 0U) {
+        work->peak = (selfcal_wide_t)-INFINITY;
+        work->n_eff = n - 1.0;
+    }
+    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+        selfcal_wide_t share;
+        const field_t field = node_field(work, k, n - 1.0, &share);
+        if (field.profile > work->peak) {
+            work->peak = field.profile;
+            work->n_eff = n - share;
+            work->best_node = k;
         }
     }
-    work->n_eff = n - share;
+}
+
+static void step_sigma(selfcal_work_t *work) {
     sigma_cells(work);
     if (hypothesis_of(work)->rho != NULL) {
-        set_truth(work, ln_rho, ln_alpha);
+        const selfcal_place_t place = place_of(work, work->best_node);
+        set_truth(work, place.ln_rho, place.ln_alpha);
     }
 }
 
-/* What the expectation says of the two fields; the splines hold the rest. */
-static void expected_fields(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t *profile,
-                            selfcal_real_t *ln_sigma) {
-    if (hypothesis_of(work)->rho == NULL) {
-        *profile = R(0.0);
-        *ln_sigma = R(0.0);
-        return;
-    }
-    const expected_t e = expected(work, ln_rho, ln_alpha);
-    *profile = R(-0.5) * (selfcal_real_t)work->bank->n * (e.ln_v - work->ln_v_peak);
-    *ln_sigma = R(0.5) * (e.ln_v - e.ln_s);
+static expectation_t node_expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, uint16_t k) {
+    const selfcal_place_t place = place_of(work, k);
+    return expectation(work, truth, place.ln_rho, place.ln_alpha);
 }
 
-static void stage_fit(selfcal_work_t *work) {
-    const uint16_t rows = grid_nodes(hypothesis_of(work)->rho), columns = grid_nodes(hypothesis_of(work)->alpha);
-    for (int field = 0; field < 2; field++) {
-        uint16_t index = work->first_node;
-        for (uint16_t i = 0; i < rows; i++) {
-            for (uint16_t j = 0; j < columns; j++) {
-                selfcal_wide_t unused;
-                selfcal_real_t expected_of[2];
-                const field_t exact = node_field(work, index++, work->n_eff, &unused);
-                expected_fields(work, node_ln_rho(work, i), node_ln_alpha(work, j), &expected_of[0], &expected_of[1]);
-                work->values[i * columns + j] =
-                    (field == 0 ? exact.profile - work->peak : exact.ln_sigma) - (selfcal_wide_t)expected_of[field];
-            }
-        }
-        fit(work, field == 0 ? work->profile : work->ln_sigma);
+/* What the splines have to carry at the nodes. */
+static void step_values(selfcal_work_t *work) {
+    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+        selfcal_wide_t unused;
+        const field_t exact = node_field(work, k, work->n_eff, &unused);
+        const expectation_t expected_of = node_expectation(work, &work->truth, k);
+        work->values[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)expected_of.profile);
+        work->values[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)expected_of.ln_sigma);
+    }
+}
+
+/* The same after the supposed truth has moved. */
+static void step_shift(selfcal_work_t *work) {
+    for (uint16_t k = part(work, STEP_SHIFTED_NODES, nodes_of(work)); k < work->at; k++) {
+        const expectation_t before = node_expectation(work, &work->truth_before, k), now = node_expectation(work, &work->truth, k);
+        work->values[0][k] = work->values[0][k] + before.profile - now.profile;
+        work->values[1][k] += before.ln_sigma - now.ln_sigma;
     }
 }
 
@@ -380,10 +420,9 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     const selfcal_t *bank = work->bank;
     const selfcal_real_t z = (cell->ln_rho - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
     cell->off_grid = z < R(0.0) || z > (selfcal_real_t)(hypothesis->rho->nodes - 1U);
-    selfcal_real_t profile, ln_sigma;
-    expected_fields(work, cell->ln_rho, row->ln_alpha, &profile, &ln_sigma);
-    cell->profile += profile;
-    cell->ln_sigma += ln_sigma;
+    const expectation_t e = expectation(work, &work->truth, cell->ln_rho, row->ln_alpha);
+    cell->profile += e.profile;
+    cell->ln_sigma += e.ln_sigma;
 }
 
 /* Part of [middle - width/2, middle + width/2] that the prior's limits leave. */
@@ -411,6 +450,7 @@ static bool has_parameter(selfcal_law_t law, unsigned parameter) {
 
 static void begin_pass(selfcal_work_t *work) {
     work->row = 0;
+    work->at = 0;
     for (int d = 0; d < 2; d++) {
         work->found_lo[d] = INFINITY;
         work->found_hi[d] = -INFINITY;
@@ -427,13 +467,13 @@ static bool reachable(const selfcal_work_t *work, const selfcal_prior_t *prior, 
            ln_value + work->delta[SELFCAL_SIGMA_CELLS - 1] + extra > (selfcal_real_t)prior->ln_min;
 }
 
-static void scan_row(selfcal_work_t *work) {
+static void step_scan(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = axis_of(work)->prior;
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     row_t row;
     make_row(work, &row);
-    for (uint16_t i = 0; i < cells(hypothesis->rho); i++) {
+    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(hypothesis->rho)); i < work->at; i++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         make_cell(work, &row, i, &cell);
@@ -492,6 +532,7 @@ static bool end_scan(selfcal_work_t *work) {
 
 static void begin_sum(selfcal_work_t *work) {
     work->row = 0;
+    work->at = 0;
     work->mass = 0.0;
     work->off_grid = 0.0;
     memset(work->first, 0, sizeof work->first);
@@ -510,48 +551,123 @@ static selfcal_real_t histogram_step(const selfcal_work_t *work, unsigned p) {
     return (work->range_hi[p] - work->range_lo[p]) / (selfcal_real_t)SELFCAL_HISTOGRAM;
 }
 
-/* Spreads mass evenly over [middle - width/2, middle + width/2] of a parameter's histogram. */
-static void deposit(selfcal_work_t *work, unsigned p, selfcal_real_t middle, selfcal_real_t width, selfcal_real_t mass) {
+/* How masses of one width go into a parameter's histogram. */
+typedef struct {
+    selfcal_real_t *bins;
+    selfcal_real_t lo, per_step; /* of ln(parameter) */
+    selfcal_real_t half, per_width; /* bins */
+} spread_t;
+
+static spread_t spread_over(selfcal_work_t *work, unsigned p, selfcal_real_t width) {
     const selfcal_real_t step = histogram_step(work, p);
-    if (!(step > R(0.0))) {
-        return;
-    }
-    const selfcal_real_t last = (selfcal_real_t)SELFCAL_HISTOGRAM;
-    const selfcal_real_t from = r_fmin(r_fmax((middle - R(0.5) * width - work->range_lo[p]) / step, R(0.0)), last);
-    const selfcal_real_t to = r_fmin(r_fmax((middle + R(0.5) * width - work->range_lo[p]) / step, R(0.0)), last);
-    if (!(to > from)) {
-        const int bin = from >= last ? SELFCAL_HISTOGRAM - 1 : (int)from;
-        work->histogram[p][bin] += mass;
-        return;
-    }
-    const selfcal_real_t density = mass / (to - from);
-    for (int bin = (int)from; bin < SELFCAL_HISTOGRAM && (selfcal_real_t)bin < to; bin++) {
-        const selfcal_real_t lo = r_fmax(from, (selfcal_real_t)bin);
-        const selfcal_real_t hi = r_fmin(to, (selfcal_real_t)bin + R(1.0));
-        work->histogram[p][bin] += density * (hi - lo);
-    }
+    const selfcal_real_t per_step = step > R(0.0) ? R(1.0) / step : R(0.0);
+    const selfcal_real_t half = R(0.5) * width * per_step;
+    const spread_t spread = {work->histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    return spread;
 }
 
-static void sum_row(selfcal_work_t *work) {
+/* Spreads mass evenly over the width about a value of ln(parameter); what would lie outside is pushed in. */
+static void deposit(const spread_t *spread, selfcal_real_t middle, selfcal_real_t mass) {
+    const selfcal_real_t last = (selfcal_real_t)SELFCAL_HISTOGRAM;
+    const selfcal_real_t at = (middle - spread->lo) * spread->per_step;
+    selfcal_real_t from = at - spread->half, to = at + spread->half, density = mass * spread->per_width;
+    if (from < R(0.0) || to > last) {
+        from = r_fmin(r_fmax(from, R(0.0)), last);
+        to = r_fmin(r_fmax(to, R(0.0)), last);
+        density = to > from ? mass / (to - from) : R(0.0);
+    }
+    int bin = (int)from;
+    if (!(to > from)) {
+        spread->bins[bin < SELFCAL_HISTOGRAM ? bin : SELFCAL_HISTOGRAM - 1] += mass;
+        return;
+    }
+    selfcal_real_t next = (selfcal_real_t)(bin + 1);
+    while (next < to) {
+        spread->bins[bin] += density * (next - from);
+        from = next;
+        next += R(1.0);
+        bin++;
+    }
+    spread->bins[bin < SELFCAL_HISTOGRAM ? bin : SELFCAL_HISTOGRAM - 1] += density * (to - from);
+}
+
+/* What a cell adds to the sums, sigma_v integrated. */
+typedef struct {
+    selfcal_real_t mass, n1, n2, d1, d2; /* and first and second moments of N and the drift parameter about the best cell, relative */
+} moments_t;
+
+/* `fall`: change of ln sigma_v's mode from one side of the cell to the other. */
+static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t fall) {
+    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
+    const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
+    const selfcal_prior_t *n_prior = &axis_of(work)->prior[SELFCAL_N], *drift_prior = &axis_of(work)->prior[drift];
+    const bool has_drift = hypothesis->rho != NULL;
+    /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
+     * noise, sigma_v falls as rho rises and their product stands still. */
+    const selfcal_real_t n_width = r_fmax(work->delta_width, has_drift ? r_fabs(fall) : R(0.0));
+    const selfcal_real_t drift_width = r_fmax(work->delta_width, r_fabs(work->width[0] + fall));
+    const spread_t n_spread = spread_over(work, SELFCAL_N, n_width), drift_spread = spread_over(work, drift, drift_width);
+    const selfcal_real_t n_off = r_expm1(ln_value[SELFCAL_N] - work->best_ln[SELFCAL_N]);
+    const selfcal_real_t drift_off = has_drift ? r_expm1(ln_value[drift] - work->best_ln[drift]) : R(0.0);
+    moments_t sum = {R(0.0), R(0.0), R(0.0), R(0.0), R(0.0)};
+    for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
+        const selfcal_real_t delta = work->delta[k];
+        const selfcal_real_t ln_n = ln_value[SELFCAL_N] + delta, ln_drift = ln_value[drift] + delta;
+        /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
+        selfcal_real_t w = height * work->delta_weight[k] * permitted(n_prior, ln_n, n_width);
+        if (n_prior->uniform) {
+            w *= r_exp(ln_n);
+        }
+        if (has_drift) {
+            w *= permitted(drift_prior, ln_drift, drift_width);
+            if (drift_prior->uniform) {
+                w *= r_exp(ln_drift);
+            }
+        }
+        if (!(w > R(0.0))) {
+            continue;
+        }
+        const selfcal_real_t e = work->delta_expm1[k];
+        const selfcal_real_t n_dev = r_fma(n_off, e, n_off + e);
+        const selfcal_real_t wn = w * n_dev;
+        sum.mass += w;
+        sum.n1 += wn;
+        sum.n2 = r_fma(wn, n_dev, sum.n2);
+        deposit(&n_spread, ln_n, w);
+        if (has_drift) {
+            const selfcal_real_t d_dev = r_fma(drift_off, e, drift_off + e);
+            const selfcal_real_t wd = w * d_dev;
+            sum.d1 += wd;
+            sum.d2 = r_fma(wd, d_dev, sum.d2);
+            deposit(&drift_spread, ln_drift, w);
+        }
+    }
+    return sum;
+}
+
+/* Some cells of a row. */
+static void step_sum(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = axis_of(work)->prior;
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    selfcal_real_t row_weight[SELFCAL_GRID_MAX], row_weight_sq[SELFCAL_GRID_MAX];
-    memset(row_weight, 0, sizeof row_weight);
-    memset(row_weight_sq, 0, sizeof row_weight_sq);
+    const uint16_t last = (uint16_t)(cells(hypothesis->rho) - 1U);
+    selfcal_real_t weight[SELFCAL_GRID_MAX], weight_sq[SELFCAL_GRID_MAX]; /* of the rho basis functions */
+    memset(weight, 0, sizeof weight);
+    memset(weight_sq, 0, sizeof weight_sq);
     row_t row;
     make_row(work, &row);
-    /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
     const selfcal_real_t alpha_density = prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL ? r_exp(row.ln_alpha) : R(1.0);
-    selfcal_wide_t row_mass = 0.0;
-    const uint16_t last = (uint16_t)(cells(hypothesis->rho) - 1U);
+    selfcal_wide_t part_mass = 0.0;
+    uint16_t i = part(work, STEP_SUMMED_CELLS, (uint16_t)(last + 1U));
     cell_t before, cell, after;
-    make_cell(work, &row, 0, &after);
+    make_cell(work, &row, i, &after);
     cell = after;
-    for (uint16_t i = 0; i <= last; i++) {
-        selfcal_real_t ln_value[SELFCAL_PARAMETERS];
+    if (i > 0U) {
+        make_cell(work, &row, (uint16_t)(i - 1U), &cell);
+    }
+    for (; i < work->at; i++) {
         before = cell;
         cell = after;
         if (i < last) {
@@ -560,72 +676,40 @@ static void sum_row(selfcal_work_t *work) {
         if (cell.profile < work->best - DEPTH) {
             continue;
         }
+        selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         cell_parameters(work, &row, &cell, ln_value);
-        /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
-         * noise, sigma_v falls as rho rises and their product stands still. */
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
-        const selfcal_real_t n_width = r_fmax(work->delta_width, has_drift ? r_fabs(fall) : R(0.0));
-        const selfcal_real_t drift_width = r_fmax(work->delta_width, r_fabs(work->width[0] + fall));
-        const selfcal_real_t height = r_exp(cell.profile - work->best) * alpha_density;
-        const selfcal_real_t n_off = r_expm1(ln_value[SELFCAL_N] - work->best_ln[SELFCAL_N]);
-        const selfcal_real_t drift_off = has_drift ? r_expm1(ln_value[drift] - work->best_ln[drift]) : R(0.0);
-        selfcal_real_t mass = R(0.0), n1 = R(0.0), n2 = R(0.0), d1 = R(0.0), d2 = R(0.0);
-        for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-            const selfcal_real_t delta = work->delta[k];
-            selfcal_real_t w = height * work->delta_weight[k] * permitted(&prior[SELFCAL_N], ln_value[SELFCAL_N] + delta, n_width);
-            if (has_drift) {
-                w *= permitted(&prior[drift], ln_value[drift] + delta, drift_width);
-                if (prior[drift].uniform) {
-                    w *= r_exp(ln_value[drift] + delta);
-                }
-            }
-            if (!(w > R(0.0))) {
-                continue;
-            }
-            if (prior[SELFCAL_N].uniform) {
-                w *= r_exp(ln_value[SELFCAL_N] + delta);
-            }
-            const selfcal_real_t e = work->delta_expm1[k];
-            const selfcal_real_t n_dev = r_fma(n_off, e, n_off + e);
-            const selfcal_real_t d_dev = r_fma(drift_off, e, drift_off + e);
-            mass += w;
-            n1 = r_fma(w, n_dev, n1);
-            n2 = r_fma(w * n_dev, n_dev, n2);
-            d1 = r_fma(w, d_dev, d1);
-            d2 = r_fma(w * d_dev, d_dev, d2);
-            deposit(work, SELFCAL_N, ln_value[SELFCAL_N] + delta, n_width, w);
-            if (has_drift) {
-                deposit(work, drift, ln_value[drift] + delta, drift_width, w);
-            }
-        }
-        row_mass += (selfcal_wide_t)mass;
-        const selfcal_real_t mass_sq = mass + R(2.0) * n1 + n2; /* times (N / best N)^2 */
-        work->off_grid += cell.off_grid ? (selfcal_wide_t)mass : 0.0;
-        work->first[SELFCAL_N] += (selfcal_wide_t)n1;
-        work->second[SELFCAL_N] += (selfcal_wide_t)n2;
-        if (has_drift) {
-            work->first[drift] += (selfcal_wide_t)d1;
-            work->second[drift] += (selfcal_wide_t)d2;
-            for (uint16_t k = 0; k < 6U; k++) {
-                row_weight[work->basis_first[i] + k] += mass * work->basis[i][k];
-                row_weight_sq[work->basis_first[i] + k] += mass_sq * work->basis[i][k];
-            }
-        } else {
-            row_weight[0] += mass;
-            row_weight_sq[0] += mass_sq;
+        const moments_t sum = sum_cell(work, ln_value, r_exp(cell.profile - work->best) * alpha_density, fall);
+        part_mass += (selfcal_wide_t)sum.mass;
+        work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
+        work->first[SELFCAL_N] += (selfcal_wide_t)sum.n1;
+        work->second[SELFCAL_N] += (selfcal_wide_t)sum.n2;
+        work->first[drift] += (selfcal_wide_t)sum.d1; /* zero without a drift */
+        work->second[drift] += (selfcal_wide_t)sum.d2;
+        const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.n1 + sum.n2; /* times (N / best N)^2 */
+        for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
+            const selfcal_real_t basis = has_drift ? work->basis[i][k] : R(1.0);
+            const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
+            weight[at] += sum.mass * basis;
+            weight_sq[at] += mass_sq * basis;
         }
     }
-    work->mass += row_mass;
+    if (!(part_mass > 0.0)) {
+        return;
+    }
+    work->mass += part_mass;
     if (hypothesis->alpha != NULL) {
         const selfcal_wide_t dev = expm1((selfcal_wide_t)row.ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);
-        work->first[SELFCAL_ALPHA] += row_mass * dev;
-        work->second[SELFCAL_ALPHA] += row_mass * dev * dev;
-        deposit(work, SELFCAL_ALPHA, row.ln_alpha, work->width[1], (selfcal_real_t)row_mass);
+        const spread_t spread = spread_over(work, SELFCAL_ALPHA, work->width[1]);
+        work->first[SELFCAL_ALPHA] += part_mass * dev;
+        work->second[SELFCAL_ALPHA] += part_mass * dev * dev;
+        deposit(&spread, row.ln_alpha, (selfcal_real_t)part_mass);
     }
-    for (uint16_t i = 0; i < rows; i++) {
-        for (unsigned j = 0; j < (hypothesis->alpha != NULL ? 6U : 1U); j++) {
-            work->weight[(size_t)i * columns + row.basis_first + j] += row_weight[i] * row.basis[j];
-            work->weight_sq[(size_t)i * columns + row.basis_first + j] += row_weight_sq[i] * row.basis[j];
+    for (uint16_t j = 0; j < rows; j++) {
+        for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
+            const size_t at = (size_t)j * columns + row.basis_first + k;
+            work->weight[at] = r_fma(weight[j], row.basis[k], work->weight[at]);
+            work->weight_sq[at] = r_fma(weight_sq[j], row.basis[k], work->weight_sq[at]);
         }
     }
 }
@@ -699,64 +783,66 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     estimate->flags = flags;
 }
 
-/* Posterior means of the basis functions become weights of the node values, in work->values: the mean of anything the spline
- * interpolates is the sum of its node values under them (the transpose of fit()). */
-static void cardinal_weights(selfcal_work_t *work, const selfcal_real_t of_basis[]) {
+/* Posterior means of the basis functions become weights of the node values: the mean of anything the spline interpolates is
+ * the sum of its node values under them (the transpose of fit()). */
+static void cardinal_weights(const selfcal_work_t *work, const selfcal_real_t of_basis[], selfcal_real_t out[]) {
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
-    const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
-    selfcal_wide_t line[SELFCAL_GRID_MAX];
-    for (uint16_t i = 0; i < rows; i++) {
-        for (uint16_t j = 0; j < columns; j++) {
-            selfcal_wide_t sum = alpha != NULL ? 0.0 : (selfcal_wide_t)of_basis[i];
-            for (uint16_t l = 0; alpha != NULL && l < columns; l++) {
-                sum += alpha->fit[l * columns + j] * (selfcal_wide_t)of_basis[i * columns + l];
+    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
+    selfcal_real_t line[SELFCAL_GRID_MAX];
+    for (size_t i = 0; i < rows; i++) {
+        for (size_t j = 0; j < columns; j++) {
+            selfcal_real_t sum = alpha != NULL ? R(0.0) : of_basis[i];
+            for (size_t l = 0; alpha != NULL && l < columns; l++) {
+                sum = r_fma(alpha->fit[l * columns + j], of_basis[i * columns + l], sum);
             }
-            work->values[i * columns + j] = sum;
+            out[i * columns + j] = sum;
         }
     }
-    for (uint16_t j = 0; rho != NULL && j < columns; j++) {
-        for (uint16_t i = 0; i < rows; i++) {
-            line[i] = 0.0;
-            for (uint16_t k = 0; k < rows; k++) {
-                line[i] += rho->fit[k * rows + i] * work->values[k * columns + j];
+    for (size_t j = 0; rho != NULL && j < columns; j++) {
+        for (size_t i = 0; i < rows; i++) {
+            line[i] = R(0.0);
+            for (size_t k = 0; k < rows; k++) {
+                line[i] = r_fma(rho->fit[k * rows + i], out[k * columns + j], line[i]);
             }
         }
-        for (uint16_t i = 0; i < rows; i++) {
-            work->values[i * columns + j] = line[i];
+        for (size_t i = 0; i < rows; i++) {
+            out[i * columns + j] = line[i];
         }
     }
 }
 
 /* Moments of x0 + drift now: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
-static void finish_bias(selfcal_work_t *work, selfcal_posterior_t *posterior) {
+static void step_bias(selfcal_work_t *work) {
     const selfcal_wide_t best_n = exp((selfcal_wide_t)work->best_ln[SELFCAL_N]);
     const selfcal_wide_t best_sq = best_n * best_n / (selfcal_wide_t)work->bank->model->dt_s;
     const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t prior_precision = best_sq * (1.0 + 2.0 * first + second) / (sd * sd);
     const selfcal_wide_t offset = selfcal_offset(work->bank, work->axis);
-    selfcal_wide_t mean = 0.0, scatter = 0.0, own = 0.0;
-    for (int pass = 0; pass < 3; pass++) {
-        if (pass != 1) {
-            cardinal_weights(work, pass == 0 ? work->weight : work->weight_sq);
+    const bool begins = work->at == 0U;
+    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+        selfcal_node_view_t v;
+        selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
+        const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
+        const selfcal_wide_t now = v.drift + (v.b - offset * prior_precision) * variance * v.bias_left;
+        if (begins && k == 0U) {
+            work->bias_about = now;
         }
-        for (uint16_t j = 0; j < nodes_of(work); j++) {
-            selfcal_node_view_t v;
-            (void)selfcal_node(work->bank, work->axis, (uint16_t)(work->first_node + j), &v);
-            const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
-            const selfcal_wide_t now = v.drift + (v.b - offset * prior_precision) * variance * v.bias_left;
-            const selfcal_wide_t weight = work->values[j] / work->mass;
-            if (pass == 0) {
-                mean += weight * now;
-            } else if (pass == 1) {
-                scatter += weight * (now - mean) * (now - mean);
-            } else {
-                own += weight * best_sq * (v.drift_var + v.bias_left * v.bias_left * variance);
-            }
-        }
+        const selfcal_wide_t off = now - work->bias_about, weighed = (selfcal_wide_t)work->values[0][k] * off;
+        work->bias_weight += (selfcal_wide_t)work->values[0][k];
+        work->bias_first += weighed;
+        work->bias_second += weighed * off;
+        work->bias_own += (selfcal_wide_t)work->values[1][k] * (v.drift_var + v.bias_left * v.bias_left * variance);
     }
-    posterior->bias_mean = (float)(mean + offset);
+    work->bias_scale = best_sq;
+}
+
+static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
+    const selfcal_wide_t mean = work->bias_first / work->bias_weight;
+    const selfcal_wide_t scatter = work->bias_second / work->bias_weight - mean * mean;
+    const selfcal_wide_t own = work->bias_own * work->bias_scale / work->mass;
+    posterior->bias_mean = (float)(work->bias_about + mean + selfcal_offset(work->bank, work->axis));
     posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
 }
 
@@ -765,9 +851,15 @@ static selfcal_wide_t ln_prior_density(const selfcal_prior_t *prior) {
     return -log(prior->uniform ? exp(hi) - exp(lo) : hi - lo);
 }
 
-static void finish_hypothesis(selfcal_work_t *work, selfcal_posterior_t *posterior) {
-    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+/* One parameter a step. */
+static void step_estimates(selfcal_work_t *work, selfcal_posterior_t *posterior) {
+    const unsigned p = work->at++;
+    if (has_parameter(hypothesis_of(work)->law, p)) {
+        finish_estimate(work, p, &posterior->parameter[p]);
+    }
+}
+
+static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
     if (!(work->mass > 0.0)) {
         posterior->ln_evidence = (selfcal_wide_t)-INFINITY; /* the priors leave nothing of the likelihood */
         return;
@@ -775,9 +867,8 @@ static void finish_hypothesis(selfcal_work_t *work, selfcal_posterior_t *posteri
     posterior->ln_evidence = work->peak + (selfcal_wide_t)work->best +
                              log(work->mass * (selfcal_wide_t)work->width[0] * (selfcal_wide_t)work->width[1]);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-        if (has_parameter(hypothesis->law, p)) {
-            posterior->ln_evidence += ln_prior_density(&prior[p]);
-            finish_estimate(work, p, &posterior->parameter[p]);
+        if (has_parameter(hypothesis_of(work)->law, p)) {
+            posterior->ln_evidence += ln_prior_density(&axis_of(work)->prior[p]);
         }
     }
     finish_bias(work, posterior);
@@ -814,17 +905,18 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
     if (work == NULL || self == NULL || report == NULL || axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    selfcal_bank_flush(self);
-    if (self->n < SELFCAL_REPORT_MIN) {
+    if (selfcal_retired(self, axis)) {
+        return SELFCAL_AXIS_RETIRED;
+    }
+    if (selfcal_count(self) < SELFCAL_REPORT_MIN) {
         return SELFCAL_TOO_SHORT;
     }
     memset(work, 0, sizeof *work);
     work->bank = self;
     work->axis = axis;
-    work->stage = FIELDS;
+    work->stage = GATHER;
     memset(report, 0, sizeof *report);
     report->axis = axis;
-    report->n = self->n;
     for (int h = 0; h < SELFCAL_HYPOTHESES_MAX; h++) {
         selfcal_posterior_t *posterior = &report->hypothesis[h];
         posterior->bias_mean = NAN;
@@ -837,20 +929,101 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
     return SELFCAL_OK;
 }
 
+/* Runs the nodes over what the bank has gathered when the report begins; true when the sums are at rest. */
+static bool step_gather(selfcal_work_t *work) {
+    if (selfcal_bank_run(work->bank, STEP_NODES)) {
+        return false;
+    }
+    if (!work->gathered) {
+        work->gathered = true;
+        if (selfcal_bank_hand_over(work->bank)) {
+            return false;
+        }
+    }
+    work->batches = work->bank->batches;
+    return true;
+}
+
+static void go_to(selfcal_work_t *work, int stage) {
+    work->stage = (uint8_t)stage;
+    work->at = 0;
+}
+
+/* After a row of a pass: the next one, the next pass, or what follows the search. */
+static void next_scan(selfcal_work_t *work) {
+    work->at = 0;
+    work->row++;
+    if (work->row < cells(hypothesis_of(work)->alpha)) {
+        return;
+    }
+    const bool over = end_scan(work), found = work->best > (selfcal_real_t)-INFINITY;
+    work->pass++;
+    if (!over) {
+        begin_pass(work);
+    } else if (!found) {
+        go_to(work, EVIDENCE); /* nothing within the priors' limits */
+    } else if (!work->refined && hypothesis_of(work)->rho != NULL) {
+        work->refined = true; /* once more, about the peak that was found */
+        work->truth_before = work->truth;
+        set_truth(work, work->best_at[0], work->best_at[1]);
+        go_to(work, SHIFT);
+    } else {
+        begin_sum(work);
+        work->stage = SUM;
+    }
+}
+
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report) {
     if (work == NULL || report == NULL || work->bank == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const uint16_t rows = cells(hypothesis->alpha);
+    if (work->stage > GATHER && work->batches != work->bank->batches) {
+        work->bank = NULL;
+        return SELFCAL_OVERTAKEN;
+    }
+    if (work->stage == WHOLE) {
+        finish_report(work, report);
+        work->bank = NULL;
+        return SELFCAL_OK;
+    }
+    selfcal_posterior_t *posterior = &report->hypothesis[work->hypothesis];
+    const uint16_t nodes = nodes_of(work), row = cells(hypothesis_of(work)->rho);
     switch (work->stage) {
-    case FIELDS:
-        stage_fields(work);
-        work->refined = false;
-        work->stage = FIT;
+    case GATHER:
+        if (step_gather(work)) {
+            report->n = work->bank->n;
+            go_to(work, PEAK);
+        }
         break;
-    case FIT:
-        stage_fit(work);
+    case PEAK:
+        step_peak(work);
+        if (work->at == nodes) {
+            work->stage = SIGMA;
+        }
+        break;
+    case SIGMA:
+        step_sigma(work);
+        work->refined = false;
+        go_to(work, VALUES);
+        break;
+    case VALUES:
+        step_values(work);
+        if (work->at == nodes) {
+            go_to(work, SPLINE_PROFILE);
+        }
+        break;
+    case SHIFT:
+        step_shift(work);
+        if (work->at == nodes) {
+            go_to(work, SPLINE_PROFILE);
+        }
+        break;
+    case SPLINE_PROFILE:
+        fit(work, work->values[0], work->profile);
+        work->stage = SPLINE_SIGMA;
+        break;
+    case SPLINE_SIGMA:
+        fit(work, work->values[1], work->ln_sigma);
         first_box(work);
         work->best = -INFINITY;
         work->pass = 0;
@@ -858,41 +1031,49 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         work->stage = SCAN;
         break;
     case SCAN:
-        scan_row(work);
-        work->row++;
-        if (work->row == rows) {
-            const bool over = end_scan(work);
-            work->pass++;
-            if (over && !work->refined && hypothesis->rho != NULL && work->best > (selfcal_real_t)-INFINITY) {
-                work->refined = true; /* once more, about the peak that was found */
-                set_truth(work, work->best_at[0], work->best_at[1]);
-                work->stage = FIT;
-            } else if (over) {
-                begin_sum(work);
-                work->stage = work->best > (selfcal_real_t)-INFINITY ? SUM : FINISH; /* nothing within the priors' limits */
-            } else {
-                begin_pass(work);
-            }
+        step_scan(work);
+        if (work->at == row) {
+            next_scan(work);
         }
         break;
     case SUM:
-        sum_row(work);
-        work->row++;
-        if (work->row == rows) {
-            work->stage = FINISH;
+        step_sum(work);
+        if (work->at == row) {
+            work->at = 0;
+            work->row++;
+            if (work->row == cells(hypothesis_of(work)->alpha)) {
+                go_to(work, work->mass > 0.0 ? WEIGHTS : EVIDENCE);
+            }
         }
         break;
-    default:
-        finish_hypothesis(work, &report->hypothesis[work->hypothesis]);
-        work->first_node = (uint16_t)(work->first_node + nodes_of(work));
+    case WEIGHTS:
+        cardinal_weights(work, work->weight, work->values[0]);
+        work->stage = WEIGHTS_SQ;
+        break;
+    case WEIGHTS_SQ:
+        cardinal_weights(work, work->weight_sq, work->values[1]);
+        work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
+        go_to(work, BIAS);
+        break;
+    case BIAS:
+        step_bias(work);
+        if (work->at == nodes) {
+            go_to(work, ESTIMATES);
+        }
+        break;
+    case ESTIMATES:
+        step_estimates(work, posterior);
+        if (work->at == SELFCAL_PARAMETERS) {
+            go_to(work, EVIDENCE);
+        }
+        break;
+    case EVIDENCE:
+        finish_hypothesis(work, posterior);
+        work->first_node = (uint16_t)(work->first_node + nodes);
         work->hypothesis++;
-        work->stage = FIELDS;
-        if (work->hypothesis == work->bank->model->hypotheses) {
-            finish_report(work, report);
-            work->bank = NULL;
-            return SELFCAL_OK;
-        }
+        go_to(work, work->hypothesis < work->bank->model->hypotheses ? PEAK : WHOLE);
         break;
+    default: SELFCAL_ASSERT(false); break;
     }
     return SELFCAL_BUSY;
 }

@@ -12,8 +12,9 @@
  *   1. `selfcal codegen MODEL.yaml -o DIR` writes the model tables (const, for flash).
  *   2. Give selfcal_init() the model and SELFCAL_SIZE(nodes, axes) bytes; the memory stays yours, nothing is allocated.
  *   3. selfcal_push() every sample, selfcal_skip() every missing one. Cost is even: SELFCAL_BATCH bank samples are
- *      gathered, then every node runs over them.
+ *      gathered, and while the next ones are, some nodes run over them at every push.
  *   4. When a report is wanted: selfcal_report_begin(), then selfcal_report_step() until it no longer says SELFCAL_BUSY.
+ *      Samples may be pushed in between, as long as selfcal_room() says that there is room.
  *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only.
  *
  * THREADS AND INTERRUPTS
@@ -63,12 +64,20 @@ extern "C" {
 #error "SELFCAL_HYPOTHESES_MAX must be 1 to 16"
 #endif
 
-/* Bank samples gathered before the nodes run over them. More: fewer loads per sample, a longer worst sample. */
+/* Bank samples gathered before the nodes run over them. More: fewer loads per sample and more time for a report, 56 bytes each. */
 #ifndef SELFCAL_BATCH
 #define SELFCAL_BATCH 16
 #endif
 #if SELFCAL_BATCH < 8 || SELFCAL_BATCH > 64
 #error "SELFCAL_BATCH must be 8 (the first batch places the nodes) to 64"
+#endif
+
+/* Nodes that one sample runs at least while a batch waits; more if the batches would come faster than that. More: less overhead. */
+#ifndef SELFCAL_PUSH_NODES
+#define SELFCAL_PUSH_NODES 1
+#endif
+#if SELFCAL_PUSH_NODES < 1 || SELFCAL_PUSH_NODES > 65535
+#error "SELFCAL_PUSH_NODES must be 1 to 65535"
 #endif
 
 /* Cells a dimension that a report integrates over. */
@@ -79,12 +88,31 @@ extern "C" {
 #error "SELFCAL_REPORT_CELLS must be 16 to 255"
 #endif
 
+/* Cells of sigma_v in each of those, and bins of a parameter's histogram, which its quantiles are read from. */
+#ifndef SELFCAL_SIGMA_CELLS
+#define SELFCAL_SIGMA_CELLS 24
+#endif
+#ifndef SELFCAL_HISTOGRAM
+#define SELFCAL_HISTOGRAM 128
+#endif
+#if SELFCAL_SIGMA_CELLS < 8 || SELFCAL_HISTOGRAM < 32
+#error "SELFCAL_SIGMA_CELLS must be 8 and SELFCAL_HISTOGRAM 32 at least"
+#endif
+
 /* Nodes one grid dimension holds at most. */
 #ifndef SELFCAL_GRID_MAX
 #define SELFCAL_GRID_MAX 16
 #endif
 #if SELFCAL_GRID_MAX < 6 || SELFCAL_GRID_MAX > 64
 #error "SELFCAL_GRID_MAX must be 6 (a quintic spline needs six) to 64"
+#endif
+
+/* Bank intervals in a row that an axis may spoil before it is retired, see selfcal_push(); 0: no axis is ever retired. */
+#ifndef SELFCAL_RETIRE_BLOCKS
+#define SELFCAL_RETIRE_BLOCKS 60
+#endif
+#if SELFCAL_RETIRE_BLOCKS < 0
+#error "SELFCAL_RETIRE_BLOCKS must be 0 or above"
 #endif
 
 #ifndef SELFCAL_ASSERT
@@ -104,6 +132,10 @@ typedef float selfcal_real_t;
 typedef struct {
     selfcal_real_t hi, lo;
 } selfcal_sum_t;
+
+/* What a kernel keeps for each (node, axis): its predicted drift, and its sums. */
+typedef selfcal_real_t selfcal_drift_t;
+typedef selfcal_sum_t selfcal_total_t;
 
 /* Reports and ln-likelihoods. Deliberately double, in software where the FPU has none; never touched per sample. */
 typedef double selfcal_wide_t;
@@ -137,7 +169,7 @@ typedef struct {
  * to either end). Even steps make its matrix the same wherever the nodes lie. */
 typedef struct {
     uint16_t nodes;
-    const selfcal_wide_t *fit; /* [nodes][nodes]: node values to B-spline coefficients */
+    const selfcal_real_t *fit; /* [nodes][nodes]: node values to B-spline coefficients */
 } selfcal_grid_t;
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
@@ -168,6 +200,8 @@ typedef enum {
     SELFCAL_OK = 0,
     SELFCAL_BUSY = 1,            /* a report has more steps to go */
     SELFCAL_TOO_SHORT = 2,       /* fewer bank samples than a report needs (SELFCAL_REPORT_MIN) */
+    SELFCAL_OVERTAKEN = 3,       /* the sums have moved under a report, which is given up */
+    SELFCAL_AXIS_RETIRED = 4,    /* the axis failed for SELFCAL_RETIRE_BLOCKS: it has no sums any more */
     SELFCAL_BAD_ARGUMENT = -1,   /* null pointer, axis or node out of range, sigma_v not positive */
     SELFCAL_BAD_MODEL = -2,      /* tables contradict themselves or exceed a configured maximum */
     SELFCAL_BAD_MEMORY = -3      /* too small, or not aligned to 8 bytes */
@@ -180,6 +214,7 @@ typedef struct {
     uint32_t gaps;          /* runs of missing or rejected samples */
     uint32_t blocks_lost;   /* bank intervals without a value: fewer than half of their samples were usable */
     uint32_t blocks_part;   /* bank intervals averaged from part of their samples */
+    uint32_t blocks_moving; /* those of blocks_lost that selfcal_moving() dropped */
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
@@ -197,41 +232,59 @@ typedef struct {
     selfcal_real_t e;     /* that innovation at the next sample less u_inf */
     bool level;           /* d = e = 0: the kernel sums plain nu */
     uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
+    uint32_t level_from;  /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;      /* sum u^2 / s */
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
 } selfcal_node_t;
 
-/* Bytes of memory selfcal_init() needs: for each node in the float build, 52 and 20 more per axis. */
+/* Bytes of memory selfcal_init() needs: for each node in the float build, 56 and 20 more per axis. */
 #define SELFCAL_SIZE(nodes, axes) \
-    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_sum_t) + sizeof(selfcal_real_t))))
+    ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
+
+/* Bank samples on their way into the sums. Private. */
+typedef struct {
+    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
+    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over that of a whole block */
+    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
+    uint32_t gap_after;
+    uint32_t count;
+} selfcal_batch_t;
 
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
     selfcal_node_t *node;    /* [nodes] */
-    selfcal_sum_t *b, *c;    /* [nodes][axes]: sums u nu / s and nu^2 / s */
-    selfcal_real_t *x;       /* [nodes][axes]: predicted drift of the zero-bias filter */
+    selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
+    selfcal_drift_t *x;      /* [nodes][axes]: predicted drift of the zero-bias filter */
     uint32_t n;              /* bank samples in all sums */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
-    /* batch */
-    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
-    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over that of a whole block */
-    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
-    uint32_t pending_gap;            /* ... and after the last */
-    uint32_t in_batch;
+    /* One batch is gathered while the nodes run, some at every push, over the one before. */
+    selfcal_batch_t batch[2];
+    uint8_t gathering;    /* which of them is gathered */
+    uint16_t ran;         /* nodes that have run over the other */
+    uint16_t push_nodes;  /* to run at a push */
+    uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
+    uint32_t batches;     /* that the nodes have begun with */
     /* averager */
     bool started;
     float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
     selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
+    uint32_t block;                          /* samples a bank interval now has */
+    selfcal_real_t variance_ratio;           /* r of a whole block */
     float first[SELFCAL_AXES_MAX];           /* this block's first sample: its sums are taken about it */
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX];
     uint32_t position, used; /* samples of this block: passed, and usable */
+    bool dropped;            /* the rest of it counts for nothing */
     selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
     uint64_t within_dof;
     float last[SELFCAL_AXES_MAX];
     uint32_t equal[SELFCAL_AXES_MAX];
     bool in_gap;
+    uint32_t retired;        /* a bit for each axis */
+    uint32_t watched;        /* samples looked at since the axes were last judged ... */
+    uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
+    uint32_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
     selfcal_counters_t counters;
 } selfcal_t;
 
@@ -239,23 +292,54 @@ typedef struct {
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
+/* |sample| from here on counts as saturated whatever the range: the most for which no sum can overflow (averager.c), 2^40. */
+#define SELFCAL_SAMPLE_MAX 1.099511627776e12F
+
 /* One sample of every axis, in the model's axis order, in the model's units. A value that is not finite, at the range limit
- * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes); every
- * block * SELFCAL_BATCH samples O(nodes * axes * SELFCAL_BATCH). */
+ * or stuck keeps the whole sample out (the axes share gains) and time passes as with selfcal_skip(). O(axes), and SELFCAL_BATCH
+ * bank samples of all axes for SELFCAL_PUSH_NODES nodes, or 2 nodes / (block * SELFCAL_BATCH) if that is more: the work is even.
+ *
+ * An axis that is at fault in more than half of a bank interval's samples spoils the interval for all. After
+ * SELFCAL_RETIRE_BLOCKS such intervals in a row it is retired: the others go on without it, exactly as if the model did not have
+ * it; its values are looked at for the fault counters only; its reports and node views say SELFCAL_AXIS_RETIRED. It stays so
+ * until selfcal_init(), even if it comes back. Samples in which every axis fails count for nobody, and the last axis is never
+ * retired: a sensor that is unplugged and back goes on after a gap. (Intervals are here counted in samples pushed: missing
+ * ones neither help nor harm an axis.) */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
+
+/* True once an axis is retired. */
+bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
 /* `count` samples are missing. The prediction over the gap is exact, however long it is. A block with half or more of its
  * samples counts as their mean with its variance raised by block / used; one with fewer is dropped. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
+/* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
+ * Nothing happens at the start of an interval. For selfcal_gate_push(): call this before the window's last sample goes to
+ * selfcal_push(), and selfcal_skip() while the gate says moving. No window then reaches back into an interval that is already
+ * closed, provided that the block is a multiple of the window and that both began together. */
+selfcal_status_t selfcal_moving(selfcal_t *self);
+
+/* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
+ * yields no value. `variance_ratio`: white-noise variance of a whole block's mean over what it is for the model's block at the
+ * model's rate. It is 1 where the sensor's own averaging keeps the noise density, and model->block / block where single samples
+ * stay as noisy as before. sigma_v and N remain those of the model's block: the likelihood is exact, though any ratio but 1
+ * costs the full gain computation for every sample. SELFCAL_BAD_ARGUMENT, and nothing changes, on a block of 0 or a ratio beyond
+ * SELFCAL_VARIANCE_RATIO_MAX or below its inverse. selfcal_within_sd() starts anew. */
+#define SELFCAL_VARIANCE_RATIO_MAX 1024.0F
+selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ratio);
+
 /* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */
 
-/* Bank samples in the sums, those of the current batch included. */
+/* Bank samples in the sums, those on their way into them included. */
 uint32_t selfcal_count(const selfcal_t *self);
+
+/* Bank samples that may still come before the nodes have to run on, which ends a report under way (SELFCAL_OVERTAKEN). */
+uint32_t selfcal_room(const selfcal_t *self);
 
 const selfcal_counters_t *selfcal_counters(const selfcal_t *self);
 
-/* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1 or before the first whole block.
+/* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1, before the first whole block, of a retired axis.
  * White noise would make it sigma_v * sqrt(block): more says coloured noise or vibration within the blocks. */
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis);
 
@@ -307,21 +391,28 @@ typedef struct {
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
 
-#define SELFCAL_HISTOGRAM 128
-#define SELFCAL_SIGMA_CELLS 24
+/* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
+typedef struct {
+    selfcal_real_t variance, rate; /* of the drift over sigma_v^2; 1 - its pole */
+    selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
+    bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
+} selfcal_truth_t;
 
 /* Scratch of a report under way. Private; may be shared by all axes and reused. */
 typedef struct {
     selfcal_t *bank;
     uint8_t axis, hypothesis, stage, pass;
-    uint16_t row, first_node;
+    uint16_t first_node;
+    uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
+    uint32_t batches; /* of the bank, when the sums came to rest */
+    bool gathered;    /* the nodes run over the last batch */
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
+    uint16_t best_node;
     bool refined;            /* the expectation is about the peak, no longer about the best node */
-    selfcal_real_t truth[2]; /* drift variance over sigma_v^2 and 1 - pole that the expectation supposes */
-    selfcal_real_t ln_v_peak;
-    selfcal_wide_t values[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];
+    selfcal_truth_t truth, truth_before;
+    selfcal_real_t values[2][SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* at the nodes: both fields less their expectation; later weights */
     selfcal_real_t profile[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* B-spline coefficients of the profile ln-likelihood ... */
     selfcal_real_t ln_sigma[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of ln of sigma_v's conditional mode, both less their expectation */
     selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function ... */
@@ -340,16 +431,111 @@ typedef struct {
     selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+    selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
+    selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
 } selfcal_work_t;
 
-/* Starts a report on one axis. Do not push or skip between this and the last step. SELFCAL_TOO_SHORT if there are too few samples. */
+/* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. */
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
-/* One slice of it. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. */
+/* One slice of it, below 60 000 instructions on a Cortex-M4F. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is
+ * whole. It first runs the nodes over what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a
+ * call that looks at the sums, it is SELFCAL_OVERTAKEN; begin anew. */
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);
 
 /* All steps in a row. */
 selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
+
+/* ------------------------------------------------------------------------------------------------------------- gate
+ * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both); gate.c
+ * states the hypotheses, the statistics and their distributions. Independent of selfcal_t. */
+
+typedef enum { SELFCAL_MOVING = 0, SELFCAL_RESTING = 1 } selfcal_motion_t;
+
+typedef struct {
+    uint8_t axes;
+    uint32_t window;   /* samples, 2 or more; a divisor of the bank's block, see selfcal_moving() */
+    float false_alarm; /* probability that a window of rest is taken for motion, up to 0.1; 0: never, to measure the noise */
+    uint32_t hold;     /* windows in a row, after a first one, that must be quiet and on one level before motion is over; 1 or more */
+    uint32_t settle;   /* likewise to take a new gyro level for rest; below `hold` it does nothing, 0: never */
+    uint32_t memory;   /* windows that the level at rest is averaged over, 1 or more; over as many the bias must not drift by more
+                          than the noise of a window's mean. A rotation is found by its distance from that level. */
+    float sigma[SELFCAL_AXES_MAX];  /* noise of one sample at rest: N sqrt(sampling rate); INFINITY leaves the axis out */
+    bool is_rate[SELFCAL_AXES_MAX]; /* a gyro: after a motion it must read what it read before. Others may rest at a new level. */
+} selfcal_gate_config_t;
+
+/* Noise of one axis at rest; the factors are 1 where it is white. */
+typedef struct {
+    float sigma;  /* of one sample, unit; INFINITY leaves the axis out (absent, retired) */
+    float within; /* mean square about the window's mean over sigma^2 */
+    float spread; /* variance of that mean square over what it is for white noise */
+    float level;  /* variance of a window's mean over sigma^2/window */
+} selfcal_gate_noise_t;
+
+/* Monotonic since selfcal_gate_init(). */
+typedef struct {
+    uint64_t windows;
+    uint64_t shaken; /* windows that scatter too much */
+    uint64_t moved;  /* windows off the level of the rest, or of the quiet windows, before */
+    uint64_t blind;  /* windows with a sample that is no number (or at SELFCAL_SAMPLE_MAX), or less than half full */
+    uint64_t alarms; /* times that rest ended by a shaken or moved window */
+} selfcal_gate_counters_t;
+
+/* A level and its variance over sigma^2 of each axis. Private. */
+typedef struct {
+    float mean[SELFCAL_AXES_MAX];
+    selfcal_real_t gamma;
+} selfcal_level_t;
+
+/* Private but for reading `state`, `counters`, and the last window's statistics with their thresholds. */
+typedef struct {
+    selfcal_gate_config_t config;
+    selfcal_gate_noise_t axis[SELFCAL_AXES_MAX];
+    selfcal_motion_t state;
+    selfcal_gate_counters_t counters;
+    float t1, t2;
+    float shaken_above, moved_above, rate_moved_above; /* for windows of threshold_n samples */
+    uint32_t threshold_n;                              /* 0: to be worked out */
+    bool started;
+    float origin[SELFCAL_AXES_MAX]; /* the first sample: gravity or a turn-on bias costs no digits */
+    /* window in progress */
+    float first[SELFCAL_AXES_MAX];
+    selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
+    uint32_t position, used;
+    bool blind;
+    /* levels: of the rest, and of the quiet windows since motion */
+    selfcal_level_t rest, found;
+    bool rested;
+    uint32_t quiet;
+    /* measured over whole windows of rest */
+    uint64_t measured;
+    selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
+} selfcal_gate_t;
+
+/* Starts as moving. SELFCAL_BAD_ARGUMENT if the configuration is not as said above. */
+selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_config_t *config);
+
+/* One sample of every axis. Returns the state: that of the last whole window, so with a sample's last window, known one window
+ * late at most. The window is judged with its last sample. A sample that is no number ends rest at once.
+ *   resting -> moving: one window that scatters too much or is off the level of the rest; a blind window.
+ *   moving -> resting: `hold` windows after a first quiet one, all on one level, the gyros' that of the last rest. A gyro that
+ *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro.
+ * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes); the first window with another count of samples, or after a change of noise,
+ * works out its thresholds: O(sqrt(axes * window)) in selfcal_wide_t. */
+selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]);
+
+/* `count` samples are missing; windows keep their grid. One with half or more of its samples is judged by those. O(1) + a window's. */
+selfcal_motion_t selfcal_gate_skip(selfcal_gate_t *gate, uint64_t count);
+
+/* Takes the noise of an axis from now on, say once N is identified. SELFCAL_BAD_ARGUMENT: null pointer, no such axis, a value that
+ * is not above 0, or a factor that is infinite. */
+selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise);
+
+/* The noise as measured over the whole windows of rest so far, for selfcal_gate_noise(): run with false_alarm 0 while the sensor
+ * is known to rest, and with the sigma that is to be used. Each factor's relative error is about sqrt(2/windows), that of
+ * `within` less. SELFCAL_TOO_SHORT below SELFCAL_GATE_MEASURED_MIN windows. */
+#define SELFCAL_GATE_MEASURED_MIN 30U
+selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise);
 
 /* -------------------------------------------------------------------------------------------------------- telemetry
  * Reports as classical CAN frames of 8 bytes with 11-bit ids. selfcal.dbc describes every item, its unit and its bits, and

@@ -94,7 +94,9 @@ static bool compute(app_t *app)
 
 bool app_step(app_t *app)
 {
-    bool busy = app->computing ? compute(app) : take_sample(app);
+    /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. */
+    bool busy = app->computing && compute(app);
+    busy = ((!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app)) || busy;
     busy = send_frames(app) || busy;
     if (!app->computing && !app->waiting) {
         busy = advance(app) || busy;

@@ -17,7 +17,7 @@ typedef struct {
     uint32_t period_ms, due_ms; /* between reports; when the next one is due */
     uint32_t report_number;
     uint8_t stage;    /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
-    bool computing;   /* an axis's report is being worked out: the bank must rest */
+    bool computing;   /* an axis's report is being worked out */
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
     bool waiting;     /* `frame` is made but not taken yet */

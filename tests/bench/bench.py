@@ -232,16 +232,26 @@ def table(bench: Bench) -> str:
     clocks = ", ".join(f"{MACHINES[target].systick_hz // 10**6} MHz" for target in targets)
     row(f"share of the core ({clocks}), six axes at {float(RATE_HZ)} Hz averaged to 1 Hz", shares["push"])
     row("… with every sample a bank sample", shares["bank"])
-    per("push that fills a batch, every filter settled", "bank.steady.worst_push")
-    per("push that fills the first batch and places the nodes", "bank.first_batch")
+    per("the dearest push, averaged to 1 Hz", "push.worst")
+    per("the dearest push, every sample a bank sample, filters settled", "bank.steady.worst_push")
+    per("… over the first batch, which places the nodes", "bank.first.worst_push")
     per("gap, every filter", "bank.gap")
     per("report of one axis", "report")
     for stage, title in (
-        ("fields", "node fields"),
-        ("fit", "spline fits"),
-        ("scan", "search for the box, by rows"),
-        ("sum", "integral, by rows"),
-        ("finish", "moments and quantiles"),
+        ("gather", "nodes over the last samples"),
+        ("peak", "best node"),
+        ("sigma", "cells of σv"),
+        ("values", "node values"),
+        ("shift", "node values about the peak"),
+        ("spline_profile", "spline fit of the profile"),
+        ("spline_sigma", "spline fit of σv's mode, first box"),
+        ("scan", "search for the box"),
+        ("sum", "integral"),
+        ("weights", "node weights"),
+        ("bias", "bias"),
+        ("estimates", "moments and quantiles"),
+        ("evidence", "evidence"),
+        ("whole", "probabilities"),
     ):
         steps = max(figures["facts"][f"report.{stage}.steps"] for figures in targets.values())
         per(f"… {title}, {steps} steps", f"report.{stage}")

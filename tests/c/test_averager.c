@@ -1,4 +1,5 @@
 /* What reaches the bank and what does not: bad samples, gaps, partly filled blocks. */
+#include <float.h>
 #include <math.h>
 #include <string.h>
 
@@ -12,6 +13,24 @@ static selfcal_t bank;
 static selfcal_model_t model;
 static selfcal_axis_t axes[AXES];
 static selfcal_wide_t memory[SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES) / sizeof(selfcal_wide_t) + 1U];
+static selfcal_t other; /* to compare with */
+static selfcal_model_t other_model;
+static selfcal_axis_t other_axes[AXES];
+static selfcal_wide_t other_memory[SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES) / sizeof(selfcal_wide_t) + 1U];
+static selfcal_work_t work;
+
+/* xorshift: any sequence will do, it must only be the same everywhere */
+static uint32_t state;
+static float noise(void) {
+    float sum = 0.0F; /* of 12 uniforms: variance 1 */
+    for (int i = 0; i < 12; i++) {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        sum += (float)state / 4294967296.0F;
+    }
+    return sum - 6.0F;
+}
 
 void setUp(void) {
     model = selfcal_model;
@@ -23,6 +42,7 @@ void setUp(void) {
     model.axis = axes;
     model.block = BLOCK;
     model.dt_s = 1.0F;
+    state = 12345U;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&bank, &model, memory, sizeof memory));
 }
 
@@ -160,6 +180,226 @@ static void time_before_the_first_sample_does_not_count(void) {
     TEST_ASSERT_EQUAL(123456, selfcal_counters(&bank)->missing);
 }
 
+/* The bound of averager.c, driven to it: whatever the range says, sums stay finite and would for 2^32 bank samples. */
+static void huge_samples_cannot_overflow_a_sum(void) {
+    for (unsigned axis = 0; axis < AXES; axis++) {
+        axes[axis].range = 0.0F;
+    }
+    push(FLT_MAX); /* as the origin it would swallow all that follows */
+    push(-1e38F);
+    push(SELFCAL_SAMPLE_MAX);
+    TEST_ASSERT_EQUAL(0, selfcal_counters(&bank)->samples);
+    TEST_ASSERT_EQUAL(3, selfcal_counters(&bank)->saturated[0]);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, BLOCK, 1.0F / SELFCAL_VARIANCE_RATIO_MAX));
+    const float most = nextafterf(SELFCAL_SAMPLE_MAX, 0.0F);
+    for (unsigned i = 0; i < 100U * BLOCK; i++) {
+        push(i / BLOCK % 2U == 0U ? most : -most);
+        if (i % 3U == 0U) {
+            push(i % 2U == 0U ? FLT_MAX : -FLT_MAX);
+        }
+    }
+    TEST_ASSERT_TRUE(selfcal_count(&bank) > 80U);
+    for (uint16_t j = 0; j < model.nodes; j++) {
+        selfcal_node_view_t view;
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, j, &view));
+        const double most_samples = 4294967296.0 / selfcal_count(&bank);
+        TEST_ASSERT_TRUE(view.c > 0.0 && view.c * most_samples < (double)FLT_MAX);
+        TEST_ASSERT_TRUE(fabs(view.b) * most_samples < (double)FLT_MAX);
+        TEST_ASSERT_TRUE(isfinite(view.drift));
+    }
+    selfcal_report_t report;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, 0, &report)); /* far beyond the priors, but an answer */
+    for (unsigned h = 0; h < model.hypotheses; h++) {
+        TEST_ASSERT_FALSE(isnan(report.hypothesis[h].ln_evidence));
+    }
+}
+
+#define DEAD 2U /* the axis that dies */
+
+/* A bank without that axis, fed the rest. */
+static void init_other(void) {
+    other_model = model;
+    other_model.axes = AXES - 1U;
+    other_model.axis = other_axes;
+    for (unsigned axis = 0; axis < AXES - 1U; axis++) {
+        other_axes[axis] = axes[axis < DEAD ? axis : axis + 1U];
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&other, &other_model, other_memory, sizeof other_memory));
+}
+
+static void without_dead(const float sample[AXES], float rest[AXES]) {
+    for (unsigned axis = 0; axis < AXES - 1U; axis++) {
+        rest[axis] = sample[axis < DEAD ? axis : axis + 1U];
+    }
+}
+
+/* Noise on all axes, the dead one a twin of its neighbour, so that it draws the nodes nowhere else. */
+static void rest_sample(float sample[AXES]) {
+    for (unsigned axis = 0; axis < AXES; axis++) {
+        sample[axis] = (axis < 3U ? 0.1F : 0.01F) * noise() + (float)axis;
+    }
+    sample[DEAD] = sample[DEAD - 1U];
+}
+
+/* Every report of the other axes, bit for bit. */
+static void others_equal(void) {
+    TEST_ASSERT_EQUAL(selfcal_count(&other), selfcal_count(&bank));
+    for (uint8_t axis = 0; axis < AXES - 1U; axis++) {
+        selfcal_report_t with, without;
+        memset(&with, 0, sizeof with);
+        memset(&without, 0, sizeof without);
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, (uint8_t)(axis < DEAD ? axis : axis + 1U), &with));
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &other, axis, &without));
+        without.axis = with.axis;
+        TEST_ASSERT_EQUAL_MEMORY(&without, &with, sizeof with);
+    }
+}
+
+static void a_dead_axis_is_retired_and_the_others_go_on(void) {
+    const float signs_of_death[] = {NAN, 1000.0F, INFINITY};
+    for (unsigned trial = 0; trial < 6U; trial++) {
+        setUp();
+        init_other();
+        const bool from_the_start = trial >= 3U;
+        const unsigned sound = from_the_start ? 0U : 20U * BLOCK + 3U;
+        unsigned out = 0;
+        for (unsigned i = 0; i < (SELFCAL_RETIRE_BLOCKS + 100U) * BLOCK; i++) {
+            float sample[AXES], rest[AXES];
+            rest_sample(sample);
+            without_dead(sample, rest);
+            if (i >= sound) {
+                sample[DEAD] = signs_of_death[trial % 3U];
+            }
+            const bool kept_out = i >= sound && !selfcal_retired(&bank, DEAD);
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, kept_out ? selfcal_skip(&other, 1) : selfcal_push(&other, rest));
+            out += kept_out;
+        }
+        /* RETIRE_BLOCKS whole blocks, and up to one more in which it was sound for a part */
+        TEST_ASSERT_TRUE(out >= SELFCAL_RETIRE_BLOCKS * BLOCK - BLOCK / 2U && out <= (SELFCAL_RETIRE_BLOCKS + 1U) * BLOCK);
+        others_equal();
+        selfcal_report_t report;
+        selfcal_node_view_t view;
+        TEST_ASSERT_EQUAL(SELFCAL_AXIS_RETIRED, selfcal_report(&work, &bank, DEAD, &report));
+        TEST_ASSERT_EQUAL(SELFCAL_AXIS_RETIRED, selfcal_node(&bank, DEAD, 0, &view));
+        TEST_ASSERT_TRUE(isnan(selfcal_within_sd(&bank, DEAD)));
+        for (uint8_t axis = 0; axis < AXES; axis++) {
+            TEST_ASSERT_EQUAL(axis == DEAD, selfcal_retired(&bank, axis));
+        }
+        /* It comes back: it stays out, and still nobody else notices. */
+        for (unsigned i = 0; i < 100U * BLOCK; i++) {
+            float sample[AXES], rest[AXES];
+            rest_sample(sample);
+            without_dead(sample, rest);
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&other, rest));
+        }
+        TEST_ASSERT_TRUE(selfcal_retired(&bank, DEAD));
+        others_equal();
+    }
+}
+
+/* Pushes blocks in each of which `bad` samples of BLOCK fail on the axes of the mask. */
+static void push_failing(unsigned bad, unsigned mask, unsigned blocks) {
+    for (unsigned i = 0; i < blocks * BLOCK; i++) {
+        float sample[AXES];
+        rest_sample(sample);
+        for (unsigned axis = 0; axis < AXES; axis++) {
+            if ((mask >> axis & 1U) != 0U && i % BLOCK >= BLOCK - bad) {
+                sample[axis] = NAN;
+            }
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+    }
+}
+
+static void only_an_axis_that_starves_the_others_is_retired(void) {
+    const unsigned long_enough = SELFCAL_RETIRE_BLOCKS + 10U;
+    push_failing(BLOCK / 2U, 1U << DEAD, long_enough); /* leaves half of each block: a value each time */
+    TEST_ASSERT_FALSE(selfcal_retired(&bank, DEAD));
+    TEST_ASSERT_EQUAL(long_enough, selfcal_count(&bank));
+    push_failing(BLOCK, 1U << DEAD, SELFCAL_RETIRE_BLOCKS - 1U); /* not long enough */
+    push_failing(0, 0, 1);
+    push_failing(BLOCK, 1U << DEAD, SELFCAL_RETIRE_BLOCKS - 1U);
+    TEST_ASSERT_FALSE(selfcal_retired(&bank, DEAD));
+    push_failing(BLOCK, (1U << AXES) - 1U, long_enough); /* the sensor is unplugged: nobody's fault */
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_FALSE(selfcal_retired(&bank, axis));
+    }
+    push_failing(0, 0, 1);
+    push_failing(BLOCK, 7U, long_enough); /* the gyro chip dies */
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_EQUAL(axis < 3U, selfcal_retired(&bank, axis));
+    }
+    /* The others take turns, each failing in more than half of all samples: one is left. */
+    for (unsigned i = 0; i < 3U * long_enough * BLOCK; i++) {
+        float sample[AXES];
+        rest_sample(sample);
+        sample[3U + i % 3U] = NAN;
+        sample[3U + (i + 1U) % 3U] = NAN;
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+    }
+    TEST_ASSERT_EQUAL(1, !selfcal_retired(&bank, 3) + !selfcal_retired(&bank, 4) + !selfcal_retired(&bank, 5));
+}
+
+static void motion_drops_the_block_in_progress(void) {
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_moving(NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_moving(&bank)); /* nothing in progress */
+    for (unsigned i = 0; i < BLOCK; i++) {
+        push(1.0F);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_moving(&bank));
+    TEST_ASSERT_EQUAL(0, selfcal_counters(&bank)->blocks_moving);
+    push(100.0F);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_moving(&bank));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_moving(&bank)); /* no more to drop */
+    for (unsigned i = 0; i < BLOCK - 1U; i++) {
+        push(100.0F); /* nine of ten would be a block */
+    }
+    const selfcal_counters_t *counters = selfcal_counters(&bank);
+    TEST_ASSERT_EQUAL(1, selfcal_count(&bank));
+    TEST_ASSERT_EQUAL(1, counters->blocks_moving);
+    TEST_ASSERT_EQUAL(1, counters->blocks_lost);
+    TEST_ASSERT_EQUAL(1, counters->gaps);
+    for (unsigned i = 0; i < BLOCK; i++) {
+        push(3.0F); /* and the grid has stayed */
+    }
+    TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.0F, (float)constant().b); /* 0 + 2: the 100s are nowhere */
+}
+
+static void a_change_of_rate_changes_the_weight_alone(void) {
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_rate(NULL, 5, 1.0F));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_rate(&bank, 0, 1.0F));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_rate(&bank, 5, 0.0F));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_rate(&bank, 5, NAN));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_rate(&bank, 5, 2.0F * SELFCAL_VARIANCE_RATIO_MAX));
+    for (unsigned i = 0; i < BLOCK + 4U; i++) {
+        push(1.0F);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, BLOCK / 2U, 2.0F)); /* 4 of 10 have passed: 2 of 5 */
+    for (unsigned i = 0; i < 3U; i++) {
+        push(77.0F);
+    }
+    TEST_ASSERT_EQUAL(1, selfcal_counters(&bank)->blocks_lost);
+    for (unsigned i = 0; i < BLOCK / 2U; i++) {
+        push(3.0F);
+    }
+    TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
+    const selfcal_node_view_t view = constant();
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 1.5F, (float)view.a);               /* 1 + 1/2 */
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.0F, (float)view.c);               /* 0 + 4/2 */
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, logf(2.0F), (float)view.ln_s);      /* ln 1 + ln 2 */
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 4U * BLOCK, 1.0F)); /* the density stays: whole blocks weigh as ever */
+    for (unsigned i = 0; i < 4U * BLOCK; i++) {
+        push(1.0F);
+    }
+    TEST_ASSERT_EQUAL(3, selfcal_count(&bank));
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.5F, (float)constant().a);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_skip(&bank, 9U * 4U * BLOCK)); /* gaps are in new samples */
+    TEST_ASSERT_EQUAL(10, selfcal_counters(&bank)->blocks_lost);
+}
+
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(a_block_is_averaged);
@@ -170,5 +410,10 @@ int main(void) {
     RUN_TEST(less_than_half_a_block_is_dropped);
     RUN_TEST(a_gap_keeps_the_grid);
     RUN_TEST(time_before_the_first_sample_does_not_count);
+    RUN_TEST(huge_samples_cannot_overflow_a_sum);
+    RUN_TEST(a_dead_axis_is_retired_and_the_others_go_on);
+    RUN_TEST(only_an_axis_that_starves_the_others_is_retired);
+    RUN_TEST(motion_drops_the_block_in_progress);
+    RUN_TEST(a_change_of_rate_changes_the_weight_alone);
     return UNITY_END();
 }

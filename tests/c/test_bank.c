@@ -237,6 +237,63 @@ static void a_report_is_a_probability_law(void) {
     }
 }
 
+/* Truth: the report of a bank that is left alone meanwhile, to the last bit. */
+static void samples_may_come_during_a_report(void) {
+    for (int i = 0; i < 300; i++) {
+        push(0.1F, 0.02F);
+    }
+    const uint32_t before = selfcal_count(&bank);
+    static selfcal_t twin;
+    static selfcal_wide_t twin_memory[sizeof memory / sizeof memory[0]];
+    static selfcal_report_t alone;
+    const uint32_t seed = state;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&twin, &model, twin_memory, sizeof twin_memory));
+    state = 12345U;
+    for (uint32_t i = 0; i < before; i++) {
+        float sample[AXES];
+        for (unsigned axis = 0; axis < AXES; axis++) {
+            sample[axis] = 0.1F + 0.02F * noise();
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&twin, sample));
+    }
+    TEST_ASSERT_EQUAL(seed, state);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &twin, 2, &alone));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report_begin(&work, &bank, 2, &report));
+    unsigned pushed = 0;
+    selfcal_status_t status;
+    do {
+        status = selfcal_report_step(&work, &report);
+        if (report.n > 0U && selfcal_room(&bank) > 0U) { /* the sums are at rest */
+            push(0.3F, 0.5F);
+            pushed++;
+        }
+    } while (status == SELFCAL_BUSY);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, status);
+    TEST_ASSERT_TRUE(pushed >= SELFCAL_BATCH - 1U);
+    TEST_ASSERT_EQUAL(before + pushed, selfcal_count(&bank));
+    TEST_ASSERT_EQUAL(before, report.n);
+    TEST_ASSERT_EQUAL_MEMORY(&alone, &report, sizeof report);
+    TEST_ASSERT_EQUAL(0U, selfcal_room(&bank));
+}
+
+static void a_report_that_samples_overtake_is_given_up(void) {
+    for (int i = 0; i < 300; i++) {
+        push(0.1F, 0.02F);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report_begin(&work, &bank, 0, &report));
+    while (work.row == 0U) { /* into the cells */
+        TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_report_step(&work, &report));
+    }
+    while (selfcal_room(&bank) > 0U) {
+        push(0.1F, 0.02F);
+        TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_report_step(&work, &report));
+    }
+    push(0.1F, 0.02F);
+    TEST_ASSERT_EQUAL(SELFCAL_OVERTAKEN, selfcal_report_step(&work, &report));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_report_step(&work, &report)); /* it is over */
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, 0, &report));
+}
+
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(bad_arguments_change_nothing);
@@ -247,5 +304,7 @@ int main(void) {
     RUN_TEST(a_long_gap_leaves_finite_sums);
     RUN_TEST(reports_on_the_way_do_not_change_the_sums);
     RUN_TEST(a_report_is_a_probability_law);
+    RUN_TEST(samples_may_come_during_a_report);
+    RUN_TEST(a_report_that_samples_overtake_is_given_up);
     return UNITY_END();
 }

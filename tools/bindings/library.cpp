@@ -7,6 +7,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -23,11 +24,11 @@ using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::o
 namespace MODULE_NAME {
 
 struct Grid {
-    explicit Grid(const GridTuple &t) : fit(std::get<1>(t)), grid{std::get<0>(t), fit.data()} {
+    explicit Grid(const GridTuple &t) : fit(std::get<1>(t).begin(), std::get<1>(t).end()), grid{std::get<0>(t), fit.data()} {
         if (fit.size() != size_t{grid.nodes} * grid.nodes)
             throw std::invalid_argument("the spline matrix does not fit its nodes");
     }
-    std::vector<double> fit;
+    std::vector<selfcal_real_t> fit;
     selfcal_grid_t grid;
 };
 
@@ -77,6 +78,16 @@ public:
                 check(selfcal_skip(&bank_, missing_before.data()[i]));
             check(selfcal_push(&bank_, samples.data() + i * axes_.size()));
         }
+    }
+
+    void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
+    void moving() { check(selfcal_moving(&bank_)); }
+    void rate(uint32_t block, float variance_ratio) { check(selfcal_rate(&bank_, block, variance_ratio)); }
+
+    bool retired(uint8_t axis) const {
+        if (axis >= axes_.size())
+            throw std::invalid_argument("axis out of range");
+        return selfcal_retired(&bank_, axis);
     }
 
     nb::dict report(uint8_t axis) {
@@ -140,6 +151,7 @@ public:
         d["gaps"] = c->gaps;
         d["blocks_lost"] = c->blocks_lost;
         d["blocks_part"] = c->blocks_part;
+        d["blocks_moving"] = c->blocks_moving;
         d["not_finite"] = list(c->not_finite);
         d["saturated"] = list(c->saturated);
         d["stuck"] = list(c->stuck);
@@ -170,6 +182,8 @@ private:
             return;
         case SELFCAL_TOO_SHORT:
             throw std::length_error("too few bank samples for a report");
+        case SELFCAL_AXIS_RETIRED:
+            throw std::domain_error("the axis is retired: it failed for too long");
         case SELFCAL_BAD_ARGUMENT:
             throw std::invalid_argument("argument out of range");
         case SELFCAL_BAD_MODEL:
@@ -188,6 +202,65 @@ private:
     std::unique_ptr<selfcal_work_t> work_ = std::make_unique<selfcal_work_t>();
 };
 
+class Gate {
+public:
+    Gate(uint32_t window, float false_alarm, uint32_t hold, uint32_t settle, uint32_t memory, const std::vector<float> &sigma,
+         const std::vector<bool> &is_rate) {
+        if (sigma.size() > SELFCAL_AXES_MAX || is_rate.size() != sigma.size())
+            throw std::invalid_argument("one sigma and one kind an axis, up to SELFCAL_AXES_MAX");
+        selfcal_gate_config_t config{static_cast<uint8_t>(sigma.size()), window, false_alarm, hold, settle, memory, {}, {}};
+        std::copy(sigma.begin(), sigma.end(), config.sigma);
+        std::copy(is_rate.begin(), is_rate.end(), config.is_rate);
+        check(selfcal_gate_init(&gate_, &config));
+    }
+
+    // The state after each sample, one byte each: 1 at rest.
+    nb::bytes push(const nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu> &samples) {
+        if (samples.shape(1) != gate_.config.axes)
+            throw std::invalid_argument("samples must be [n, axes]");
+        std::string states(samples.shape(0), '\0');
+        for (size_t i = 0; i < states.size(); i++)
+            states[i] = static_cast<char>(selfcal_gate_push(&gate_, samples.data() + i * gate_.config.axes));
+        return nb::bytes(states.data(), states.size());
+    }
+
+    int skip(uint64_t count) { return selfcal_gate_skip(&gate_, count); }
+
+    void noise(uint8_t axis, float sigma, float within, float spread, float level) {
+        const selfcal_gate_noise_t noise{sigma, within, spread, level};
+        check(selfcal_gate_noise(&gate_, axis, &noise));
+    }
+
+    std::tuple<float, float, float, float> measured(uint8_t axis) const {
+        selfcal_gate_noise_t n{};
+        check(selfcal_gate_measured(&gate_, axis, &n));
+        return {n.sigma, n.within, n.spread, n.level};
+    }
+
+    nb::dict last() const {
+        const selfcal_gate_counters_t &c = gate_.counters;
+        nb::dict d;
+        d["t1"] = gate_.t1;
+        d["t2"] = gate_.t2;
+        d["shaken_above"] = gate_.shaken_above;
+        d["moved_above"] = gate_.moved_above;
+        d["windows"] = c.windows;
+        d["shaken"] = c.shaken;
+        d["moved"] = c.moved;
+        d["blind"] = c.blind;
+        d["alarms"] = c.alarms;
+        return d;
+    }
+
+private:
+    static void check(selfcal_status_t status) {
+        if (status != SELFCAL_OK)
+            throw std::invalid_argument(status == SELFCAL_TOO_SHORT ? "too few windows" : "argument out of range");
+    }
+
+    selfcal_gate_t gate_{};
+};
+
 } // namespace MODULE_NAME
 
 NB_MODULE(MODULE_NAME, m) {
@@ -202,6 +275,10 @@ NB_MODULE(MODULE_NAME, m) {
     nb::class_<Bank>(m, "Bank")
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &>())
         .def("push", &Bank::push)
+        .def("skip", &Bank::skip)
+        .def("moving", &Bank::moving)
+        .def("rate", &Bank::rate)
+        .def("retired", &Bank::retired)
         .def("report", &Bank::report)
         .def("node", &Bank::node)
         .def("log_likelihood", &Bank::log_likelihood)
@@ -210,4 +287,12 @@ NB_MODULE(MODULE_NAME, m) {
         .def_prop_ro("count", &Bank::count)
         .def_prop_ro("nodes", &Bank::nodes)
         .def_prop_ro("size", &Bank::size);
+    using MODULE_NAME::Gate;
+    nb::class_<Gate>(m, "Gate")
+        .def(nb::init<uint32_t, float, uint32_t, uint32_t, uint32_t, const std::vector<float> &, const std::vector<bool> &>())
+        .def("push", &Gate::push)
+        .def("skip", &Gate::skip)
+        .def("noise", &Gate::noise)
+        .def("measured", &Gate::measured)
+        .def("last", &Gate::last);
 }

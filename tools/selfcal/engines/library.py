@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _library32, _library64
+from selfcal import _dense, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS
 from selfcal.result import AxisResult, Estimate
@@ -22,11 +22,11 @@ def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
 
 
 class Bank:
-    """A bank over the axes of `tables`; `double` picks the verification build."""
+    """A bank over the axes of `tables`; `double` picks the verification build, `dense` that for up to 64 nodes a dimension."""
 
-    def __init__(self, tables: Tables, *, double: bool = False) -> None:
+    def __init__(self, tables: Tables, *, double: bool = False, dense: bool = False) -> None:
         self.tables = tables
-        self.raw: Any = (_library64 if double else _library32).Bank(
+        self.raw: Any = (_dense if dense else _library64 if double else _library32).Bank(
             tables.dt_s,
             tables.block,
             [
@@ -43,7 +43,12 @@ class Bank:
         self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64))
 
     def report(self, axis: int) -> AxisResult:
-        """Posterior of one axis now. Raises UserError with fewer bank samples than a report needs."""
+        """Posterior of one axis now. Raises UserError of an axis that failed, or with too few bank samples."""
+        if self.raw.retired(axis):
+            raise UserError(
+                f"{self.tables.axes[axis].name} was out of range or stuck for too long and is left out: choose the "
+                "others with --axis"
+            )
         try:
             report = self.raw.report(axis)
         except ValueError as error:  # std::length_error

@@ -86,10 +86,10 @@ def _f(value: float) -> str:
 
 
 def _grid(grid: Grid) -> str:
-    rows = ",\n".join("    " + ", ".join(f"{value:.17g}" for value in row) for row in grid.fit.tolist())
+    rows = ",\n".join("    " + ", ".join(_f(value) for value in row) for row in grid.fit.tolist())
     name = f"fit_{grid.nodes}"
     return (
-        f"static const selfcal_wide_t {name}[{grid.nodes * grid.nodes}] = {{\n{rows},\n}};\n"
+        f"static const selfcal_real_t {name}[{grid.nodes * grid.nodes}] = {{\n{rows},\n}};\n"
         f"static const selfcal_grid_t grid_{grid.nodes} = {{{grid.nodes}U, {name}}};\n"
     )
 

@@ -1,0 +1,327 @@
+/* Stationary gate: a generalised likelihood-ratio test over windows of samples: does the sensor rest?
+ *
+ * After Skog, Haendel, Nilsson & Rantakokko, "Zero-velocity detection: an algorithm evaluation", IEEE Trans. Biomed. Eng. 57
+ * (2010) 2657-2666, with two differences. Their detector (SHOE) knows gyros without bias and gravity's magnitude; here every
+ * axis has an unknown level of its own, for a bias is just what the bank is to find, and an accelerometer's spoils |g|. And
+ * what their detector gains from a known level, a second test gains from the level of the rest before.
+ *
+ * A window holds n samples y_i of each of A axes. At rest y_i = m + v_i, v_i ~ N(0, sigma^2) white, the level m unknown.
+ *
+ * (i) Shaken? H0: one level m per axis for the window. H1: any signal. Twice the ln of the ratio of the maximised likelihoods is
+ *         T1 = sum over axes, samples of (y_i - mean)^2 / sigma^2,   chi-square with A (n - 1) degrees of freedom at rest.
+ * (ii) Moved? H0: the window has the level of the rest before, whose estimate has the variance gamma sigma^2. H1: any levels.
+ *         T2 = sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)),   chi-square with A degrees of freedom at rest.
+ * Mean and scatter of normal samples are independent, so T1 and T2 are: each test gets half of the stated false alarm rate p,
+ * and a window of rest is taken for motion with probability p - p^2/4.
+ *
+ * A sensor's filter colours its noise; vibration adds to it. With factors measured at rest on each axis, the scatter of a window
+ * has the mean `within` sigma^2 (n - 1) and `spread` times the variance that goes with it, and the window's mean has the variance
+ * `level` sigma^2/n. Then T1, its terms over `within`, is taken as c chi-square with nu degrees of freedom of the same mean and
+ * variance (Satterthwaite, Biometrics Bull. 2 (1946) 110-114): nu = A^2 (n - 1)/sum of spread, c = A (n - 1)/nu. White: nu = A (n - 1), c = 1. */
+#include "internal.h"
+
+/* ln Gamma(a), a > 0, to 1e-10: Stirling's series above 8. lgamma() has a global, signgam. */
+static selfcal_wide_t ln_gamma(selfcal_wide_t a) {
+    selfcal_wide_t result = 0.5 * SELFCAL_LN_2PI;
+    while (a < 8.0) {
+        result -= log(a);
+        a += 1.0;
+    }
+    const selfcal_wide_t sq = 1.0 / (a * a);
+    return result + (a - 0.5) * log(a) - a + (1.0 / 12.0 - sq * (1.0 / 360.0 - sq * (1.0 / 1260.0 - sq / 1680.0))) / a;
+}
+
+/* h in Q(a, x) = e^-x x^a / Gamma(a) h, the upper tail of the gamma distribution, x well above a: Legendre's continued fraction
+ * (Abramowitz & Stegun 6.5.31, even part) from its first term on (modified Lentz). */
+static selfcal_wide_t tail_fraction(selfcal_wide_t a, selfcal_wide_t x) {
+    selfcal_wide_t b = x + 1.0 - a, c = 1e300, d = 1.0 / b, h = d;
+    for (int i = 1; i < 1000; i++) {
+        const selfcal_wide_t an = -(selfcal_wide_t)i * ((selfcal_wide_t)i - a);
+        b += 2.0;
+        d = 1.0 / (an * d + b);
+        c = b + an / c;
+        h *= d * c;
+        if (fabs(d * c - 1.0) < 1e-12) {
+            break;
+        }
+    }
+    return h;
+}
+
+/* What a chi-square variable of `nu` degrees of freedom exceeds with the probability p <= 0.1: Newton's iteration on ln Q, whose
+ * slope is -1/(x h), from Wilson & Hilferty's cube root of a normal variable. */
+static selfcal_wide_t chi_square_above(selfcal_wide_t nu, selfcal_wide_t p) {
+    const selfcal_wide_t a = 0.5 * nu, ln_p = log(p);
+    /* Normal quantile to 4.5e-4 (Abramowitz & Stegun 26.2.23). */
+    const selfcal_wide_t t = sqrt(-2.0 * ln_p);
+    const selfcal_wide_t z = t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)));
+    const selfcal_wide_t root = 1.0 - 2.0 / (9.0 * nu) + z * sqrt(2.0 / (9.0 * nu));
+    selfcal_wide_t x = fmax(a * root * root * root, a + 0.5);
+    for (int i = 0; i < 20; i++) {
+        const selfcal_wide_t h = tail_fraction(a, x);
+        const selfcal_wide_t step = (a * log(x) - x - ln_gamma(a) + log(h) - ln_p) * x * h;
+        x = fmax(x + step, a + 0.5 * (x - a));
+        if (fabs(step) < 1e-9 * x) {
+            break;
+        }
+    }
+    return 2.0 * x;
+}
+
+/* An axis of infinite sigma is left out. */
+static bool present(const selfcal_gate_t *gate, uint8_t axis) {
+    return isfinite(gate->axis[axis].sigma);
+}
+
+/* Thresholds for windows of `n` samples; O(sqrt(axes * n)) in selfcal_wide_t, so kept until n or the noise changes. */
+static void set_thresholds(selfcal_gate_t *gate, uint32_t n) {
+    const selfcal_wide_t p = 0.5 * (selfcal_wide_t)gate->config.false_alarm;
+    selfcal_wide_t axes = 0.0, rates = 0.0, spread = 0.0;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        if (present(gate, axis)) {
+            axes += 1.0;
+            rates += gate->config.is_rate[axis] ? 1.0 : 0.0;
+            spread += (selfcal_wide_t)gate->axis[axis].spread;
+        }
+    }
+    gate->threshold_n = n;
+    /* Without an axis there is no rest to be seen. */
+    gate->shaken_above = gate->moved_above = gate->rate_moved_above = axes > 0.0 ? INFINITY : -1.0F;
+    if (p > 0.0 && axes > 0.0) {
+        const selfcal_wide_t dof = axes * (selfcal_wide_t)(n - 1U);
+        const selfcal_wide_t nu = axes * dof / spread;
+        gate->shaken_above = (float)(dof / nu * chi_square_above(nu, p));
+        gate->moved_above = (float)chi_square_above(axes, p);
+        gate->rate_moved_above = rates > 0.0 ? (float)chi_square_above(rates, p) : INFINITY;
+    }
+}
+
+static void start_window(selfcal_gate_t *gate) {
+    gate->position = 0;
+    gate->used = 0;
+    gate->blind = false;
+}
+
+selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_config_t *config) {
+    if (gate == NULL || config == NULL || config->axes == 0U || config->axes > SELFCAL_AXES_MAX || config->window < 2U ||
+        !(config->false_alarm >= 0.0F) || !(config->false_alarm <= 0.1F) || config->hold == 0U || config->memory == 0U) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    for (uint8_t axis = 0; axis < config->axes; axis++) {
+        if (!(config->sigma[axis] > 0.0F)) {
+            return SELFCAL_BAD_ARGUMENT;
+        }
+    }
+    memset(gate, 0, sizeof *gate);
+    gate->config = *config;
+    gate->state = SELFCAL_MOVING;
+    for (uint8_t axis = 0; axis < config->axes; axis++) {
+        const selfcal_gate_noise_t white = {config->sigma[axis], 1.0F, 1.0F, 1.0F};
+        gate->axis[axis] = white;
+    }
+    start_window(gate);
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise) {
+    if (gate == NULL || noise == NULL || axis >= gate->config.axes || !(noise->sigma > 0.0F) || !(noise->within > 0.0F) ||
+        !(noise->spread > 0.0F) || !(noise->level > 0.0F) || !isfinite(noise->within) || !isfinite(noise->spread) ||
+        !isfinite(noise->level)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    gate->axis[axis] = *noise;
+    gate->threshold_n = 0;
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise) {
+    if (gate == NULL || noise == NULL || axis >= gate->config.axes) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (gate->measured < SELFCAL_GATE_MEASURED_MIN) {
+        return SELFCAL_TOO_SHORT;
+    }
+    const selfcal_wide_t count = (selfcal_wide_t)gate->measured;
+    const selfcal_wide_t scatter = gate->sum_scatter[axis] / count;
+    const selfcal_wide_t variance = (gate->sum_scatter_sq[axis] / count - scatter * scatter) * count / (count - 1.0);
+    const selfcal_wide_t sigma_sq = (selfcal_wide_t)gate->axis[axis].sigma * (selfcal_wide_t)gate->axis[axis].sigma;
+    /* A scatter of mean s over d = n - 1 degrees of freedom has the variance 2 s^2/d when white. */
+    noise->sigma = gate->axis[axis].sigma;
+    noise->within = (float)(scatter / sigma_sq);
+    noise->spread = (float)(variance * (selfcal_wide_t)(gate->config.window - 1U) / (2.0 * scatter * scatter));
+    noise->level = (float)(gate->sum_level_sq[axis] / count / sigma_sq);
+    return SELFCAL_OK;
+}
+
+/* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only. */
+static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n, const selfcal_level_t *level, bool rates) {
+    float sum = 0.0F;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        if (present(gate, axis) && (gate->config.is_rate[axis] || !rates)) {
+            const float off = (mean[axis] - level->mean[axis]) / gate->axis[axis].sigma;
+            sum += off * off / gate->axis[axis].level;
+        }
+    }
+    return sum / (float)(inv_n + level->gamma);
+}
+
+/* Mean of the samples so far with those of a window, but a window weighs at least 1/memory. */
+static void merge(const selfcal_gate_t *gate, selfcal_level_t *level, const float mean[], selfcal_real_t inv_n) {
+    const selfcal_real_t least = R(1.0) / (selfcal_real_t)gate->config.memory;
+    const selfcal_real_t w = r_fmax(level->gamma / (level->gamma + inv_n), least);
+    level->gamma = (R(1.0) - w) * (R(1.0) - w) * level->gamma + w * w * inv_n;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        level->mean[axis] = (float)r_fma(w, (selfcal_real_t)mean[axis] - (selfcal_real_t)level->mean[axis], (selfcal_real_t)level->mean[axis]);
+    }
+}
+
+static void set_level(const selfcal_gate_t *gate, selfcal_level_t *level, const float mean[], selfcal_real_t inv_n) {
+    memcpy(level->mean, mean, gate->config.axes * sizeof mean[0]);
+    level->gamma = inv_n;
+}
+
+/* Sums for selfcal_gate_measured(), of a whole window of rest. */
+static void measure(selfcal_gate_t *gate, const float scatter[], const float mean[], selfcal_real_t inv_n) {
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        const selfcal_wide_t variance = (selfcal_wide_t)scatter[axis] / (selfcal_wide_t)(gate->config.window - 1U);
+        const selfcal_wide_t off = (selfcal_wide_t)mean[axis] - (selfcal_wide_t)gate->rest.mean[axis];
+        gate->sum_scatter[axis] += variance;
+        gate->sum_scatter_sq[axis] += variance * variance;
+        gate->sum_level_sq[axis] += off * off / (selfcal_wide_t)(inv_n + gate->rest.gamma);
+    }
+    gate->measured++;
+}
+
+/* A window has nothing to go by: too few samples, or one that is no number. */
+static void blind_window(selfcal_gate_t *gate) {
+    gate->counters.blind++;
+    gate->state = SELFCAL_MOVING;
+    gate->quiet = 0;
+}
+
+static void judge(selfcal_gate_t *gate) {
+    const uint32_t n = gate->used;
+    float mean[SELFCAL_AXES_MAX], scatter[SELFCAL_AXES_MAX], t1 = 0.0F;
+    const selfcal_real_t inv_n = R(1.0) / (selfcal_real_t)n;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        const selfcal_real_t about_first = gate->sum[axis] * inv_n;
+        mean[axis] = (float)((selfcal_real_t)gate->first[axis] + about_first);
+        scatter[axis] = (float)r_fmax(r_fma(-gate->sum[axis], about_first, gate->sum_sq[axis]), R(0.0));
+        if (present(gate, axis)) {
+            t1 += scatter[axis] / gate->axis[axis].sigma / gate->axis[axis].sigma / gate->axis[axis].within;
+        }
+    }
+    if (gate->threshold_n != n) {
+        set_thresholds(gate, n);
+    }
+    const bool shaken = !(t1 <= gate->shaken_above);
+    gate->t1 = t1;
+    gate->counters.shaken += shaken;
+    if (gate->state == SELFCAL_RESTING) {
+        gate->t2 = distance(gate, mean, inv_n, &gate->rest, false);
+        const bool moved = !(gate->t2 <= gate->moved_above);
+        gate->counters.moved += moved;
+        if (!shaken && !moved) {
+            if (n == gate->config.window) {
+                measure(gate, scatter, mean, inv_n);
+            }
+            merge(gate, &gate->rest, mean, inv_n);
+            return;
+        }
+        gate->counters.alarms++;
+        gate->state = SELFCAL_MOVING;
+        gate->quiet = 0; /* Not even the first of the quiet ones: picked for its odd mean, it would make a bad level. */
+        return;
+    }
+    bool moved = false;
+    if (gate->quiet > 0U) {
+        gate->t2 = distance(gate, mean, inv_n, &gate->found, false);
+        moved = !(gate->t2 <= gate->moved_above);
+        gate->counters.moved += moved;
+    }
+    if (shaken || moved) {
+        gate->quiet = 0;
+        return;
+    }
+    if (gate->quiet == 0U) {
+        set_level(gate, &gate->found, mean, inv_n);
+    } else {
+        merge(gate, &gate->found, mean, inv_n);
+    }
+    gate->quiet++;
+    const bool back = !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true) <= gate->rate_moved_above;
+    const bool settled = gate->config.settle > 0U && gate->quiet > gate->config.settle;
+    if (gate->quiet > gate->config.hold && (back || settled)) {
+        gate->rest = gate->found;
+        gate->rested = true;
+        gate->state = SELFCAL_RESTING;
+    }
+}
+
+static void close_window(selfcal_gate_t *gate) {
+    gate->counters.windows++;
+    if (gate->blind || gate->used < 2U || gate->used < gate->config.window - gate->used) {
+        blind_window(gate);
+    } else {
+        judge(gate);
+    }
+    start_window(gate);
+}
+
+selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]) {
+    SELFCAL_ASSERT(gate != NULL && sample != NULL);
+    const uint8_t axes = gate->config.axes;
+    bool sound = true;
+    for (uint8_t axis = 0; axis < axes; axis++) {
+        sound = sound && (!present(gate, axis) || fabsf(sample[axis]) < SELFCAL_SAMPLE_MAX); /* false for a NaN */
+    }
+    if (sound && !gate->started) {
+        gate->started = true;
+        for (uint8_t axis = 0; axis < axes; axis++) {
+            gate->origin[axis] = present(gate, axis) ? sample[axis] : 0.0F;
+        }
+    }
+    if (!sound) {
+        gate->blind = true;
+        gate->state = SELFCAL_MOVING;
+        gate->quiet = 0;
+    } else {
+        for (uint8_t axis = 0; axis < axes; axis++) {
+            const float value = present(gate, axis) ? sample[axis] - gate->origin[axis] : 0.0F;
+            if (gate->used == 0U) {
+                gate->first[axis] = value;
+                gate->sum[axis] = R(0.0);
+                gate->sum_sq[axis] = R(0.0);
+            }
+            const selfcal_real_t off = (selfcal_real_t)value - (selfcal_real_t)gate->first[axis];
+            gate->sum[axis] += off;
+            gate->sum_sq[axis] = r_fma(off, off, gate->sum_sq[axis]);
+        }
+        gate->used++;
+    }
+    gate->position++;
+    if (gate->position == gate->config.window) {
+        close_window(gate);
+    }
+    return gate->state;
+}
+
+selfcal_motion_t selfcal_gate_skip(selfcal_gate_t *gate, uint64_t count) {
+    SELFCAL_ASSERT(gate != NULL);
+    const uint32_t window = gate->config.window;
+    const uint32_t left = window - gate->position;
+    if (count < left) {
+        gate->position += (uint32_t)count;
+        return gate->state;
+    }
+    close_window(gate);
+    count -= left;
+    const uint64_t whole = count / window;
+    if (whole > 0U) {
+        gate->counters.windows += whole;
+        gate->counters.blind += whole - 1U;
+        blind_window(gate);
+    }
+    gate->position = (uint32_t)(count % window);
+    return gate->state;
+}

@@ -1,0 +1,92 @@
+/* The seam between what all axes share (bank.c: variances, gains, sums A and D) and the work of each axis (a kernel: drift x,
+ * sums B and C). Not for users. */
+#ifndef SELFCAL_KERNEL_H
+#define SELFCAL_KERNEL_H
+
+#include "internal.h"
+
+/* Part of the batch without a gap inside. */
+typedef struct {
+    uint32_t from, to;
+} span_t;
+
+/* The gain side of a batch, shared by the axes. */
+typedef struct {
+    span_t span;
+    selfcal_real_t g[SELFCAL_BATCH];     /* phi K + beta */
+    selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1" over s */
+    selfcal_real_t inv_s[SELFCAL_BATCH]; /* 1 where s is constant and left to the scales */
+    selfcal_sum_t scale;                 /* what the span's sums of nu and nu^2 are still to be multiplied by */
+} gains_t;
+
+/* The batch that the nodes run over. */
+static inline selfcal_batch_t *waiting(selfcal_t *self) {
+    return &self->batch[1U - self->gathering];
+}
+
+/* Every axis of node `j` through the span. */
+void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains);
+
+/* The same for the level ones of the nodes `from` to `to` - 1: g, u and 1/s are constant. */
+void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
+
+/* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
+void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
+
+/* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
+void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
+
+/* Nodes of a hypothesis: `rows` of rho times `columns` of alpha, which changes fastest. */
+static inline uint16_t grid_rows(const selfcal_hypothesis_t *hypothesis) {
+    return hypothesis->rho != NULL ? hypothesis->rho->nodes : 1U;
+}
+
+static inline uint16_t grid_columns(const selfcal_hypothesis_t *hypothesis) {
+    return hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
+}
+
+/* ------------------------------------------------------------------------------------------------------- long sums */
+
+/* Adds hi + lo, |lo| far below |hi| (Knuth's two-sum, then renormalised). */
+static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
+    const selfcal_real_t total = sum->hi + hi;
+    const selfcal_real_t part = total - sum->hi;
+    const selfcal_real_t error = ((sum->hi - (total - part)) + (hi - part)) + (sum->lo + lo);
+    sum->hi = total + error;
+    sum->lo = error - (sum->hi - total);
+}
+
+/* Adds scale * value, the product in full. */
+static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
+    const selfcal_real_t product = scale.hi * value;
+    sum_add(sum, product, r_fma(scale.lo, value, r_fma(scale.hi, value, -product)));
+}
+
+static inline selfcal_wide_t sum_value(selfcal_sum_t sum) {
+    return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
+}
+
+/* ------------------------------------------------------------------------------------------------- converged nodes */
+
+/* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */
+static inline selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
+    const selfcal_real_t s = R(1.0) + node->p_inf;
+    const selfcal_real_t s_lo = node->p_inf >= R(1.0) ? R(1.0) - (s - node->p_inf) : node->p_inf - (s - R(1.0));
+    const selfcal_real_t inv = R(1.0) / s;
+    const selfcal_sum_t result = {inv, inv * r_fma(-inv, s_lo, r_fma(-inv, s, R(1.0)))};
+    return result;
+}
+
+/* The gain of a converged node, phi K + beta. */
+static inline selfcal_real_t steady_g(const selfcal_node_t *node) {
+    const selfcal_real_t gain = node->p_inf / (R(1.0) + node->p_inf);
+    return r_fma(gain, -node->beta, gain) + node->beta;
+}
+
+/* What a level node's samples have added to A since it became level. */
+static inline selfcal_wide_t level_a(const selfcal_node_t *node) {
+    const selfcal_wide_t u = (selfcal_wide_t)node->u_inf;
+    return node->level ? (selfcal_wide_t)(node->steady - node->level_from) * u * u / (1.0 + (selfcal_wide_t)node->p_inf) : 0.0;
+}
+
+#endif

@@ -1,0 +1,84 @@
+/* The stationary gate through the public header: arguments and extremes. Its statistics are tested in tests/py/test_gate.py. */
+#include <float.h>
+#include <math.h>
+
+#include "selfcal.h"
+#include "unity.h"
+
+static selfcal_gate_t gate;
+static selfcal_gate_config_t config;
+
+void setUp(void) {
+    const selfcal_gate_config_t two = {.axes = 2, .window = 10, .false_alarm = 1e-3F, .hold = 1, .memory = 10,
+                                       .sigma = {1.0F, 1.0F}, .is_rate = {true, false}};
+    config = two;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_init(&gate, &config));
+}
+
+void tearDown(void) {}
+
+/* A window of rest about a level: +-1 in turn. */
+static selfcal_motion_t window(float x, float y) {
+    selfcal_motion_t state = SELFCAL_MOVING;
+    for (unsigned i = 0; i < config.window; i++) {
+        const float off = i % 2U == 0U ? 1.0F : -1.0F;
+        state = selfcal_gate_push(&gate, (const float[2]){x + off, y - off});
+    }
+    return state;
+}
+
+static void bad_arguments_are_refused(void) {
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_init(NULL, &config));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_init(&gate, NULL));
+    config.axes = SELFCAL_AXES_MAX + 1;
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_init(&gate, &config));
+    const selfcal_gate_noise_t white = {1.0F, 1.0F, 1.0F, 1.0F};
+    selfcal_gate_noise_t noise;
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_noise(NULL, 0, &white));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_noise(&gate, 2, &white));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_noise(&gate, 0, NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_measured(&gate, 2, &noise));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_gate_measured(&gate, 0, NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_TOO_SHORT, selfcal_gate_measured(&gate, 0, &noise));
+}
+
+static void rest_motion_and_rest_again(void) {
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(5.0F, 9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_RESTING, window(5.0F, 9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(10.0F, 9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(10.0F, 9.8F)); /* the gyro has not come back */
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(10.0F, 9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(5.0F, -9.8F)); /* off what it was just before */
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(5.0F, -9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_RESTING, window(5.0F, -9.8F)); /* turned over */
+    TEST_ASSERT_EQUAL(8, gate.counters.windows);
+    TEST_ASSERT_EQUAL(1, gate.counters.alarms);
+}
+
+/* The largest samples that count, and the smallest noise: nothing becomes rest by way of a NaN. */
+static void extremes_are_motion(void) {
+    const float most = nextafterf(SELFCAL_SAMPLE_MAX, 0.0F);
+    const selfcal_gate_noise_t tiny = {FLT_MIN, FLT_MIN, 1.0F, FLT_MIN};
+    for (uint8_t axis = 0; axis < 2U; axis++) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_noise(&gate, axis, &tiny));
+    }
+    for (unsigned i = 0; i < 1000U; i++) {
+        TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
+        TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){FLT_MAX, NAN}));
+    }
+    TEST_ASSERT_EQUAL(200, gate.counters.blind);
+    for (unsigned i = 0; i < 1000U; i++) {
+        TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
+    }
+    TEST_ASSERT_EQUAL(100, gate.counters.shaken);
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_skip(&gate, UINT64_MAX));
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_skip(&gate, 0));
+}
+
+int main(void) {
+    UNITY_BEGIN();
+    RUN_TEST(bad_arguments_are_refused);
+    RUN_TEST(rest_motion_and_rest_again);
+    RUN_TEST(extremes_are_motion);
+    return UNITY_END();
+}
