@@ -11,6 +11,12 @@
 #define BOARD_REPORT_MS 10000
 #endif
 
+/* Seconds of running between saves of the state. A sector bears 10 000 erases and a save erases one of two, so that four saves
+ * a day wear the flash out in 13 years. */
+#ifndef BOARD_SAVE_PERIOD_S
+#define BOARD_SAVE_PERIOD_S 21600U
+#endif
+
 static adis16405_t sensor;
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 static app_t app;
@@ -94,13 +100,68 @@ static void port_idle(void *context)
 
 static const port_t port = {NULL, port_time_ms, port_sample, port_send, port_idle};
 
-/* Fed once in 100 ms at most, and only if the millisecond clock goes on: a main loop that turns without its interrupts is not
- * healthy. */
+/* ------------------------------------------------------------------------------------------------------------- module */
+
+static reset_cause_t reset_cause;
+static board_fault_t last_fault;
+
+static void module_tell(void *context, selfcal_module_t *told)
+{
+    (void)context;
+    told->reset_cause = (uint32_t)reset_cause;
+    told->fault_address = last_fault.pc;
+    told->clock = board_clock.crystal ? 1U : 2U;
+    told->sensor_state = (uint32_t)sensor.state + 1U;
+    told->sensor_fault = (uint32_t)sensor.fault;
+    told->sensor_fault_count = sensor.counters.faults;
+    told->sensor_diagnosis = sensor.diagnosis;
+    told->sensor_stale_count = sensor.counters.stale;
+    told->sensor_alarm_count = sensor.counters.alarms;
+    told->sensor_damaged_count = sensor.counters.damaged;
+    told->sensor_anomaly_count = sensor.counters.anomalies;
+    told->sensor_overrun_count = sensor.counters.overruns;
+    wire_counters_t wire;
+    if (BOARD_CAN_KBITPS > 0) {
+        can_counters(&wire);
+    } else {
+        usart_counters(&wire);
+    }
+    told->frames_dropped = wire.dropped;
+    told->bus_off_count = wire.bus_offs;
+}
+
+static const void *module_stored(void *context, bool older, size_t *length)
+{
+    (void)context;
+    uint32_t sequence;
+    return flash_newest(older, length, &sequence);
+}
+
+static bool module_save_begin(void *context)
+{
+    (void)context;
+    watchdog_feed(); /* the erase takes 2 s at most, the watchdog 5.4 s at least */
+    return flash_begin();
+}
+
+static bool module_save_end(void *context)
+{
+    (void)context;
+    return flash_end();
+}
+
+static const port_module_t module = {
+    NULL, module_tell, module_stored, module_save_begin, flash_put, module_save_end, BOARD_SAVE_PERIOD_S * 1000U,
+    (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
+};
+
+/* Fed once in 100 ms at most, and only if the millisecond clock goes on (a main loop that turns without its interrupts is not
+ * healthy) and the application is well. */
 static void feed(void)
 {
     static uint32_t fed_ms;
     const uint32_t now = clock_ms();
-    if (now - fed_ms >= 100U) {
+    if (now - fed_ms >= 100U && app_healthy(&app)) {
         fed_ms = now;
         watchdog_feed();
     }
@@ -109,6 +170,10 @@ static void feed(void)
 int main(void)
 {
     watchdog_start();
+    reset_cause = watchdog_reset_cause();
+    if (board_last_fault(&last_fault) && reset_cause == RESET_SOFTWARE) {
+        reset_cause = RESET_FAULT;
+    }
     clock_init();
     irq_on();
     if (BOARD_CAN_KBITPS > 0) {
@@ -120,6 +185,7 @@ int main(void)
     if (!sensor_init() || app_init(&app, &port, BOARD_REPORT_MS) != SELFCAL_OK) {
         return 1; /* the model is not one for this sensor: the start-up code resets */
     }
+    app_module(&app, &module);
     for (;;) {
         if (BOARD_CAN_KBITPS == 0) {
             usart_poll();
