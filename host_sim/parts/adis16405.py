@@ -30,6 +30,7 @@ class Adis16405:
         self.clock_error = 0.0  # of its own sample clock, relative
         self.supply = 2068  # LSB of 2.418 mV: 5.0 V
         self.taken: list[tuple[int, float, Sample]] = []  # every sample it made: index, time in us, readings
+        self.read_twice: list[int] = []  # indices of the samples that two whole bursts have read
         # what can be wrong
         self.connected = True
         self.floating_high = True  # its output's line, when it is not there
@@ -41,6 +42,7 @@ class Adis16405:
         self.lose_sign: Callable[[int], bool] = lambda k: False  # the known anomaly, for sample k
         self.stale: Callable[[int], bool] = lambda k: False  # data-ready without new data
         self.product = PRODUCT
+        self._read_once = -1
         # statistics
         self.frames = self.bursts = self.resets = 0
         self.index = 0
@@ -159,6 +161,10 @@ class Adis16405:
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz in a burst")
         position = self.burst_at or 0
         self.burst_at = position + 1
+        if position == len(OUTPUTS) - 1 and self.taken:
+            if self._read_once == self.taken[-1][0]:
+                self.read_twice.append(self._read_once)
+            self._read_once = self.taken[-1][0]
         if position >= len(OUTPUTS):
             self.machine.violations.append("ADIS16405: a burst of more than 12 words")
             return 0

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+from unicorn import arm_const as arm
 
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
@@ -33,7 +34,7 @@ def resting(seed: int) -> Callable[[int], Sample]:
 
 class Board:
     """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is given.
-    `text`: what the USART said. `retained`: content of the flash's two last sectors to start with."""
+    `text`: what the USART said. `retained`: content of the flash's two last sectors to start with. `clock_broken`: "crystal" or "pll"."""
 
     def __init__(
         self,
@@ -43,10 +44,13 @@ class Board:
         seed: int = 0,
         channel: str | None = None,
         retained: bytes | None = None,
+        clock_broken: str = "",
     ) -> None:
         self.elf = elf
         self.machine = machine = Machine(elf, seed)
         self.rcc = Rcc(machine)
+        self.rcc.crystal = clock_broken != "crystal"
+        self.rcc.pll_works = clock_broken != "pll"
         self.system = SystemControl(machine)
         self.pwr = Pwr(machine)
         self.tim2 = Tim2(machine, self.rcc)
@@ -113,3 +117,6 @@ class Board:
         """Leave the python-can channel."""
         if self.bus is not None:
             self.bus.shutdown()
+
+
+__all__ = ["Adis16405", "Board", "arm", "place", "resting"]

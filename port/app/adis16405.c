@@ -380,7 +380,6 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         self->last_us = stamp;
         self->progress_us = now;
         self->ready_seen = self->ready_count;
-        self->fault = ADIS16405_NO_FAULT;
         self->good++;
         self->counters.samples++;
         for (size_t i = 0; i < ADIS16405_AXES; i++) {

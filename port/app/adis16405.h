@@ -80,7 +80,7 @@ typedef struct {
     uint32_t nominal_q8, period_q8; /* sample period, us / 256 */
     float scale[ADIS16405_AXES];
     adis16405_state_t state;
-    adis16405_fault_t fault;
+    adis16405_fault_t fault; /* the last one */
     uint8_t step;
     uint64_t step_us;      /* when the step of the start was entered, or the fault state */
     uint32_t backoff_us;
