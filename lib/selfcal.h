@@ -570,9 +570,32 @@ typedef struct {
 /* What the module does, for its status: finished once no sample will follow. */
 typedef enum { SELFCAL_RUNNING, SELFCAL_FINISHED } selfcal_state_t;
 
+/* What a module tells of itself beside the bank; meanings and codes as in selfcal.dbc. */
+typedef struct {
+    uint32_t reset_cause;
+    uint32_t fault_address;
+    uint32_t clock;
+    uint32_t sensor_state;
+    uint32_t sensor_fault;
+    uint32_t sensor_fault_count;
+    uint32_t sensor_diagnosis;
+    uint32_t sensor_stale_count;
+    uint32_t sensor_alarm_count;
+    uint32_t sensor_damaged_count;
+    uint32_t sensor_anomaly_count;
+    uint32_t sensor_overrun_count;
+    uint32_t frames_dropped;
+    uint32_t bus_off_count;
+    uint32_t state_found;
+    uint32_t state_refused;
+    uint32_t state_saves;
+    uint32_t state_save_failures;
+} selfcal_module_t;
+
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
+    const selfcal_module_t *module;
     uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
     uint8_t of_law[SELFCAL_LAWS];      /* hypothesis with that law; SELFCAL_HYPOTHESES_MAX: none */
     /* source of the frames under way: a report, or the status if NULL */
@@ -600,7 +623,10 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
 selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
                                           const selfcal_counters_t *counters, uint32_t time_ms);
 
-/* Sends the status next, 16 frames; otherwise as selfcal_telemetry_report(). */
+/* What the following statuses tell of the module; it must stay. NULL: zeros. */
+void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module);
+
+/* Sends the status next, 34 frames; otherwise as selfcal_telemetry_report(). */
 selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
                                           selfcal_state_t state, uint32_t report_number, uint32_t time_ms);
 

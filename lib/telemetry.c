@@ -128,6 +128,11 @@ selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfc
     return SELFCAL_OK;
 }
 
+void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module)
+{
+    self->module = module;
+}
+
 selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
                                           selfcal_state_t state, uint32_t report_number, uint32_t time_ms)
 {
@@ -254,6 +259,30 @@ static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t coun
     return held_count(sum);
 }
 
+static uint32_t module_value(const selfcal_module_t *module, uint8_t item)
+{
+    switch (item) {
+    case SELFCAL_STATUS_RESET_CAUSE: return module->reset_cause;
+    case SELFCAL_STATUS_FAULT_ADDRESS: return module->fault_address;
+    case SELFCAL_STATUS_CLOCK: return module->clock;
+    case SELFCAL_STATUS_SENSOR_STATE: return module->sensor_state;
+    case SELFCAL_STATUS_SENSOR_FAULT: return module->sensor_fault;
+    case SELFCAL_STATUS_SENSOR_FAULT_COUNT: return module->sensor_fault_count;
+    case SELFCAL_STATUS_SENSOR_DIAGNOSIS: return module->sensor_diagnosis;
+    case SELFCAL_STATUS_SENSOR_STALE_COUNT: return module->sensor_stale_count;
+    case SELFCAL_STATUS_SENSOR_ALARM_COUNT: return module->sensor_alarm_count;
+    case SELFCAL_STATUS_SENSOR_DAMAGED_COUNT: return module->sensor_damaged_count;
+    case SELFCAL_STATUS_SENSOR_ANOMALY_COUNT: return module->sensor_anomaly_count;
+    case SELFCAL_STATUS_SENSOR_OVERRUN_COUNT: return module->sensor_overrun_count;
+    case SELFCAL_STATUS_FRAMES_DROPPED: return module->frames_dropped;
+    case SELFCAL_STATUS_BUS_OFF_COUNT: return module->bus_off_count;
+    case SELFCAL_STATUS_STATE_FOUND: return module->state_found;
+    case SELFCAL_STATUS_STATE_REFUSED: return module->state_refused;
+    case SELFCAL_STATUS_STATE_SAVES: return module->state_saves;
+    default: return module->state_save_failures; /* SELFCAL_STATUS_STATE_SAVE_FAILURES */
+    }
+}
+
 static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
 {
     const selfcal_counters_t *c = self->counters;
@@ -274,7 +303,8 @@ static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
     case SELFCAL_STATUS_NOT_FINITE_COUNT: return sum_of_axes(self, c->not_finite);
     case SELFCAL_STATUS_SATURATED_COUNT: return sum_of_axes(self, c->saturated);
     case SELFCAL_STATUS_STUCK_COUNT: return sum_of_axes(self, c->stuck);
-    default: return self->frames; /* SELFCAL_STATUS_FRAMES_SENT */
+    case SELFCAL_STATUS_FRAMES_SENT: return self->frames;
+    default: return self->module != NULL ? module_value(self->module, item) : 0U;
     }
 }
 

@@ -4,6 +4,7 @@
 #define PORT_H
 
 #include <stdbool.h>
+#include <stddef.h>
 #include <stdint.h>
 
 #include "selfcal.h"
@@ -31,5 +32,26 @@ typedef struct {
     /* Nothing to do until the next sample or until the wire has room: sleep. */
     void (*idle)(void *context);
 } port_t;
+
+/* What a module has beside; a program on a host does without. The memory for saved state is two slots in turn, so that the one before
+ * the newest is still there. */
+typedef struct {
+    void *context;
+
+    /* Fills in what the target knows: reset, clock, sensor, wire. */
+    void (*tell)(void *context, selfcal_module_t *module);
+
+    /* The newest saved state that is whole, or the one before it; NULL: there is none. */
+    const void *(*stored)(void *context, bool older, size_t *length);
+
+    /* A save: begin, put until all is put, end; false: it has failed and what was saved before stands. May block for 2 s; samples
+     * lost meanwhile are counted by the sensor's driver. */
+    bool (*save_begin)(void *context);
+    bool (*save_put)(void *context, const void *bytes, size_t count);
+    bool (*save_end)(void *context);
+
+    uint32_t save_period_ms; /* between saves, at least: bounds the wear */
+    uint64_t save_gap;       /* samples taken as missing after a restore: the age of a saved state is not known */
+} port_module_t;
 
 #endif

@@ -4,6 +4,9 @@
 
 enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
 
+/* A report takes some seconds on any wire; one that has not ended after so long never will. */
+#define REPORT_MOST_MS 60000U
+
 selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
 {
     memset(app, 0, sizeof *app);
@@ -15,6 +18,90 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
         return status;
     }
     return selfcal_telemetry_init(&app->telemetry, &selfcal_model, selfcal_model_axis_name);
+}
+
+/* The library's snapshot, where the build has it. */
+#ifdef SELFCAL_SNAPSHOT_MAX
+
+static void restore(app_t *app)
+{
+    const port_module_t *module = app->module;
+    for (int older = 0; older < 2; older++) {
+        size_t length = 0;
+        const void *bytes = module->stored(module->context, older != 0, &length);
+        if (bytes == NULL) {
+            break;
+        }
+        const selfcal_status_t status =
+            selfcal_restore(&app->bank, &selfcal_model, app->memory, sizeof app->memory, bytes, length);
+        if (status == SELFCAL_OK) {
+            (void)selfcal_skip(&app->bank, module->save_gap);
+            app->told.state_found = older == 0 ? 1U : 2U;
+            return;
+        }
+        app->told.state_refused = (uint32_t)-status;
+        app->told.state_found = 3U;
+    }
+}
+
+static bool check(const app_t *app)
+{
+    return selfcal_check(&app->bank) == SELFCAL_OK;
+}
+
+static bool write_state(const app_t *app)
+{
+    return selfcal_save(&app->bank, app->module->save_put, app->module->context) == SELFCAL_OK;
+}
+
+#else
+
+static void restore(app_t *app)
+{
+    (void)app;
+}
+
+static bool check(const app_t *app)
+{
+    (void)app;
+    return true;
+}
+
+static bool write_state(const app_t *app)
+{
+    (void)app;
+    return false;
+}
+
+#endif
+
+void app_module(app_t *app, const port_module_t *module)
+{
+    app->module = module;
+    restore(app);
+    app->saved_ms = app->port->time_ms(app->port->context);
+    selfcal_telemetry_module(&app->telemetry, &app->told);
+}
+
+bool app_healthy(const app_t *app)
+{
+    const uint32_t now = app->port->time_ms(app->port->context);
+    return !app->corrupt && (app->stage == STAGE_NONE || now - app->report_ms < REPORT_MOST_MS);
+}
+
+/* Saves when it is time to; between reports, because the bank must stand still. */
+static void save_when_due(app_t *app, uint32_t now)
+{
+    const port_module_t *module = app->module;
+    if (module == NULL || now - app->saved_ms < module->save_period_ms) {
+        return;
+    }
+    app->saved_ms = now;
+    if (module->save_begin(module->context) && write_state(app) && module->save_end(module->context)) {
+        app->told.state_saves++;
+    } else {
+        app->told.state_save_failures++;
+    }
 }
 
 static bool take_sample(app_t *app)
@@ -56,10 +143,15 @@ static bool advance(app_t *app)
     const selfcal_counters_t *counters = selfcal_counters(&app->bank);
     if (app->stage == STAGE_NONE) {
         const bool due = (int32_t)(now - app->due_ms) >= 0;
-        if (app->fresh && (due || app->ended)) {
+        save_when_due(app, now);
+        app->corrupt = app->corrupt || (due && !check(app));
+        if (app->corrupt) {
+            return false;
+        }
+        if ((app->fresh || (due && app->module != NULL)) && (due || app->ended)) {
             app->due_ms += due ? (now - app->due_ms) / app->period_ms * app->period_ms + app->period_ms : 0U;
-            app->fresh = false;
-            app->report_number++;
+            app->report_number += app->fresh ? 1U : 0U;
+            app->report_ms = now;
             app->stage = STAGE_STATUS;
         } else if (app->ended && !app->finished) {
             app->finished = true;
@@ -70,7 +162,14 @@ static bool advance(app_t *app)
         }
     }
     if (app->stage == STAGE_STATUS) {
+        if (app->module != NULL) {
+            app->module->tell(app->module->context, &app->told);
+        }
         (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_RUNNING, app->report_number, now);
+        if (!app->fresh) { /* no sample since the last report: the status alone */
+            app->stage = STAGE_END;
+        }
+        app->fresh = false;
     } else if (app->stage < STAGE_END) {
         app->begun_ms = now;
         app->computing = selfcal_report_begin(&app->work, &app->bank, (uint8_t)(app->stage - STAGE_AXES),
