@@ -1,0 +1,392 @@
+#include "adis16405.h"
+
+#include <string.h>
+
+/* Registers. */
+enum {
+    MSC_CTRL = 0x34,
+    SMPL_PRD = 0x36,
+    SENS_AVG = 0x38,
+    DIAG_STAT = 0x3C,
+    GLOB_CMD = 0x3E,
+    PRODUCT_ID = 0x56
+};
+#define WRITE 0x8000U
+#define PRODUCT 16405U
+#define GLOB_CMD_RESET 0x80U
+#define MSC_CTRL_READY 0x06U          /* data-ready on DIO1, rising */
+#define MSC_CTRL_SELF_TEST_HIGH 0x04U /* bit 10; clears itself at the end */
+#define DIAG_SELF_TEST 0xFC20U        /* channels 15 to 10, overall 5 */
+#define DIAG_FATAL (DIAG_SELF_TEST | 0x0043U) /* and flash checksum 6, supply above 5.25 V 1, below 4.75 V 0 */
+
+/* A burst word. */
+#define ND 0x8000U
+#define EA 0x4000U
+#define VALUE 0x3FFFU
+enum { FIRST_CHANNEL = 1 }; /* after the supply */
+
+/* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no motion,
+ * and with nothing to compare with what could be a negative reading is refused. */
+enum { SIGN_STEP = 4096, SIGN_UNSURE = 8192 - 6000 };
+
+enum { STUCK_SAMPLES = 512 };
+#define RESET_PULSE_US 1000U
+#define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
+#define SELF_TEST_US 200000U
+#define SILENCE_US 250000U    /* without a sample; at least 10 periods as well */
+#define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
+#define BACKOFF_MIN_US 100000U
+#define BACKOFF_MAX_US 10000000U
+enum { PROVEN_SAMPLES = 1000 };
+
+enum { STEP_PULSE, STEP_BOOT, STEP_SELF_TEST };
+
+static bool read_register(adis16405_t *self, uint8_t address, uint16_t *value)
+{
+    const adis16405_bus_t *bus = self->bus;
+    uint16_t ignored;
+    return bus->word(bus->context, (uint16_t)(address << 8), &ignored) && bus->word(bus->context, 0U, value);
+}
+
+/* Twice, and alike: a register has no checksum either. */
+static bool read_surely(adis16405_t *self, uint8_t address, uint16_t *value)
+{
+    uint16_t again;
+    return read_register(self, address, value) && read_register(self, address, &again) && *value == again;
+}
+
+static bool write_byte(adis16405_t *self, uint8_t address, uint16_t value)
+{
+    uint16_t ignored;
+    return self->bus->word(self->bus->context, (uint16_t)(WRITE | (unsigned)address << 8 | (value & 0xFFU)), &ignored);
+}
+
+static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
+{
+    uint16_t found;
+    return write_byte(self, address, value) && write_byte(self, (uint8_t)(address + 1U), (uint16_t)(value >> 8)) &&
+           read_surely(self, address, &found) && found == value;
+}
+
+static void enter(adis16405_t *self, uint8_t step, uint64_t now)
+{
+    self->state = ADIS16405_STARTING;
+    self->step = step;
+    self->step_us = now;
+}
+
+static void begin(adis16405_t *self, uint64_t now)
+{
+    (void)write_byte(self, GLOB_CMD, GLOB_CMD_RESET);
+    self->bus->reset_line(self->bus->context, true);
+    enter(self, STEP_PULSE, now);
+}
+
+static void fail(adis16405_t *self, adis16405_fault_t fault, uint64_t now)
+{
+    self->listening = false;
+    self->state = ADIS16405_FAILED;
+    self->fault = fault;
+    self->step_us = now;
+    self->counters.faults++;
+    if (self->good >= PROVEN_SAMPLES) {
+        self->backoff_us = BACKOFF_MIN_US;
+    } else {
+        self->backoff_us = self->backoff_us < BACKOFF_MAX_US / 2U ? self->backoff_us * 2U : BACKOFF_MAX_US;
+    }
+    self->good = 0;
+}
+
+bool adis16405_init(adis16405_t *self, const adis16405_bus_t *bus, const adis16405_config_t *config)
+{
+    memset(self, 0, sizeof *self);
+    self->bus = bus;
+    const float divider = 1638.4F / config->rate_hz;
+    const uint32_t n = divider >= 1.0F && divider < 129.0F ? (uint32_t)(divider + 0.5F) : 0U;
+    const float error = divider - (float)n;
+    if (n < 1U || n > 128U || error > 1e-3F * divider || error < -1e-3F * divider || config->filter_taps_ln2 > 4U) {
+        return false;
+    }
+    self->sample_period = (uint16_t)(n - 1U);
+    self->nominal_q8 = (uint32_t)(256.0F * 1e6F / 1638.4F * (float)n + 0.5F);
+    self->period_q8 = self->nominal_q8;
+    uint16_t range;
+    float gyro;
+    switch (config->range_deg_s) {
+    case 300: range = 4U; gyro = 0.05F; break;
+    case 150: range = 2U; gyro = 0.025F; break;
+    case 75: range = 1U; gyro = 0.0125F; break;
+    default: return false;
+    }
+    self->filter = (uint16_t)((unsigned)range << 8 | config->filter_taps_ln2);
+    for (size_t i = 0; i < ADIS16405_AXES; i++) {
+        self->scale[i] = i < 3U ? gyro : 3.33e-3F * 9.80665F;
+    }
+    self->backoff_us = BACKOFF_MIN_US / 2U;
+    begin(self, bus->time_us(bus->context));
+    return true;
+}
+
+/* -------------------------------------------------------------------------------------------------- interrupt handlers */
+
+static void start_burst(adis16405_t *self)
+{
+    self->reading = self->bus->burst(self->bus->context);
+    if (!self->reading) {
+        self->counters.damaged++;
+    }
+}
+
+void adis16405_ready(adis16405_t *self)
+{
+    const uint32_t now = self->bus->time_us32(self->bus->context);
+    self->ready_count++;
+    if (!self->listening) {
+        return;
+    }
+    if (self->reading) {
+        self->counters.overruns++;
+        if (now - self->stamp < 4U * (self->nominal_q8 >> 8)) {
+            return; /* else the burst has died: break it off */
+        }
+    }
+    self->stamp = now;
+    self->second = false;
+    start_burst(self);
+}
+
+/* Whether the words of the first reading are a new sample. */
+static bool fresh(adis16405_t *self, const uint16_t words[])
+{
+    uint16_t all = 0xFFFFU, any = 0;
+    for (size_t i = 0; i < ADIS16405_AXES; i++) {
+        all &= words[FIRST_CHANNEL + i];
+        any |= words[FIRST_CHANNEL + i];
+    }
+    if ((any & EA) != 0U) {
+        self->counters.alarms++;
+        self->diagnosis_wanted = true;
+        return false;
+    }
+    if ((all & ND) == 0U) {
+        self->counters.stale++;
+        return false;
+    }
+    return true;
+}
+
+void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WORDS], bool whole)
+{
+    if (!self->reading) {
+        return;
+    }
+    self->reading = false;
+    if (!self->listening) {
+        return;
+    }
+    if (!whole) {
+        self->counters.damaged++;
+        return;
+    }
+    if (!self->second) {
+        if (fresh(self, words)) {
+            memcpy(self->first_words, words, sizeof self->first_words);
+            self->second = true;
+            start_burst(self);
+        }
+        return;
+    }
+    for (size_t i = FIRST_CHANNEL; i < FIRST_CHANNEL + ADIS16405_AXES; i++) {
+        if (((words[i] ^ self->first_words[i]) & (VALUE | EA)) != 0U || (words[i] & ND) != 0U) {
+            self->counters.damaged++; /* ND again: a sample came in between, and the words may be of either */
+            return;
+        }
+    }
+    const uint32_t head = self->head;
+    if (head - self->tail == ADIS16405_QUEUE) {
+        self->counters.overruns++;
+        return;
+    }
+    self->queue[head % ADIS16405_QUEUE].stamp = self->stamp;
+    for (size_t i = 0; i < ADIS16405_AXES; i++) {
+        const uint32_t value = words[FIRST_CHANNEL + i] & VALUE;
+        self->queue[head % ADIS16405_QUEUE].raw[i] = (int16_t)((int32_t)(value ^ 0x2000U) - 0x2000);
+    }
+    self->head = head + 1U;
+}
+
+/* --------------------------------------------------------------------------------------------------------- main loop */
+
+/* Stops listening and waits for a reading under way, two bursts of 317 us at most; a burst that has died is left. */
+static void hold(adis16405_t *self)
+{
+    const uint32_t start = self->bus->time_us32(self->bus->context);
+    self->listening = false;
+    while (self->reading && self->bus->time_us32(self->bus->context) - start < 2000U) {
+    }
+    self->reading = false;
+}
+
+static void listen(adis16405_t *self)
+{
+    self->second = false;
+    self->listening = true;
+}
+
+/* Reads DIAG_STAT, which clears it; false: not readable. */
+static bool diagnose(adis16405_t *self, uint16_t *bits)
+{
+    if (!read_register(self, DIAG_STAT, bits) || *bits == 0xFFFFU) { /* floating lines */
+        return false;
+    }
+    self->diagnosis |= *bits;
+    self->diagnosis_us = self->bus->time_us(self->bus->context);
+    self->diagnosis_wanted = false;
+    return true;
+}
+
+static void start_on(adis16405_t *self, uint64_t now)
+{
+    const uint64_t passed = now - self->step_us;
+    uint16_t value;
+    switch (self->step) {
+    case STEP_PULSE:
+        if (passed >= RESET_PULSE_US) {
+            self->bus->reset_line(self->bus->context, false);
+            enter(self, STEP_BOOT, now);
+        }
+        return;
+    case STEP_BOOT:
+        if (passed < START_US) {
+            return;
+        }
+        if (!read_surely(self, PRODUCT_ID, &value) || value != PRODUCT) {
+            fail(self, ADIS16405_ABSENT, now);
+        } else if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, self->filter) ||
+                   !write_register(self, MSC_CTRL, MSC_CTRL_READY)) {
+            fail(self, ADIS16405_SET_UP, now);
+        } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
+            fail(self, ADIS16405_SELF_TEST, now);
+        } else {
+            enter(self, STEP_SELF_TEST, now);
+        }
+        return;
+    default: break;
+    }
+    if (!read_surely(self, MSC_CTRL, &value) || value != MSC_CTRL_READY) {
+        if (passed >= SELF_TEST_US) {
+            fail(self, ADIS16405_SELF_TEST, now);
+        }
+        return;
+    }
+    if (!diagnose(self, &value) || (value & DIAG_SELF_TEST) != 0U) {
+        fail(self, ADIS16405_SELF_TEST, now);
+        return;
+    }
+    if ((value & DIAG_FATAL) != 0U) {
+        fail(self, ADIS16405_STATUS, now);
+        return;
+    }
+    self->state = ADIS16405_RUNNING;
+    self->progress_us = now;
+    self->ready_seen = self->ready_count;
+    self->equal = 0;
+    self->anchored = false;
+    listen(self);
+}
+
+static void watch(adis16405_t *self, uint64_t now)
+{
+    if (self->diagnosis_wanted && now - self->diagnosis_us >= DIAGNOSIS_US) {
+        uint16_t bits;
+        hold(self);
+        const bool read = diagnose(self, &bits);
+        listen(self);
+        if (read && (bits & DIAG_FATAL) != 0U) {
+            fail(self, ADIS16405_STATUS, now);
+            return;
+        }
+    }
+    const uint64_t silence = SILENCE_US > 10U * (self->nominal_q8 >> 8) ? SILENCE_US : 10U * (self->nominal_q8 >> 8);
+    if (now - self->progress_us > silence && self->head == self->tail) {
+        /* One data-ready may come from plugging; a sensor gives one a period. */
+        fail(self, self->ready_count - self->ready_seen < 3U ? ADIS16405_SILENT : ADIS16405_NO_DATA, now);
+    } else if (self->equal >= STUCK_SAMPLES) {
+        fail(self, ADIS16405_STUCK, now);
+    }
+}
+
+void adis16405_poll(adis16405_t *self)
+{
+    const uint64_t now = self->bus->time_us(self->bus->context);
+    switch (self->state) {
+    case ADIS16405_STARTING: start_on(self, now); break;
+    case ADIS16405_RUNNING: watch(self, now); break;
+    default:
+        if (now - self->step_us >= self->backoff_us) {
+            begin(self, now);
+        }
+        break;
+    }
+}
+
+/* XGYRO_OUT less its sign bit, judged by what went before. */
+static bool sign_lost(const adis16405_t *self, int16_t x)
+{
+    return self->anchored ? x - self->last[0] >= SIGN_STEP : x >= SIGN_UNSURE;
+}
+
+/* Periods since the last sample, and the period itself tracked over samples that follow each other. */
+static uint32_t periods(adis16405_t *self, uint64_t stamp)
+{
+    const uint64_t passed_q8 = (stamp - self->last_us) << 8;
+    const uint64_t count = (passed_q8 + self->period_q8 / 2U) / self->period_q8;
+    if (count == 1U) {
+        const int32_t off = (int32_t)(passed_q8 - self->period_q8) / 64;
+        const uint32_t period = self->period_q8 + (uint32_t)off;
+        if (period > self->nominal_q8 - self->nominal_q8 / 16U && period < self->nominal_q8 + self->nominal_q8 / 16U) {
+            self->period_q8 = period;
+        }
+    }
+    return count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
+}
+
+bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing)
+{
+    while (self->tail != self->head) {
+        const uint32_t tail = self->tail;
+        int16_t raw[ADIS16405_AXES];
+        const uint64_t now = self->bus->time_us(self->bus->context);
+        const uint64_t stamp = now - (uint32_t)((uint32_t)now - self->queue[tail % ADIS16405_QUEUE].stamp);
+        for (size_t i = 0; i < ADIS16405_AXES; i++) {
+            raw[i] = self->queue[tail % ADIS16405_QUEUE].raw[i];
+        }
+        self->tail = tail + 1U;
+        if (self->state != ADIS16405_RUNNING) {
+            continue;
+        }
+        if (self->anchored && stamp - self->last_us > 10U * (self->nominal_q8 >> 8)) {
+            self->anchored = false;
+        }
+        if (sign_lost(self, raw[0])) {
+            self->counters.anomalies++;
+            continue;
+        }
+        self->equal = memcmp(raw, self->last, sizeof raw) == 0 ? self->equal + 1U : 0U;
+        memcpy(self->last, raw, sizeof raw);
+        self->anchored = true;
+        const uint32_t passed = self->counters.samples > 0U ? periods(self, stamp) : 1U;
+        *missing = passed > 0U ? passed - 1U : 0U;
+        self->last_us = stamp;
+        self->progress_us = now;
+        self->ready_seen = self->ready_count;
+        self->fault = ADIS16405_NO_FAULT;
+        self->good++;
+        self->counters.samples++;
+        for (size_t i = 0; i < ADIS16405_AXES; i++) {
+            reading[i] = (float)raw[i] * self->scale[i];
+        }
+        return true;
+    }
+    return false;
+}

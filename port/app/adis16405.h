@@ -1,0 +1,125 @@
+/* Driver of the ADIS16405 inertial sensor, without a target: SPI and time come through callbacks.
+ *
+ * The sensor raises data-ready once a sample. The driver then reads the burst twice: a burst has no checksum, but the
+ * output registers stand still until the next sample, so whatever the wires did to one reading shows as a difference
+ * between the two. A sample is delivered only if
+ *   - the first reading has ND (new data) set and EA (error/alarm) clear on all six inertial channels,
+ *   - the second one has the same 14 bits everywhere,
+ *   - XGYRO_OUT has not lost its sign bit (known anomaly of the part: a step of +2^13 LSB).
+ * Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
+ * and the sensor's own sample period, which is tracked.
+ *
+ * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the
+ * driver resets the sensor and tries again, at first after 0.1 s, then with doubled delays up to 10 s. Nothing blocks for
+ * longer than a register access, about 50 us each, 12 of them in a row at most.
+ *
+ * Registers and bits: ADIS16400/ADIS16405 data sheet, table 8 and the register tables after it. */
+#ifndef ADIS16405_H
+#define ADIS16405_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define ADIS16405_AXES 6U         /* gx gy gz ax ay az */
+#define ADIS16405_BURST_WORDS 12U /* supply, 3 gyro, 3 accel, 3 magn, temperature, aux */
+#define ADIS16405_QUEUE 1024U     /* samples that wait for the main loop: 1.25 s at 819.2 Hz. A power of two */
+
+typedef struct adis16405_bus {
+    void *context;
+    /* Time since start, us: from the main loop, and modulo 2^32 from anywhere. */
+    uint64_t (*time_us)(void *context);
+    uint32_t (*time_us32)(void *context);
+    /* One frame of 16 bits each way with chip select low around it, SPI mode 3, at most 1 MHz, then 9 us or more of rest.
+     * Bounded; false: it did not take place. */
+    bool (*word)(void *context, uint16_t out, uint16_t *in);
+    /* Begins a burst (0x3E00, then 12 words, chip select low throughout); its end is told by adis16405_burst(). Breaks off
+     * one under way. */
+    bool (*burst)(void *context);
+    /* The sensor's reset line; not needed where it is not wired, the driver also resets by command. */
+    void (*reset_line)(void *context, bool low);
+} adis16405_bus_t;
+
+typedef enum {
+    ADIS16405_STARTING, /* reset, identification, set-up, self-test */
+    ADIS16405_RUNNING,
+    ADIS16405_FAILED    /* waiting for the next try */
+} adis16405_state_t;
+
+typedef enum {
+    ADIS16405_NO_FAULT = 0,
+    ADIS16405_ABSENT = 1,    /* PRODUCT_ID is not 16405 */
+    ADIS16405_SET_UP = 2,    /* a register did not read back as written */
+    ADIS16405_SELF_TEST = 3, /* an axis failed it, or it did not end */
+    ADIS16405_SILENT = 4,    /* no data-ready */
+    ADIS16405_NO_DATA = 5,   /* data-ready, but no sample that passes the checks */
+    ADIS16405_STUCK = 6,     /* all six channels stand still */
+    ADIS16405_STATUS = 7     /* DIAG_STAT: supply out of range, flash checksum, self-test */
+} adis16405_fault_t;
+
+/* Since start. */
+typedef struct {
+    uint32_t samples;   /* delivered to the queue */
+    uint32_t stale;     /* ND not set */
+    uint32_t alarms;    /* EA set */
+    uint32_t damaged;   /* the two readings differ, or a burst failed */
+    uint32_t anomalies; /* lost sign bit of XGYRO_OUT */
+    uint32_t overruns;  /* data-ready with a reading under way, or no room in the queue */
+    uint32_t faults;    /* times the fault state was entered */
+} adis16405_counters_t;
+
+typedef struct {
+    float rate_hz;           /* 1638.4 / n, n = 1 .. 128 */
+    uint16_t range_deg_s;    /* 300, 150 or 75 */
+    uint8_t filter_taps_ln2; /* Bartlett filter of 2^m taps, 0 to 4 */
+} adis16405_config_t;
+
+/* Private; declared here so that the caller can place it. */
+typedef struct {
+    const adis16405_bus_t *bus;
+    uint16_t sample_period, filter; /* SMPL_PRD, SENS_AVG */
+    uint32_t nominal_q8, period_q8; /* sample period, us / 256 */
+    float scale[ADIS16405_AXES];
+    adis16405_state_t state;
+    adis16405_fault_t fault;
+    uint8_t step;
+    uint64_t step_us;      /* when the step of the start was entered, or the fault state */
+    uint32_t backoff_us;
+    uint16_t diagnosis;    /* every bit of DIAG_STAT seen so far */
+    bool diagnosis_wanted;
+    uint64_t diagnosis_us; /* when it was read last */
+    /* main loop, of the samples */
+    uint64_t last_us;      /* stamp of the last sample delivered */
+    bool anchored;
+    int16_t last[ADIS16405_AXES];
+    uint32_t equal;
+    uint32_t good;         /* samples since the start of this run */
+    uint64_t progress_us;  /* when a sample was delivered last, or the run began */
+    uint32_t ready_seen;
+    /* shared with the interrupt handlers */
+    volatile bool listening, reading;
+    volatile uint32_t stamp;
+    volatile uint32_t ready_count;
+    bool second;
+    uint16_t first_words[ADIS16405_BURST_WORDS];
+    volatile uint32_t head, tail; /* count up for ever */
+    volatile struct {
+        uint32_t stamp;
+        int16_t raw[ADIS16405_AXES];
+    } queue[ADIS16405_QUEUE];
+    adis16405_counters_t counters;
+} adis16405_t;
+
+/* Begins to start the sensor. False: the configuration has no setting of the sensor. */
+bool adis16405_init(adis16405_t *self, const adis16405_bus_t *bus, const adis16405_config_t *config);
+
+/* From the data-ready interrupt, and at the end of a burst (`whole`: it went through). Equal priorities, please. */
+void adis16405_ready(adis16405_t *self);
+void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WORDS], bool whole);
+
+/* From the main loop, every few ms at least: goes on with the start, watches, tries again. */
+void adis16405_poll(adis16405_t *self);
+
+/* The oldest waiting sample, deg/s and m/s^2, and the samples missing before it; false: none is waiting. */
+bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing);
+
+#endif

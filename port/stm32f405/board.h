@@ -1,0 +1,127 @@
+/* What the parts of this target give each other. Pins: GUIDE.md, "The module". */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "selfcal.h"
+
+/* --------------------------------------------------------------------------------------------------------- start-up */
+
+typedef struct {
+    uint32_t vector; /* exception number: 3 HardFault, 16 + n interrupt n */
+    uint32_t pc, lr; /* where; 0 if the stack was gone */
+    uint32_t cfsr;   /* SCB_CFSR, PM0214 4.4.14 */
+} board_fault_t;
+
+/* The fault that ended the last run, once; false: there was none. */
+bool board_last_fault(board_fault_t *fault);
+
+void board_reset(void);
+
+/* ------------------------------------------------------------------------------------------------------------ clock */
+
+typedef struct {
+    uint32_t hclk_hz, pclk1_hz, pclk2_hz;
+    uint32_t tim2_hz;
+    bool crystal; /* false: HSE did not start, and the internal oscillator (1 %) serves: too coarse for CAN at 500 kbit/s and more */
+} board_clock_t;
+
+extern board_clock_t board_clock;
+
+/* 168 MHz from the 8 MHz crystal, from HSI if that does not start, HSI itself if the PLL does not lock; never waits
+ * longer than about 20 ms. */
+void clock_init(void);
+
+/* Time since start. The second is for interrupt handlers, modulo 2^32. */
+uint32_t clock_ms(void);
+uint64_t clock_us(void);
+uint32_t clock_us32(void);
+
+/* At least this long, at most twice. */
+void clock_spin_us(uint32_t us);
+
+void systick_handler(void);
+
+/* ----------------------------------------------------------------------------------------------------------- sensor */
+
+struct adis16405_bus;
+void spi_init(void);
+bool spi_word(void *context, uint16_t out, uint16_t *in);
+bool spi_burst(void *context);
+void spi_reset_line(void *context, bool low);
+void sensor_ready_handler(void);
+void sensor_burst_handler(void);
+
+/* In main.c: what the handlers hand on. */
+void board_sensor_ready(void);
+void board_sensor_burst(const uint16_t words[12], bool whole);
+
+/* ------------------------------------------------------------------------------------------------------------- wire */
+
+/* Either CAN or SLCAN on the USART, chosen at build time: BOARD_CAN_KBITPS, 125 to 1000, or 0 for the USART. */
+#ifndef BOARD_CAN_KBITPS
+#define BOARD_CAN_KBITPS 500
+#endif
+#ifndef BOARD_USART_BAUD
+#define BOARD_USART_BAUD 115200
+#endif
+
+typedef struct {
+    uint32_t dropped;  /* frames taken from the application and not sent */
+    uint32_t bus_offs; /* CAN: times the controller left the bus; USART: bytes lost on reception */
+} wire_counters_t;
+
+/* False: the bit rate cannot be made exactly from this clock, or the controller does not answer. Then nothing is sent. */
+bool can_init(uint32_t bit_per_s);
+bool can_send(const selfcal_frame_t *frame);
+void can_counters(wire_counters_t *counters);
+void can_tx_handler(void);
+void can_error_handler(void);
+
+/* Value of CAN_BTR for a bit rate, exact, with the sample point nearest to 87.5 %; 0: there is none. */
+uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s);
+
+void usart_init(uint32_t baud);
+bool usart_send(const selfcal_frame_t *frame);
+void usart_poll(void); /* takes what the host said */
+void usart_counters(wire_counters_t *counters);
+void usart_handler(void);
+
+/* --------------------------------------------------------------------------------------------- watchdog, reset cause */
+
+typedef enum {
+    RESET_UNKNOWN = 0,
+    RESET_POWER_ON = 1,  /* power, or brown-out */
+    RESET_PIN = 2,
+    RESET_SOFTWARE = 3,
+    RESET_WATCHDOG = 4,
+    RESET_FAULT = 5,     /* software reset after a recorded fault */
+    RESET_LOW_POWER = 6
+} reset_cause_t;
+
+/* Reads and clears the reset flags. */
+reset_cause_t watchdog_reset_cause(void);
+
+/* 8 s by the nominal LSI, 5.4 s at its fastest (47 kHz): longer than the longest erase of a flash sector. */
+void watchdog_start(void);
+void watchdog_feed(void);
+
+/* ------------------------------------------------------------------------------------------------------------ flash */
+
+/* Largest state a slot keeps, bytes. */
+#define FLASH_SLOT_BYTES (128U * 1024U - 32U)
+
+/* The newest whole state, or NULL; `older`: the one before it, if that is whole too. */
+const void *flash_newest(bool older, size_t *length, uint32_t *sequence);
+
+/* A save: begin erases the slot that is not the newest (1 s, 2 s at most, during which the processor stands still), put
+ * appends, end writes the header. Until the header's last word is written the newest state stays what it was. False: the
+ * flash refused or did not read back; the save is void. */
+bool flash_begin(void);
+bool flash_put(void *context, const void *bytes, size_t count);
+bool flash_end(void);
+
+#endif

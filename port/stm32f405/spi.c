@@ -1,0 +1,130 @@
+/* ADIS16405 on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. Registers one
+ * frame at a time and polled; bursts by DMA2 (RM0090 table 43: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+#include "board.h"
+#include "stm32f405.h"
+
+enum { CS_PIN = 4, READY_PIN = 0, RESET_PIN_NUMBER = 1, BURST_WORDS = 13, SCK_MAX_HZ = 1000000 };
+enum { STALL_US = 10 }; /* between frames: the data sheet asks for 9 */
+enum { RX_STREAM = 0, TX_STREAM = 3, CHANNEL = 3 };
+
+static const uint16_t burst_out[BURST_WORDS] = {0x3E00};
+static volatile uint16_t burst_in[BURST_WORDS];
+
+static void select_sensor(bool on)
+{
+    GPIO_BSRR(GPIOA) = on ? BIT(CS_PIN + 16) : BIT(CS_PIN);
+}
+
+void spi_reset_line(void *context, bool low)
+{
+    (void)context;
+    GPIO_BSRR(GPIOB) = low ? BIT(RESET_PIN_NUMBER + 16) : BIT(RESET_PIN_NUMBER);
+}
+
+void spi_init(void)
+{
+    RCC_AHB1ENR |= RCC_AHB1ENR_GPIOA | RCC_AHB1ENR_GPIOB | RCC_AHB1ENR_DMA2;
+    RCC_APB2ENR |= RCC_APB2ENR_SPI1 | RCC_APB2ENR_SYSCFG;
+    (void)RCC_APB2ENR;
+
+    select_sensor(false);
+    spi_reset_line(NULL, false);
+    /* PA5 to PA7 alternate function 5; PA4 and PB1 outputs; PB0 an input, pulled down: a missing sensor gives no edges. */
+    GPIO_AFR(GPIOA, 5U) = (GPIO_AFR(GPIOA, 5U) & ~0xFFF00000U) | 0x55500000U;
+    GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~(0xFFU << 8)) | 0xA9U << 8;
+    GPIO_OSPEEDR(GPIOA) |= 0x55U << 8;
+    GPIO_MODER(GPIOB) = (GPIO_MODER(GPIOB) & ~0xFU) | 0x4U;
+    GPIO_PUPDR(GPIOB) = (GPIO_PUPDR(GPIOB) & ~0x3U) | 0x2U;
+
+    uint32_t rate = 0; /* PCLK2 / 2^(rate + 1) */
+    while (rate < 7U && board_clock.pclk2_hz >> (rate + 1U) > SCK_MAX_HZ) {
+        rate++;
+    }
+    SPI1_CR1 = SPI_CR1_CPHA | SPI_CR1_CPOL | SPI_CR1_MSTR | rate << SPI_CR1_BR_POS | SPI_CR1_SSI | SPI_CR1_SSM | SPI_CR1_DFF16;
+    SPI1_CR1 |= SPI_CR1_SPE;
+
+    SYSCFG_EXTICR1 = (SYSCFG_EXTICR1 & ~0xFU) | 1U; /* EXTI0 is PB0 */
+    EXTI_RTSR |= BIT(READY_PIN);
+    EXTI_PR = BIT(READY_PIN);
+    EXTI_IMR |= BIT(READY_PIN);
+    irq_enable(IRQ_EXTI0);
+    irq_enable(IRQ_DMA2_STREAM0);
+}
+
+/* A frame at 656 kHz takes 24 us. */
+static bool await_status(uint32_t mask, uint32_t value)
+{
+    const uint32_t start = clock_us32();
+    while ((SPI1_SR & mask) != value) {
+        if (clock_us32() - start > 200U) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool spi_word(void *context, uint16_t out, uint16_t *in)
+{
+    (void)context;
+    SPI1_CR2 = 0U;
+    (void)SPI1_DR;
+    select_sensor(true);
+    SPI1_DR = out;
+    const bool done = await_status(SPI_SR_RXNE, SPI_SR_RXNE) && await_status(SPI_SR_BSY, 0U);
+    *in = (uint16_t)SPI1_DR;
+    select_sensor(false);
+    clock_spin_us(STALL_US);
+    return done;
+}
+
+static void stop_dma(void)
+{
+    SPI1_CR2 = 0U;
+    DMA_SCR(RX_STREAM) = 0U;
+    DMA_SCR(TX_STREAM) = 0U;
+    for (uint32_t turn = 0; turn < 100U && ((DMA_SCR(RX_STREAM) | DMA_SCR(TX_STREAM)) & DMA_SCR_EN) != 0U; turn++) {
+    } /* section 10.3.17: a stream ends its transfer under way first */
+    DMA_LIFCR = DMA_LISR_STREAM0 | DMA_LISR_STREAM3;
+}
+
+bool spi_burst(void *context)
+{
+    (void)context;
+    stop_dma();
+    select_sensor(false); /* a burst that never ended is broken off */
+    (void)SPI1_DR;
+    DMA_SPAR(RX_STREAM) = SPI1_DR_ADDRESS;
+    DMA_SM0AR(RX_STREAM) = (uint32_t)(uintptr_t)burst_in;
+    DMA_SNDTR(RX_STREAM) = BURST_WORDS;
+    DMA_SPAR(TX_STREAM) = SPI1_DR_ADDRESS;
+    DMA_SM0AR(TX_STREAM) = (uint32_t)(uintptr_t)burst_out;
+    DMA_SNDTR(TX_STREAM) = BURST_WORDS;
+    const uint32_t common =
+        (uint32_t)CHANNEL << DMA_SCR_CHSEL_POS | DMA_SCR_PL_HIGH | DMA_SCR_MSIZE_16 | DMA_SCR_PSIZE_16 | DMA_SCR_MINC;
+    select_sensor(true);
+    SPI1_CR2 = SPI_CR2_RXDMAEN; /* order of section 28.3.9 */
+    DMA_SCR(RX_STREAM) = common | DMA_SCR_TCIE | DMA_SCR_TEIE | DMA_SCR_EN;
+    DMA_SCR(TX_STREAM) = common | DMA_SCR_TO_PERIPHERAL | DMA_SCR_EN;
+    SPI1_CR2 = SPI_CR2_RXDMAEN | SPI_CR2_TXDMAEN;
+    return true;
+}
+
+void sensor_ready_handler(void)
+{
+    EXTI_PR = BIT(READY_PIN);
+    board_sensor_ready();
+}
+
+void sensor_burst_handler(void)
+{
+    const uint32_t flags = DMA_LISR;
+    const bool whole = (flags & DMA_LISR_TCIF0) != 0U && (flags & DMA_LISR_TEIF0) == 0U && await_status(SPI_SR_BSY, 0U);
+    stop_dma();
+    select_sensor(false);
+    clock_spin_us(STALL_US);
+    uint16_t words[BURST_WORDS - 1];
+    for (size_t i = 0; i < BURST_WORDS - 1; i++) {
+        words[i] = burst_in[i + 1];
+    }
+    board_sensor_burst(words, whole);
+}
