@@ -2,6 +2,7 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
+#   make emulate                20 minutes of six axes through the emulated firmware
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
@@ -12,8 +13,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 RECORDING ?= tests/data/simulated_adis16405.npz
 
+include port/arm.mk
+
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix test c-tests check clean
+.PHONY: all setup system python run posix test soak emulate c-tests check clean
 
 all: setup
 
@@ -64,7 +67,7 @@ posix: $(MODEL)/selfcal_model.c
 # -------------------------------------------------------------------------------------------------------------- tests
 
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
-INCLUDES := -Ilib -Iport -Iport/app -I$(MODEL)
+INCLUDES := -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL)
 TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
@@ -75,6 +78,9 @@ test: setup
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
+
+emulate: setup
+	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED)
 
@@ -100,8 +106,6 @@ $(eval $(call C_TESTS,sanitized))
 BENCH := $(BUILD)/bench
 BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
-ARM_cortex-m4f := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
-ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
 
@@ -141,7 +145,7 @@ CHECKS := check-gcc check-clang check-arm check-c++ check-tidy check-tokens chec
 check: setup
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
 
-C_ALL := $(filter-out port/stm32f405/%,$(wildcard lib/*.c port/*/*.c)) $(MODEL)/selfcal_model.c
+C_ALL := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/posix/*.c) $(MODEL)/selfcal_model.c
 # each COMPILER+FLAGS,FILES: every file by itself, so that every complaint is seen
 each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$failed
 
@@ -152,18 +156,27 @@ check-gcc: $(MODEL)/selfcal_model.c
 check-clang: $(MODEL)/selfcal_model.c
 	$(call each,clang -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
 
-# The library as a Cortex-M4F and a Cortex-M0 get it.
-ARM := arm-none-eabi-gcc -std=c99 -O2 $(WARNINGS) -Ilib -c -o /dev/null
+# Firmware that is for one core alone. A folder that the emulators share is compiled for both.
+EMBEDDED_cortex-m4f := $(wildcard port/qemu/*.c port/stm32f405/*.c)
+EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
+
+# What a Cortex-M4F and a Cortex-M0 get.
 check-arm: $(MODEL)/selfcal_model.c
-	$(call each,$(ARM) $(ARM_cortex-m4f),$(wildcard lib/*.c))
-	$(call each,$(ARM) $(ARM_cortex-m0),$(wildcard lib/*.c))
-	$(call each,$(ARM) $(ARM_cortex-m4f) -Iport -Iport/app -I$(MODEL),$(wildcard port/app/*.c port/stm32f405/*.c))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES) -DQEMU_MICROBIT -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m0))
 
 check-c++:
 	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
 
+# The compiler's own headers do not know newlib's; integers stand for addresses in firmware.
+TIDY := clang-tidy --quiet
+TIDY_ARM := --checks=-performance-no-int-to-ptr
+TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h"))
+tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 check-tidy: $(MODEL)/selfcal_model.c
-	@clang-tidy --quiet $(wildcard lib/*.c port/*/*.c) -- -std=c99 $(INCLUDES) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
+	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
+	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
+	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
 
 # lib/ has no heap, no I/O and no double but selfcal_wide_t. Comments do not count.
 BANNED := (malloc|calloc|realloc|free|alloca|[a-z]*printf|puts|putchar|fopen|exit|abort)[[:space:]]*\(

@@ -825,7 +825,8 @@ static void step_bias(selfcal_work_t *work) {
         selfcal_node_view_t v;
         selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
         const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
-        const selfcal_wide_t now = v.drift + (v.b - offset * prior_precision) * variance * v.bias_left;
+        const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
+        const selfcal_wide_t now = v.drift + x0 * v.bias_left;
         if (begins && k == 0U) {
             work->bias_about = now;
         }
@@ -834,6 +835,17 @@ static void step_bias(selfcal_work_t *work) {
         work->bias_first += weighed;
         work->bias_second += weighed * off;
         work->bias_own += (selfcal_wide_t)work->values[1][k] * (v.drift_var + v.bias_left * v.bias_left * variance);
+        if (v.law == SELFCAL_GAUSS_MARKOV) {
+            /* As the drift decays by 1 - psi, the mean goes to now - psi (now - x0) and the node's own variance to
+             * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
+            selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
+            const selfcal_wide_t fall = now - x0, lost = 1.0 - v.bias_left, own = (selfcal_wide_t)work->values[1][k] * best_sq;
+            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->values[0][k] * fall;
+            const selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
+            decay[0] += weighed_fall;
+            decay[1] += 2.0 * (own * (stationary - v.drift_var + v.bias_left * lost * variance) - weighed_fall * off);
+            decay[2] += own * (v.drift_var + lost * lost * variance - stationary) + weighed_fall * fall;
+        }
     }
     work->bias_scale = best_sq;
 }
@@ -844,6 +856,13 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     const selfcal_wide_t own = work->bias_own * work->bias_scale / work->mass;
     posterior->bias_mean = (float)(work->bias_about + mean + selfcal_offset(work->bank, work->axis));
     posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
+    for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
+        const selfcal_wide_t *decay = work->bias_decay[j];
+        posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
+        posterior->decay[j].mean = (float)(decay[0] / work->bias_weight);
+        posterior->decay[j].var[0] = (float)((decay[1] + 2.0 * mean * decay[0]) / work->bias_weight);
+        posterior->decay[j].var[1] = (float)(decay[2] / work->bias_weight);
+    }
 }
 
 static selfcal_wide_t ln_prior_density(const selfcal_prior_t *prior) {
@@ -1053,6 +1072,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     case WEIGHTS_SQ:
         cardinal_weights(work, work->weight_sq, work->values[1]);
         work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
+        memset(work->bias_decay, 0, sizeof work->bias_decay);
         go_to(work, BIAS);
         break;
     case BIAS:

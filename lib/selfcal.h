@@ -377,11 +377,20 @@ typedef struct {
     uint8_t flags;
 } selfcal_estimate_t;
 
+/* What a decaying drift does to the bias, for selfcal_predict(): with psi = 1 - e^(-alpha t) of each alpha node, t after the
+ * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var[0] + psi^2 var[1]) - f^2. */
+typedef struct {
+    float alpha; /* 1/s */
+    float mean;
+    float var[2];
+} selfcal_decay_t;
+
 typedef struct {
     float probability;
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now, under this hypothesis, unit */
+    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov: of each alpha node; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {
@@ -433,6 +442,7 @@ typedef struct {
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
+    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][3];                  /* sums of selfcal_decay_t over the nodes of each alpha */
 } selfcal_work_t;
 
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. */
@@ -445,6 +455,14 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
 
 /* All steps in a row. */
 selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
+
+/* The bias of the report's axis `elapsed_s` after the last bank interval (missing ones told by selfcal_skip() included) that the
+ * report rests on, and its standard deviation, mixed over the hypotheses; both in the axis's unit. A reading less `bias` is the
+ * corrected reading, at rest or moving. Under the constant law the bias stays; under the random walk its variance grows by
+ * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2: exact moments of the
+ * mixture over the nodes and sigma_v, as far as the report's own are. `model` is the bank's.
+ * SELFCAL_BAD_ARGUMENT: null pointer, elapsed_s negative or not finite. O(alpha nodes). */
+selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd);
 
 /* ------------------------------------------------------------------------------------------------------------- gate
  * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both); gate.c

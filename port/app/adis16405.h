@@ -22,7 +22,11 @@
 
 #define ADIS16405_AXES 6U         /* gx gy gz ax ay az */
 #define ADIS16405_BURST_WORDS 12U /* supply, 3 gyro, 3 accel, 3 magn, temperature, aux */
-#define ADIS16405_QUEUE 1024U     /* samples that wait for the main loop: 1.25 s at 819.2 Hz. A power of two */
+
+/* Samples that wait for the main loop: 1.25 s at 819.2 Hz. A power of two; 16 bytes each. */
+#ifndef ADIS16405_QUEUE
+#define ADIS16405_QUEUE 1024U
+#endif
 
 typedef struct adis16405_bus {
     void *context;

@@ -6,8 +6,8 @@
  * channel is closed), and ends when the host closes the channel after the last frame. Exit code: 0; 1 if the host went
  * away or never came; 2 for bad arguments or a bad recording.
  *
- * RECORDING, little-endian: "SELFCAL1", uint32 axes, uint32 0, float64 rate (Hz), uint64 rows; then each row: uint32
- * samples missing just before it, float32 reading of each axis. Axes and units are those of the model built in. */
+ * RECORDING: see port/replay/replay.h.
+ */
 #define _POSIX_C_SOURCE 200112L
 
 #include <errno.h>
@@ -19,16 +19,13 @@
 
 #include "app.h"
 #include "pty.h"
+#include "replay.h"
 
-enum { HEADER_BYTES = 32, ROW_BYTES = 4 + 4 * SELFCAL_MODEL_AXES, ROWS_BETWEEN_POLLS = 1024 };
+enum { ROWS_BETWEEN_POLLS = 1024 };
 
 typedef struct {
     FILE *file;
-    double rate_hz;
-    uint64_t rows;    /* still to read */
-    uint64_t passed;  /* samples since the start of the recording, missing ones too: its clock */
-    bool waiting;     /* `row` is read and due */
-    unsigned char row[ROW_BYTES];
+    replay_t replay;
     double speed;     /* times real time; 0: as fast as it goes */
     struct timespec start; /* when the channel was opened, and what had passed then */
     uint64_t passed_at_start;
@@ -37,35 +34,22 @@ typedef struct {
     pty_t pty;
 } host_t;
 
-static uint32_t little32(const unsigned char *bytes)
+static bool host_read(void *context, void *bytes, size_t count)
 {
-    return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
-}
-
-static uint64_t little64(const unsigned char *bytes)
-{
-    return little32(bytes) | (uint64_t)little32(bytes + 4) << 32;
+    const host_t *host = context;
+    return fread(bytes, count, 1, host->file) == 1;
 }
 
 static uint32_t host_time_ms(void *context)
 {
     const host_t *host = context;
-    return (uint32_t)(uint64_t)((double)host->passed * 1000.0 / host->rate_hz);
+    return host->replay.time_ms;
 }
 
 static port_sample_t host_sample(void *context, float reading[], uint32_t *missing)
 {
     host_t *host = context;
-    if (!host->waiting) {
-        return host->rows == 0 ? PORT_END : PORT_EMPTY;
-    }
-    host->waiting = false;
-    *missing = little32(host->row);
-    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        const uint32_t bits = little32(host->row + 4 + 4 * axis);
-        memcpy(&reading[axis], &bits, sizeof bits);
-    }
-    return PORT_SAMPLE;
+    return replay_sample(&host->replay, reading, missing);
 }
 
 static bool host_send(void *context, const selfcal_frame_t *frame)
@@ -81,7 +65,7 @@ static int wall_wait_ms(const host_t *host)
     struct timespec now;
     (void)clock_gettime(CLOCK_MONOTONIC, &now);
     const double wall = (double)(now.tv_sec - host->start.tv_sec) + 1e-9 * (double)(now.tv_nsec - host->start.tv_nsec);
-    const double wait = (double)(host->passed - host->passed_at_start) / host->rate_hz / host->speed - wall;
+    const double wait = (double)(host->replay.passed - host->passed_at_start) / host->replay.rate_hz / host->speed - wall;
     return wait > 0.0 ? (int)ceil(fmin(wait, 1.0) * 1000.0) : 0;
 }
 
@@ -94,16 +78,10 @@ static void host_idle(void *context)
         pty_flush(&host->pty);
         (void)pty_receive(&host->pty, 0);
     }
-    if (!host->pty.slcan.open || host->rows == 0) {
+    if (!host->pty.slcan.open || host->replay.rows == 0) {
         return;
     }
-    if (fread(host->row, ROW_BYTES, 1, host->file) != 1) {
-        host->error = "the recording is shorter than it says";
-        return;
-    }
-    host->rows--;
-    host->passed += (uint64_t)little32(host->row) + 1U;
-    host->waiting = true;
+    host->error = replay_next(&host->replay);
     if (host->speed > 0.0) {
         for (int wait = wall_wait_ms(host); wait > 0 && host->pty.error == NULL; wait = wall_wait_ms(host)) {
             (void)pty_receive(&host->pty, wait);
@@ -113,25 +91,13 @@ static void host_idle(void *context)
 
 static const char *open_recording(host_t *host, const char *path)
 {
-    unsigned char header[HEADER_BYTES];
     host->file = fopen(path, "rb");
     if (host->file == NULL) {
         return strerror(errno);
     }
-    if (fread(header, sizeof header, 1, host->file) != 1 || memcmp(header, "SELFCAL1", 8) != 0) {
-        return "not a recording for this program";
-    }
-    if (little32(header + 8) != SELFCAL_MODEL_AXES) {
-        return "its axes are not those of the model built in";
-    }
-    const uint64_t rate = little64(header + 16);
-    memcpy(&host->rate_hz, &rate, sizeof rate);
-    if (!(host->rate_hz > 0.0) ||
-        fabs((double)selfcal_model.dt_s * host->rate_hz / (double)selfcal_model.block - 1.0) > 1e-5) {
-        return "its rate is not that of the model built in";
-    }
-    host->rows = little64(header + 24);
-    return NULL;
+    host->replay.read = host_read;
+    host->replay.context = host;
+    return replay_open(&host->replay);
 }
 
 /* Waits until the channel is open, or closed; false if the host went away or let the timeout pass. */
@@ -142,7 +108,7 @@ static bool await_channel(host_t *host, bool open)
             host->pty.error = open ? "the host did not open the channel" : "the host did not close the channel";
         } else if (host->pty.slcan.open) {
             (void)clock_gettime(CLOCK_MONOTONIC, &host->start);
-            host->passed_at_start = host->passed;
+            host->passed_at_start = host->replay.passed;
         }
     }
     return host->pty.error == NULL;

@@ -2,13 +2,13 @@
 # MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen`); makes OUT/selfcal-posix.
 
 POSIX_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion
-POSIX_SOURCES := $(wildcard lib/*.c port/app/*.c port/posix/*.c)
-POSIX_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/posix/*.h)
+POSIX_SOURCES := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/posix/*.c)
+POSIX_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/posix/*.h)
 
 .PHONY: posix
 posix: $(OUT)/selfcal-posix
 
 $(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h
 	@mkdir -p $(OUT)
-	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) $(POSIX_CFLAGS) -Ilib -Iport -Iport/app -I$(MODEL_DIR) \
+	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) $(POSIX_CFLAGS) -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
 	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm

@@ -64,6 +64,11 @@ static void bad_arguments_change_nothing(void) {
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_node(&bank, 0, model.nodes, &view));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_log_likelihood(&bank, 0, 0, 0.0, &ln_p));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_log_likelihood(&bank, 0, 0, -1.0, &ln_p));
+    float bias, sd;
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_predict(NULL, &model, 1.0F, &bias, &sd));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_predict(&report, NULL, 1.0F, &bias, &sd));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_predict(&report, &model, 1.0F, NULL, &sd));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_predict(&report, &model, 1.0F, &bias, NULL));
     TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
 }
 

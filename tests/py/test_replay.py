@@ -148,7 +148,6 @@ def assert_one_line(done: subprocess.CompletedProcess[str], complaint: str) -> N
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--target", "cortex-m4f"], "--target cortex-m4f: this build has the target host only"),
         (["--transport", "can"], "--transport can: this build has the transport slcan only"),
         (["--report-every", "0"], "--report-every"),
         (["--axis", "temp"], "no axis 'temp'"),
@@ -221,7 +220,7 @@ def read_until(line: int, end: bytes, seconds: float = 20.0) -> bytes:
 
 
 def test_rows_written_are_rows_expected(tmp_path: Path) -> None:
-    """The layout in the comment of port/posix/main.c, packed here by struct."""
+    """The layout in the comment of port/replay/replay.h, packed here by struct."""
     path = tmp_path / "two.csv"
     path.write_text("t[s],gx[rad/s]\n0,1.0\n0.1,2.0\n0.2,2.0\n0.5,3.0\n")
     write_rows(load(path, rate=10.0), Model.load(), ("gx",), tmp_path / "rows.bin")

@@ -118,6 +118,16 @@ public:
         return out;
     }
 
+    // (bias, sd) at each time after the last bank interval, s.
+    std::vector<std::tuple<float, float>> predict(uint8_t axis, const std::vector<float> &elapsed_s) {
+        selfcal_report_t r{};
+        check(selfcal_report(work_.get(), &bank_, axis, &r));
+        std::vector<std::tuple<float, float>> found(elapsed_s.size());
+        for (size_t k = 0; k < found.size(); k++)
+            check(selfcal_predict(&r, &model_, elapsed_s[k], &std::get<0>(found[k]), &std::get<1>(found[k])));
+        return found;
+    }
+
     nb::dict node(uint8_t axis, uint16_t index) {
         selfcal_node_view_t v{};
         check(selfcal_node(&bank_, axis, index, &v));
@@ -280,6 +290,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def("rate", &Bank::rate)
         .def("retired", &Bank::retired)
         .def("report", &Bank::report)
+        .def("predict", &Bank::predict)
         .def("node", &Bank::node)
         .def("log_likelihood", &Bank::log_likelihood)
         .def("counters", &Bank::counters)

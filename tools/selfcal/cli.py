@@ -150,10 +150,10 @@ def replay(
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
-    target: Annotated[Target, typer.Option(help="Where the firmware runs")] = Target.host,
+    target: Annotated[Target, typer.Option(help="Where the firmware runs: here, or in QEMU")] = Target.host,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
     report_every: Annotated[
-        float | None, typer.Option(metavar="S", help="Seconds between reports; default: a hundredth of the recording")
+        float | None, typer.Option(metavar="S", help="Seconds between reports; default: 100 in all, fewer in QEMU")
     ] = None,
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,

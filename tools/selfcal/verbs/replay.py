@@ -6,9 +6,12 @@ import fcntl
 import hashlib
 import math
 import shutil
+import socket
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +29,32 @@ from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document
 from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
-REPORTS = 100  # of each axis in a run, unless --report-every says otherwise
-TIMEOUT_S = 60.0  # without a frame
+TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
+#: s without a frame from an emulated module: its reports are slow, and so may the machine be.
+EMULATED_TIMEOUT_S = 600.0
 PLOT_FORMATS = (".png", ".pdf", ".svg", ".jpg")
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where the firmware runs: its `make` file's name, what is made, QEMU's board, and reports of each axis in a run.
+
+    `reports` holds unless --report-every says otherwise; an emulated core takes seconds over each.
+    """
+
+    make: str
+    image: str
+    reports: int
+    board: tuple[str, ...] = ()
+
+
+TARGETS = {
+    "host": Target("posix", "selfcal-posix", 100),
+    "cortex-m4f": Target("qemu", "selfcal-qemu.elf", 10, ("netduinoplus2",)),
+    # The nRF51822 with 32 KB of RAM: six axes do not fit the 16 KB of the board's own.
+    "cortex-m0": Target("qemu", "selfcal-qemu.elf", 1, ("microbit", "-global", "nrf51-soc.sram-size=0x8000")),
+}
 
 
 def replay(
@@ -49,12 +74,13 @@ def replay(
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
-    The firmware is built for the model and the recording's rate if it is not there yet. `report_every`: seconds of the
-    recording between reports (default: a hundredth of it). `plot`: file for the picture of the run. Numbers are in the
-    recording's units. Raises UserError for what the user can put right.
+    The firmware is built for the model and the recording's rate if it is not there yet. `target`: this machine, or a
+    processor emulated by QEMU. `report_every`: seconds of the recording between reports (default: a hundredth of it on
+    the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `plot`: file for the picture of the run. Numbers
+    are in the recording's units. Raises UserError for what the user can put right.
     """
-    if target != "host":
-        raise UserError(f"--target {target}: this build has the target host only")
+    if target not in TARGETS:
+        raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
     if transport != "slcan":
         raise UserError(f"--transport {transport}: this build has the transport slcan only")
     if report_every is not None and not (math.isfinite(report_every) and report_every >= 0.001):
@@ -73,8 +99,8 @@ def replay(
                 f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
                 f"{axis_unit(name)}, so the model must be in that unit"
             )
-    firmware = build(loaded_model, recording.rate_hz, names)
-    history = run(firmware, recording, loaded_model, names, report_every)
+    firmware = build(loaded_model, recording.rate_hz, names, target)
+    history = run(firmware, recording, loaded_model, names, report_every, target)
     document = _document(recording, loaded_model, names, history)
     if json is not None:
         write_json(document, json)
@@ -86,32 +112,40 @@ def replay(
     return document
 
 
-def build(model: Model, rate_hz: float, axes: Sequence[str]) -> Path:
-    """The host firmware for a model, a sampling rate and a choice of axes; made anew only if something has changed."""
+def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host", nodes: str | None = None) -> Path:
+    """The firmware of a target for a model, a sampling rate and a choice of axes; made anew only if something changed.
+
+    `nodes`: whose node counts it gets (default: the target's own).
+    """
+    core = nodes or target
+    made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         made = Path(name)
-        codegen(model.path, made, rate=rate_hz, axes=axes)
+        codegen(model.path, made, target=core, rate=rate_hz, axes=axes)
         digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(made.iterdir()))).hexdigest()[:12]
-        folder = ROOT / "build" / "posix" / digest
+        folder = ROOT / "build" / made_by.make / (digest if target == "host" else f"{target}-{digest}")
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             for file in made.iterdir():
                 if not (folder / file.name).exists():
                     shutil.copy(file, folder)
-            command = ["make", "-s", "-f", "port/posix/posix.mk", "posix", f"MODEL_DIR={folder}", f"OUT={folder}"]
+            makefile = f"port/{made_by.make}/{made_by.make}.mk"
+            command = ["make", "-s", "-f", makefile, made_by.make, f"MODEL_DIR={folder}", f"OUT={folder}"]
             try:
-                done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+                done = subprocess.run(
+                    [*command, f"CORE={target}"], cwd=ROOT, capture_output=True, text=True, check=False
+                )
             except OSError as error:
                 raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
             if done.returncode != 0:
                 first = next((line for line in done.stderr.splitlines() if line.strip()), "make failed")
                 raise UserError(f"cannot build the firmware: {first}")
-    return folder / "selfcal-posix"
+    return folder / made_by.image
 
 
 def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
-    """The recording as the host firmware reads it (port/posix/main.c): float32 in the model's units."""
+    """The recording as the firmware reads it (port/replay/replay.h): float32 in the model's units."""
     rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("reading", "<f4", (len(axes),))])
     rows["missing"] = recording.missing_before
     for index, name in enumerate(axes):
@@ -126,44 +160,96 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
 
 
 def run(
-    firmware: Path, recording: Recording, model: Model, axes: Sequence[str], report_every: float | None
+    firmware: Path,
+    recording: Recording,
+    model: Model,
+    axes: Sequence[str],
+    report_every: float | None,
+    target: str = "host",
 ) -> dict[str, list[AxisReport]]:
     """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts."""
     block = bank_block(recording.rate_hz, model.bank_rate_hz)
-    period_s = report_every or min(max(block / recording.rate_hz, recording.duration_s / REPORTS), LONGEST_PERIOD_S)
+    longest_s = recording.duration_s / TARGETS[target].reports
+    period_s = report_every or min(max(block / recording.rate_hz, longest_s), LONGEST_PERIOD_S)
     history: dict[str, list[AxisReport]] = {name: [] for name in axes}
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
         write_rows(recording, model, axes, rows)
-        command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--timeout", f"{TIMEOUT_S:g}"]
-        with (Path(name) / "errors").open("w+") as errors:
-            module = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
-            try:
-                assert module.stdout is not None
-                word, _, device = module.stdout.readline().strip().partition(" ")
-                finished = False
-                if word == "SELFCAL_PTY":
-                    # The firmware is ready at once: python-can's pause after opening is for modules that restart.
-                    with open_bus("slcan", device, bitrate=500000, sleep_after_open=0.0) as link:
-                        finished = _watch(link, recording, history)
-                module.wait(TIMEOUT_S)
-            finally:
-                module.kill()
-                module.wait()
-            if module.returncode != 0 or not finished:
-                errors.seek(0)
-                said = errors.read().strip().replace(str(rows), str(recording.path))
-                raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
+        finished = False
+        with _module(firmware, rows, period_s, target) as (module, channel, before):
+            if channel:
+                # The firmware is ready at once: python-can's pause after opening is for modules that restart.
+                with open_bus("slcan", channel, bitrate=500000, sleep_after_open=0.0) as link:
+                    finished = _watch(link, recording, history, target)
+            said = before + module.communicate(timeout=TIMEOUT_S)[0]
+        if module.returncode != 0 or not finished:
+            said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
+            raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
     return history
 
 
-def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]]) -> bool:
+@contextmanager
+def _module(
+    firmware: Path, rows: Path, period_s: float, target: str
+) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """The running firmware, the serial channel its telemetry comes by, and what it said before; killed at the end.
+
+    The channel is empty if the firmware did not get as far as having one: then it is ending.
+    """
+    with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
+        if server is None:
+            command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--timeout", f"{TIMEOUT_S:g}"]
+        else:  # QEMU takes over a socket that listens already, so no port can be lost to another program
+            uart = f"socket,id=uart,server=on,wait=off,fd={server.fileno()}"
+            command = emulator(firmware, rows.name, period_s, target, uart)
+        try:
+            module = subprocess.Popen(
+                command,
+                cwd=rows.parent,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                pass_fds=() if server is None else (server.fileno(),),
+            )
+        except OSError as error:
+            raise UserError(f"cannot run the firmware: {command[0]}: {error.strerror}") from error
+        try:
+            assert module.stdout is not None
+            channel = said = ""
+            for line in module.stdout:
+                word, _, rest = line.strip().partition(" ")
+                if word == "SELFCAL_PTY":
+                    channel = rest
+                elif word == "SELFCAL_UART" and server is not None:
+                    channel = f"socket://127.0.0.1:{server.getsockname()[1]}"
+                if channel:
+                    break
+                said += line
+            yield module, channel, said
+        finally:
+            module.kill()
+            module.wait()
+
+
+def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str) -> list[str]:
+    """QEMU's command line for a firmware over the file `rows` of its folder; `uart`: a -chardev with id=uart."""
+    period_ms = math.ceil(float(f"{period_s:.6f}") * 1000.0)  # as port/posix/main.c rounds it
+    return [
+        *("qemu-system-arm", "-M", *TARGETS[target].board, "-display", "none", "-monitor", "none"),
+        *("-chardev", uart, "-serial", "chardev:uart", "-kernel", str(firmware)),
+        *("-semihosting-config", f"enable=on,target=native,arg=selfcal,arg={rows},arg={period_ms}"),
+    ]
+
+
+def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]], target: str) -> bool:
     """Follow the telemetry until the module has finished; false if it fell silent before."""
     decoder = Decoder(from_start=True)
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s) as view:
         while not decoder.finished:
-            frame = link.recv(TIMEOUT_S)
+            frame = link.recv(EMULATED_TIMEOUT_S if TARGETS[target].board else TIMEOUT_S)
             if frame is None:
                 break
             reports = decoder.feed(frame)

@@ -1,0 +1,54 @@
+/* The bias after the report: where it goes under each law, and how the doubt about it grows. */
+#include "internal.h"
+
+typedef struct {
+    selfcal_real_t mean, var;
+} moments_t;
+
+static moments_t predict_law(selfcal_law_t law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
+    moments_t now = {(selfcal_real_t)posterior->bias_mean, (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
+    if (law == SELFCAL_RANDOM_WALK) {
+        const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
+        const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
+        now.var = r_fma(r_fma(mean, mean, sd * sd), elapsed_s, now.var);
+    } else if (law == SELFCAL_GAUSS_MARKOV) {
+        selfcal_real_t fall = R(0.0), growth = R(0.0);
+        for (unsigned j = 0; j < SELFCAL_GRID_MAX; j++) {
+            const selfcal_decay_t *decay = &posterior->decay[j];
+            const selfcal_real_t psi = -r_expm1(-(selfcal_real_t)decay->alpha * elapsed_s);
+            fall = r_fma(psi, (selfcal_real_t)decay->mean, fall);
+            growth = r_fma(psi, r_fma(psi, (selfcal_real_t)decay->var[1], (selfcal_real_t)decay->var[0]), growth);
+        }
+        now.mean -= fall;
+        now.var = r_fmax(now.var + r_fma(-fall, fall, growth), R(0.0));
+    }
+    return now;
+}
+
+selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd) {
+    if (report == NULL || model == NULL || bias == NULL || sd == NULL || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
+        !(elapsed_s >= 0.0F) || !isfinite(elapsed_s)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    const selfcal_real_t now = (selfcal_real_t)report->bias_mean; /* taken off: gravity costs no digits */
+    moments_t law[SELFCAL_HYPOTHESES_MAX] = {{R(0.0), R(0.0)}};
+    selfcal_real_t mean = R(0.0), var = R(0.0);
+    for (uint8_t h = 0; h < model->hypotheses; h++) {
+        const selfcal_real_t p = (selfcal_real_t)report->hypothesis[h].probability;
+        if (p > R(0.0)) { /* else its moments may be NaN */
+            law[h] = predict_law(model->hypothesis[h].law, &report->hypothesis[h], (selfcal_real_t)elapsed_s);
+            law[h].mean -= now;
+            mean = r_fma(p, law[h].mean, mean);
+        }
+    }
+    for (uint8_t h = 0; h < model->hypotheses; h++) {
+        const selfcal_real_t p = (selfcal_real_t)report->hypothesis[h].probability;
+        if (p > R(0.0)) {
+            const selfcal_real_t off = law[h].mean - mean;
+            var = r_fma(p, r_fma(off, off, law[h].var), var);
+        }
+    }
+    *bias = (float)(now + mean);
+    *sd = (float)r_sqrt(var);
+    return SELFCAL_OK;
+}

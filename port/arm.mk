@@ -1,0 +1,5 @@
+# How the library and the application are compiled for the cores; included by whatever builds for one.
+ARM_cortex-m4f := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
+ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb
+ARM_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
+ARM_COMPILE := -O2 -std=c99 -ffp-contract=off -ffunction-sections -fdata-sections $(ARM_WARNINGS)

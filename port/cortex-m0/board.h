@@ -1,0 +1,58 @@
+/* What the parts of this target give each other. Pins are those of a BBC micro:bit's edge connector and of its USB bridge. */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "selfcal.h"
+
+enum {
+    PIN_READY = 20, /* edge 12 */
+    PIN_RESET = 18, /* edge 8 */
+    PIN_CS = 16,    /* edge 16 */
+    PIN_MOSI = 21,  /* edge 15 */
+    PIN_MISO = 22,  /* edge 14 */
+    PIN_SCK = 23,   /* edge 13 */
+    PIN_TX = 24,
+    PIN_RX = 25
+};
+
+/* clock.c */
+
+/* 16 MHz by the crystal (by the internal oscillator if it does not start), microseconds and milliseconds by TIMER0, and the
+ * watchdog: 8 s by the nominal 32 kHz oscillator, only stopped by a reset. */
+void clock_init(void);
+
+/* Time since start. The last is for interrupt handlers too, modulo 2^32. */
+uint32_t clock_ms(void);
+uint64_t clock_us(void);
+uint32_t clock_us32(void);
+
+void clock_spin_us(uint32_t us);
+void clock_handler(void);
+void watchdog_feed(void);
+__attribute__((noreturn)) void board_reset(void);
+
+/* spi.c: what adis16405_bus_t wants */
+
+void spi_init(void);
+bool spi_word(void *context, uint16_t out, uint16_t *in);
+bool spi_burst(void *context);
+void spi_reset_line(void *context, bool low);
+void spi_handler(void);
+void ready_handler(void);
+
+/* main.c: what the handlers hand on. */
+void board_sensor_ready(void);
+void board_sensor_burst(const uint16_t words[12], bool whole);
+
+/* uart.c: SLCAN at 115200 bit/s */
+
+void uart_init(void);
+bool uart_send(const selfcal_frame_t *frame);
+void uart_poll(void); /* takes what the host said */
+void uart_handler(void);
+
+#endif

@@ -1,0 +1,112 @@
+/* Registers of the nRF51822 that this target uses: nRF51 Series Reference Manual 3.0, chapter in each heading. */
+#ifndef NRF51_H
+#define NRF51_H
+
+#include <stdint.h>
+
+#define REG32(address) (*(volatile uint32_t *)(address))
+#define BIT(n) (1UL << (n))
+
+/* Cortex-M0: ARMv6-M Architecture Reference Manual B3.4 and B3.2.6. No SysTick in this part. */
+#define NVIC_ISER REG32(0xE000E100U)
+#define SCB_AIRCR REG32(0xE000ED0CU)
+#define SCB_AIRCR_SYSRESETREQ 0x05FA0004U
+
+/* 12: power. 11: clocks. */
+#define POWER_RAMONB REG32(0x40000554U)
+#define POWER_RAMONB_ALL 0x3U
+#define CLOCK_HFCLKSTART REG32(0x40000000U)
+#define CLOCK_LFCLKSTART REG32(0x40000008U)
+#define CLOCK_HFCLKSTARTED REG32(0x40000100U)
+#define CLOCK_LFCLKSRC REG32(0x40000518U)
+#define CLOCK_LFCLKSRC_RC 0U
+
+/* 14: pins. */
+#define GPIO_OUTSET REG32(0x50000508U)
+#define GPIO_OUTCLR REG32(0x5000050CU)
+#define GPIO_PIN_CNF(pin) REG32(0x50000700U + 4U * (uint32_t)(pin))
+#define GPIO_OUTPUT 0x3U /* its input buffer off */
+#define GPIO_INPUT 0x0U
+#define GPIO_PULL_DOWN 0x4U
+#define GPIO_PULL_UP 0xCU
+
+/* 15: pin events. */
+#define GPIOTE_IN0 REG32(0x40006100U)
+#define GPIOTE_INTENSET REG32(0x40006304U)
+#define GPIOTE_CONFIG0 REG32(0x40006510U)
+#define GPIOTE_RISING(pin) (0x1U | (uint32_t)(pin) << 8 | 0x1U << 16)
+
+/* 18: timer. */
+#define TIMER0_START REG32(0x40008000U)
+#define TIMER0_CAPTURE0 REG32(0x40008040U)
+#define TIMER0_COMPARE1 REG32(0x40008144U)
+#define TIMER0_INTENSET REG32(0x40008304U)
+#define TIMER0_INTEN_COMPARE1 BIT(17)
+#define TIMER0_BITMODE REG32(0x40008508U)
+#define TIMER0_BITMODE_32 3U
+#define TIMER0_PRESCALER REG32(0x40008510U)
+#define TIMER0_CC0 REG32(0x40008540U)
+#define TIMER0_CC1 REG32(0x40008544U)
+
+/* 21: watchdog. */
+#define WDT_START REG32(0x40010000U)
+#define WDT_CRV REG32(0x40010504U)
+#define WDT_CONFIG REG32(0x4001050CU)
+#define WDT_CONFIG_RUN_ASLEEP 0x1U
+#define WDT_RR0 REG32(0x40010600U)
+#define WDT_RELOAD 0x6E524635U
+
+/* 27: SPI master. */
+#define SPI0_READY REG32(0x40003108U)
+#define SPI0_INTENSET REG32(0x40003304U)
+#define SPI0_INTENCLR REG32(0x40003308U)
+#define SPI0_INTEN_READY BIT(2)
+#define SPI0_ENABLE REG32(0x40003500U)
+#define SPI0_PSELSCK REG32(0x40003508U)
+#define SPI0_PSELMOSI REG32(0x4000350CU)
+#define SPI0_PSELMISO REG32(0x40003510U)
+#define SPI0_RXD REG32(0x40003518U)
+#define SPI0_TXD REG32(0x4000351CU)
+#define SPI0_FREQUENCY REG32(0x40003524U)
+#define SPI0_FREQUENCY_1M 0x10000000U
+#define SPI0_CONFIG REG32(0x40003554U)
+#define SPI0_CONFIG_MODE3 0x6U
+
+/* 29: UART. */
+#define UART0_STARTRX REG32(0x40002000U)
+#define UART0_STARTTX REG32(0x40002008U)
+#define UART0_RXDRDY REG32(0x40002108U)
+#define UART0_TXDRDY REG32(0x4000211CU)
+#define UART0_ERROR REG32(0x40002124U)
+#define UART0_INTENSET REG32(0x40002304U)
+#define UART0_INTEN_RXDRDY BIT(2)
+#define UART0_INTEN_TXDRDY BIT(7)
+#define UART0_INTEN_ERROR BIT(9)
+#define UART0_ERRORSRC REG32(0x40002480U)
+#define UART0_ENABLE REG32(0x40002500U)
+#define UART0_ENABLED 4U
+#define UART0_PSELTXD REG32(0x4000250CU)
+#define UART0_PSELRXD REG32(0x40002514U)
+#define UART0_RXD REG32(0x40002518U)
+#define UART0_TXD REG32(0x4000251CU)
+#define UART0_BAUDRATE REG32(0x40002524U)
+#define UART0_BAUDRATE_115200 0x01D7E000U
+
+enum { IRQ_UART0 = 2, IRQ_SPI0 = 3, IRQ_GPIOTE = 6, IRQ_TIMER0 = 8, IRQ_COUNT = 26 };
+
+static inline void irq_enable(uint32_t number)
+{
+    NVIC_ISER = BIT(number);
+}
+
+static inline void irq_off(void)
+{
+    __asm__ volatile("cpsid i" : : : "memory");
+}
+
+static inline void irq_on(void)
+{
+    __asm__ volatile("cpsie i" : : : "memory");
+}
+
+#endif

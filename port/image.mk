@@ -1,0 +1,26 @@
+# An image for a board. A target's own file sets TARGET, CORE and IMAGE_CFLAGS and includes this one; it is called with
+#   make -f port/TARGET/TARGET.mk TARGET MODEL_DIR=DIR OUT=DIR [CFLAGS=...]
+# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`); makes OUT/selfcal.elf, .bin, .hex and .map, and beside
+# the objects what gcc says of their stacks (.su).
+include port/arm.mk
+
+IMAGE_SOURCES := $(wildcard lib/*.c port/app/*.c port/$(TARGET)/*.c)
+IMAGE_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/$(TARGET)/*.h)
+IMAGE_MODEL := $(abspath $(MODEL_DIR))
+
+.PHONY: $(TARGET)
+$(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
+
+$(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(IMAGE_MODEL)/selfcal_model.c $(IMAGE_MODEL)/selfcal_model.h \
+                    port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/arm.mk
+	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
+	cd $(OUT)/objects && arm-none-eabi-gcc $(ARM_$(CORE)) $(ARM_COMPILE) -fstack-usage -g $(IMAGE_CFLAGS) $(CFLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
+	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL) -c $(IMAGE_SOURCES:%=$(CURDIR)/%) $(IMAGE_MODEL)/selfcal_model.c
+	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,--emit-relocs,-Map=$(OUT)/selfcal.map,--fatal-warnings \
+	    $(OUT)/objects/*.o -lm -o $@
+
+$(OUT)/selfcal.bin: $(OUT)/selfcal.elf
+	arm-none-eabi-objcopy -O binary $< $@
+
+$(OUT)/selfcal.hex: $(OUT)/selfcal.elf
+	arm-none-eabi-objcopy -O ihex $< $@

@@ -1,0 +1,19 @@
+# The firmware for an emulated core: make -f port/qemu/qemu.mk qemu CORE=cortex-m4f|cortex-m0 MODEL_DIR=DIR OUT=DIR
+# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`); makes OUT/selfcal-qemu.elf.
+
+include port/arm.mk
+
+QEMU_SOURCES := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/qemu/*.c) $(MODEL_DIR)/selfcal_model.c
+QEMU_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/qemu/*.h) $(MODEL_DIR)/selfcal_model.h
+QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
+QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
+QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
+QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+
+.PHONY: qemu
+qemu: $(OUT)/selfcal-qemu.elf
+
+$(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/arm.mk
+	@mkdir -p $(OUT)
+	arm-none-eabi-gcc $(ARM_$(CORE)) $(ARM_COMPILE) $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
+	    -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) $(QEMU_SOURCES) -lm -o $@

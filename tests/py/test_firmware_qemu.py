@@ -1,0 +1,243 @@
+"""The firmware on emulated cores: `selfcal replay --target cortex-m4f|cortex-m0`, by QEMU's UART and semihosting.
+
+Three truths. The host firmware over the same samples and nodes: the C code is the same and rounds alike, so telemetry
+must be the same to the last bit once both link the same <math.h> (tests/c/same_math.c); with newlib's it may differ by
+what newlib's exp, log and their kin differ from the host's. The textbook bank in double over the continuous prior,
+which shares no code. And the wire's own arithmetic: that every frame arrives, and the same ones in every run.
+
+`SELFCAL_EMULATE=1` (make emulate) adds 20 minutes of six axes.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal import recording as recording_module
+from selfcal.errors import UserError
+from selfcal.model import DEFAULT, Model
+from selfcal.recording import Recording, load
+from selfcal.verbs.identify import identify_axis
+from selfcal.verbs.replay import ROOT, TARGETS, build, emulator, replay, run, write_rows
+from selfcal.verbs.simulate import simulate
+from selfcal.wire import AxisReport
+
+from conftest import shared_recording
+
+SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
+EMULATED = ("cortex-m4f", "cortex-m0")
+SIX = ("gx", "gy", "gz", "ax", "ay", "az")
+#: Of statistics over the posterior sd, and of probabilities: newlib's expf and logf are off by up to 1 ulp (6e-8) where
+#: the host's are off by half of one; sums over some 10^4 cells of them keep it below 2e-4 of an sd (seen: 5e-5), a
+#: probability below 1e-4, a difference of evidences to one step of the wire, 0.001 nat, and what rounds to it.
+LIBM_SD, LIBM_P, LIBM_NAT = 2e-4, 1e-4, 2e-3
+
+#: What the task sets for each core, its node counts included.
+REFERENCE_P = {"cortex-m4f": 2e-3, "cortex-m0": 1e-2}
+
+
+def part(folder: Path, seconds: float, axes: Sequence[str] = SIX, hole: slice | None = None) -> Recording:
+    """The shipped recording's first seconds, `hole` (samples) left out."""
+    whole = load(SHIPPED)
+    keep = np.arange(int(seconds * whole.rate_hz))
+    if hole is not None:
+        keep = np.delete(keep, hole)
+    columns = {name: (whole.columns[name].unit, whole.in_unit(name, whole.columns[name].unit)[keep]) for name in axes}
+    path = folder / "part.npz"
+    recording_module.save(path, columns, whole.rate_hz, {}, t=keep / whole.rate_hz)
+    return load(path)
+
+
+def same_math(program: Path, target: str, folder: Path, core: str) -> Path:
+    """The firmware made anew from a program's model with tests/c/same_math.c in it."""
+    make = TARGETS[target].make
+    flags = "tests/c/same_math.c -Wno-double-promotion" + (" -DSAME_FMAF" if core == "cortex-m0" else "")
+    settings = [
+        f"MODEL_DIR={program.parent}",
+        f"OUT={folder / target}",
+        f"CORE={target}",
+        f"{make.upper()}_CFLAGS={flags}",
+    ]
+    subprocess.run(["make", "-s", "-f", f"port/{make}/{make}.mk", make, *settings], cwd=ROOT, check=True)
+    return folder / target / TARGETS[target].image
+
+
+def values(history: Mapping[str, Sequence[AxisReport]]) -> list[tuple[str, float, dict[str, str]]]:
+    """All that came, with floats as text: NaN equals NaN, and -0 does not equal 0."""
+    return [
+        (axis, report.time_s, {name: repr(value) for name, value in report.values.items()})
+        for axis, reports in history.items()
+        for report in reports
+    ]
+
+
+@pytest.mark.parametrize("core", EMULATED)
+def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> None:
+    """Bit for bit, with a gap, given the same nodes and the same <math.h>."""
+    model, axes = Model.load(), ("gx", "gy", "ax") if core == "cortex-m4f" else ("gy", "ax")
+    every = 200.0 if core == "cortex-m4f" else 600.0
+    recording = part(tmp_path, 600.0, axes, slice(3000, 3070))
+    history = {}
+    for target in ("host", core):
+        program = same_math(build(model, recording.rate_hz, axes, target, nodes=core), target, tmp_path, core)
+        history[target] = run(program, recording, model, axes, every, target)
+    assert [len(history[core][axis]) for axis in axes] == [600.0 / every] * len(axes)
+    assert values(history[core]) == values(history["host"])
+
+
+def assert_close(history: Mapping[str, Sequence[AxisReport]], truth: Mapping[str, Sequence[AxisReport]]) -> None:
+    """Reports equal but for what the C libraries round; prints the worst."""
+    worst = dict.fromkeys(("sd", "probability", "nat"), 0.0)
+    for axis, reports in truth.items():
+        for got, want in zip(history[axis], reports, strict=True):
+            assert got.time_s == want.time_s
+            for name, value in want.values.items():
+                other, (stem, _, last) = got.values[name], name.rpartition("_")
+                if math.isnan(value) or last in ("flags", "items", "ms") or name in ("count", "not_finite", "gaps"):
+                    assert repr(other) == repr(value), name
+                elif last == "probability":
+                    worst["probability"] = max(worst["probability"], abs(other - value))
+                elif name.endswith("ln_evidence_diff"):
+                    worst["nat"] = max(worst["nat"], abs(other - value))
+                elif last in ("mean", "median", "sd", "q05", "q95"):
+                    worst["sd"] = max(worst["sd"], abs(other - value) / want.values[f"{stem}_sd"])
+    print(", ".join(f"{name} {value:.1e}" for name, value in worst.items()))
+    assert worst["sd"] <= LIBM_SD
+    assert worst["probability"] <= LIBM_P
+    assert worst["nat"] <= LIBM_NAT
+
+
+@pytest.mark.parametrize("core", EMULATED)
+def test_the_c_library_changes_nothing_that_matters(core: str, tmp_path: Path) -> None:
+    model, axes = Model.load(), ("gx", "gy", "ax") if core == "cortex-m4f" else ("gx", "az")
+    recording = part(tmp_path, 600.0, axes)
+    history = {
+        target: run(build(model, recording.rate_hz, axes, target, nodes=core), recording, model, axes, 600.0, target)
+        for target in ("host", core)
+    }
+    assert_close(history[core], history["host"])
+
+
+def test_every_run_sends_the_same_bytes(tmp_path: Path) -> None:
+    """As a serial capture: the emulator's UART on its standard input and output."""
+    model, axes = Model.load(), ("gz",)
+    recording = part(tmp_path, 60.0, axes)
+    firmware = build(model, recording.rate_hz, axes, "cortex-m4f")
+    write_rows(recording, model, axes, tmp_path / "rows.bin")
+    sent = []
+    for name in ("first", "second"):
+        module = subprocess.Popen(
+            emulator(firmware, "rows.bin", 20.0, "cortex-m4f", "stdio,id=uart,signal=off"),
+            cwd=tmp_path,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        assert module.stdin is not None and module.stdout is not None and module.stderr is not None
+        assert module.stderr.readline() == b"SELFCAL_UART\n"
+        module.stdin.write(b"C\rS6\r\rO\rO\r")
+        module.stdin.flush()
+        # an answer to each command, three reports with their status, the last status
+        frames = module.stdout.read(5 + 22 * (3 * (16 + 44) + 16))
+        output, errors = module.communicate(b"C\r", timeout=30)
+        assert (module.returncode, output, errors) == (0, b"\r", b""), name
+        sent.append(frames)
+    assert sent[0] == sent[1]
+    assert sent[0].startswith(b"\r\r\r\r\rt2008")
+    assert all(len(line) == 21 for line in sent[0][5:-1].split(b"\r"))
+
+
+@pytest.mark.parametrize("core", EMULATED)
+def test_the_json_is_that_of_the_host(core: str, tmp_path: Path) -> None:
+    """By the command line, report for report as the contract has it."""
+    recording = part(tmp_path, 300.0, ("gz",))
+    line = [sys.executable, "-m", "selfcal.cli", "replay", str(recording.path), "--target", core]
+    done = subprocess.run([*line, "--json", str(tmp_path / "a.json")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    reports = TARGETS[core].reports
+    assert f"frames: {reports * (16 + 44) + 16} received, 0 lost" in done.stderr
+    document = replay(recording.path, target=core, report_every=300.0)
+    host = replay(recording.path, report_every=300.0)
+
+    def shape(tree: object) -> object:
+        return {name: shape(branch) for name, branch in tree.items()} if isinstance(tree, dict) else type(tree)
+
+    assert shape(document) == shape(host)
+    for axis, found in document["axes"].items():
+        for law, probability in found["hypotheses"].items():
+            # of the node counts; so few bank samples want few nodes
+            assert abs(probability - host["axes"][axis]["hypotheses"][law]) <= (2e-3 if core == "cortex-m4f" else 1e-2)
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda data: b"", "not a recording for this program"),
+        (lambda data: data[:8] + b"\x02" + data[9:], "axes are not those of the model"),
+        (lambda data: data[:16] + np.float64(11.0).tobytes() + data[24:], "rate is not that of the model"),
+        (lambda data: data[:-1], "the recording is shorter than it says"),
+    ],
+)
+def test_the_firmware_says_what_is_wrong_with_its_rows(damage, complaint, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    model, axes = Model.load(), ("gz",)
+    recording = part(tmp_path, 10.0, axes)
+    written = write_rows
+
+    def damaged(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
+        written(recording, model, axes, path)
+        path.write_bytes(damage(path.read_bytes()))
+
+    monkeypatch.setattr("selfcal.verbs.replay.write_rows", damaged)
+    with pytest.raises(UserError, match=complaint):
+        run(build(model, recording.rate_hz, axes, "cortex-m4f"), recording, model, axes, 10.0, "cortex-m4f")
+
+
+def test_an_emulator_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, recording = Model.load(), part(tmp_path, 10.0, ("gz",))
+    firmware = build(model, recording.rate_hz, ("gz",), "cortex-m4f")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=r"cannot run the firmware: qemu-system-arm: No such file"):
+        run(firmware, recording, model, ("gz",), None, "cortex-m4f")
+
+
+@pytest.mark.skipif("SELFCAL_EMULATE" not in os.environ, reason="minutes: make emulate")
+@pytest.mark.parametrize("core", EMULATED)
+@pytest.mark.parametrize("name", ["simulated", "adis16405_run1.npz"])
+def test_twenty_minutes_of_six_axes(core: str, name: str, tmp_path: Path) -> None:
+    """Against the textbook bank over the continuous prior; and the host firmware, whose C library alone may differ."""
+    if name == "simulated":
+        text = DEFAULT.read_text(encoding="utf-8")
+        assert "  rate_hz: 10.0\n  duration_s: 3600.0\n" in text
+        text = text.replace("  rate_hz: 10.0\n  duration_s: 3600.0\n", "  rate_hz: 819.2\n  duration_s: 1200.0\n")
+        (tmp_path / "model.yaml").write_text(text, encoding="utf-8")
+        simulate(tmp_path / "model.yaml", tmp_path / "whole.npz", seed=4)
+        recording = load(tmp_path / "whole.npz")
+    else:
+        whole = shared_recording(name)
+        count = int(1200.0 * whole.rate_hz)
+        columns = {
+            axis: (whole.columns[axis].unit, whole.in_unit(axis, whole.columns[axis].unit)[:count]) for axis in SIX
+        }
+        recording_module.save(tmp_path / "part.npz", columns, whole.rate_hz, {})
+        recording = load(tmp_path / "part.npz")
+    model = Model.load()
+    history = {
+        target: run(build(model, recording.rate_hz, SIX, target, nodes=core), recording, model, SIX, 1200.0, target)
+        for target in ("host", core)
+    }
+    assert_close(history[core], history["host"])
+    worst = 0.0
+    for axis in SIX:
+        truth = identify_axis(recording, axis, model, "reference", None).result.probability
+        found = history[core][axis][-1].result().probability
+        worst = max(worst, *(abs(found[law] - truth[law]) for law in truth))
+        print(axis, " ".join(f"{law} {found[law]:.4f} ({truth[law]:.4f})" for law in truth))
+    print(f"{core}, {name}: |dP(h)| <= {worst:.4f}")
+    assert worst <= REFERENCE_P[core]
