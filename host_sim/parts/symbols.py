@@ -19,7 +19,7 @@ def _strip(die: Any) -> Any:
 def _variables(path: Path) -> dict[str, tuple[int, Any]]:
     found: dict[str, tuple[int, Any]] = {}
     with path.open("rb") as file:
-        for unit in ELFFile(file).get_dwarf_info().iter_CUs():
+        for unit in ELFFile(file).get_dwarf_info(relocate_dwarf_sections=False).iter_CUs():
             for die in unit.get_top_DIE().iter_children():
                 location = die.attributes.get("DW_AT_location")
                 if die.tag == "DW_TAG_variable" and location is not None and "DW_AT_name" in die.attributes:

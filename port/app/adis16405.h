@@ -63,7 +63,7 @@ typedef enum {
 /* Since start. */
 typedef struct {
     uint32_t samples;   /* delivered to the queue */
-    uint32_t stale;     /* ND not set */
+    uint32_t stale;     /* ND not set, or all channels the same for the third time */
     uint32_t alarms;    /* EA set */
     uint32_t damaged;   /* the two readings differ, or a burst failed */
     uint32_t anomalies; /* lost sign bit of XGYRO_OUT */
@@ -95,7 +95,7 @@ typedef struct {
     uint64_t last_us;      /* stamp of the last sample delivered */
     bool anchored;
     int16_t last[ADIS16405_AXES];
-    uint32_t equal;
+    uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
     uint64_t progress_us;  /* when a sample was delivered last, or the run began */
     uint32_t ready_seen;

@@ -57,7 +57,7 @@ def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIE
         if not stamp.exists() or stamp.read_text() != flags:
             (folder / "selfcal.elf").unlink(missing_ok=True)
             stamp.write_text(flags)
-        subprocess.run([*command, f"STM32F405_CFLAGS={flags}", f"CFLAGS={flags}"], cwd=ROOT, check=True)
+        subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
     return folder / "selfcal.elf"
 
 
