@@ -12,7 +12,7 @@ from unicorn import arm_const as arm
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
 from .flash import Flash
-from .machine import Machine, SystemControl
+from .machine import SRAM, SRAM_BYTES, Machine, SystemControl
 from .spi import Dma2, Spi
 from .symbols import place
 from .system import Exti, Gpio, Iwdg, Pwr, Rcc, Tim2
@@ -102,6 +102,17 @@ class Board:
     def run(self, seconds: float) -> None:
         """Let time go by."""
         self.machine.run(self.machine.now_us + seconds * 1e6)
+
+    def power_cycle(self, retained: bytes | None = None) -> None:
+        """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
+        machine = self.machine
+        machine.uc.mem_write(SRAM, machine.random.randbytes(SRAM_BYTES))
+        if retained is not None:
+            machine.uc.mem_write(0x080C0000, retained)
+        self.flash.cut_at = -1
+        self.rcc.csr = self.rcc.FLAG["power"]
+        machine.power_cycle()
+        self.sensor.power_on()
 
     def retained(self) -> bytes:
         """Content of the flash's two last sectors."""

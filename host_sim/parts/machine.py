@@ -119,6 +119,13 @@ class Machine:
             self.uc.mmio_map(page, 0x1000, self._mmio_read, page, self._mmio_write, page)
         self._restart()
 
+    def power_cycle(self) -> None:
+        """Every event that was to come is void."""
+        self._events.clear()
+        self._spent = 0.0
+        self.stopped = None
+        self._restart()
+
     # ------------------------------------------------------------------------------------------------------ peripherals
 
     def _mmio_read(self, uc: Uc, offset: int, size: int, page: int) -> int:
@@ -380,4 +387,4 @@ class SystemControl(Part):
             raise KeyError(offset)
 
 
-__all__ = ["EXC_IRQ0", "EXC_NMI", "FLASH", "SRAM", "Event", "Machine", "Part", "SystemControl", "const"]
+__all__ = ["EXC_IRQ0", "EXC_NMI", "FLASH", "SRAM", "SRAM_BYTES", "Event", "Machine", "Part", "SystemControl", "const"]

@@ -114,8 +114,9 @@ void watchdog_feed(void);
 /* Largest state a slot keeps, bytes. */
 #define FLASH_SLOT_BYTES (128U * 1024U - 32U)
 
-/* The newest whole state, or NULL; `older`: the one before it, if that is whole too. */
-const void *flash_newest(bool older, size_t *length, uint32_t *sequence);
+/* The newest state whose save reached its end, or NULL; `older`: the one before it. Whether it is still what was written its own
+ * checksum tells. */
+const void *flash_newest(bool older, size_t *length);
 
 /* A save: begin erases the slot that is not the newest (1 s, 2 s at most, during which the processor stands still), put
  * appends, end writes the header. Until the header's last word is written the newest state stays what it was. False: the

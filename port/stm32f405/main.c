@@ -133,8 +133,7 @@ static void module_tell(void *context, selfcal_module_t *told)
 static const void *module_stored(void *context, bool older, size_t *length)
 {
     (void)context;
-    uint32_t sequence;
-    return flash_newest(older, length, &sequence);
+    return flash_newest(older, length);
 }
 
 static bool module_save_begin(void *context)

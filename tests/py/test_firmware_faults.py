@@ -12,7 +12,8 @@ import random
 from collections.abc import Callable
 
 import pytest
-from firmware import Board, Tap, image, messages, parts, reports, status
+from firmware import ROOT, Board, Tap, image, messages, parts, reports, status
+from parts.flash import half_erased, half_programmed
 
 MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
 #: Reports every 500 ms, no bank sample: see firmware.py.
@@ -324,3 +325,132 @@ def test_clock_falls_back(broken: str) -> None:
     assert status(board)["clock"] == 2
     assert board.machine.hclk_mhz == (168.0 if broken == "crystal" else 16.0)
     assert sound(board, tap, 0)
+
+
+# ---------------------------------------------------------------------------------------------------------- saved state
+
+SAVING = ("saving", "-DBOARD_REPORT_MS=500 -DBOARD_SAVE_PERIOD_S=2U", True)
+needs_snapshot = pytest.mark.skipif(
+    "SELFCAL_SNAPSHOT_MAX" not in (ROOT / "lib" / "selfcal.h").read_text(), reason="THE LIBRARY HAS NO SNAPSHOT YET"
+)
+NEWEST, OLDER, REFUSED = 1, 2, 3
+SLOTS = 0x080C0000
+
+
+def found(board: parts.Board) -> tuple[int, int, int]:
+    """After a start: what was found, why one was refused, samples in the bank."""
+    board.run(0.05)
+    return (
+        board.value("app.told.state_found"),
+        board.value("app.told.state_refused"),
+        board.value("app.bank.counters.samples"),
+    )
+
+
+def two_saves() -> tuple[parts.Board, bytes, int, int, int]:
+    """A board after two saves; what the flash held after the first, with the samples of either, and the first operation of
+    the second."""
+    board = Board(image(*SAVING), seed=21)
+    board.run(2.5)
+    while board.value("app.told.state_saves") < 1:
+        board.run(0.1)
+    first = board.retained()
+    samples = [board.value("app.bank.counters.samples")]
+    operations = board.flash.operations
+    board.flash.keep_history = True
+    while board.value("app.told.state_saves") < 2:
+        before = board.value("app.bank.counters.samples")
+        board.run(0.005)
+    samples.append(before)
+    return board, first, samples[0], samples[1], operations
+
+
+@needs_snapshot
+def test_power_cut_at_every_flash_operation_of_a_save() -> None:
+    """A start after a cut anywhere in a save finds the state before it whole, or, once the header is complete, the new one. Short
+    run: the erase, the header, both ends of the payload and some between; SELFCAL_CAMPAIGN=2 or more: every operation."""
+    board, flash, _, _, start = two_saves()
+    history = board.flash.history
+    total = len(history)
+    assert total > 5000
+    after = flash
+    truth: list[tuple[int, int, int]] = []
+    for content in (flash, board.retained()):
+        board.power_cycle(content)
+        truth.append(found(board))
+        assert truth[-1][:2] == (NEWEST, 0)
+    assert truth[0][2] < truth[1][2]
+    rng = random.Random(7)
+    some = {0, 1, 2, 3, *range(total - 12, total), *(rng.randrange(total) for _ in range(20))}
+    chosen = range(total) if MANY > 1 else sorted(some)
+    content = bytearray(after)
+    done = trials = survived = 0
+    for k in chosen:
+        for address, _, new in history[done:k]:
+            content[address - SLOTS : address - SLOTS + len(new)] = new
+        done = k
+        address, old, new = history[k]
+        cut = half_erased(old, rng) if k == 0 else half_programmed(old, new, rng)
+        broken = bytearray(content)
+        broken[address - SLOTS : address - SLOTS + len(new)] = cut
+        board.power_cycle(bytes(broken))
+        got = found(board)
+        trials += 1
+        survived += got == truth[0] or (got == truth[1] and k == total - 1 and cut == new)
+    tell("power cut in a save", trials, survived, f"{total} operations in a save, the first being number {start}")
+    assert survived == trials
+
+
+@needs_snapshot
+def test_power_cut_while_running() -> None:
+    """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves again."""
+    for k in (0, 3, 500):
+        board, _, _, _, _ = two_saves()
+        third = board.flash.operations + k
+        board.flash.cut_at = third
+        board.run(4.0)
+        assert board.machine.stopped == "power cut"
+        board.power_cycle()
+        outcome, refused, samples = found(board)
+        assert (outcome, refused) == (NEWEST, 0)
+        assert samples > 0
+        board.run(4.5)
+        assert board.value("app.told.state_saves") >= 1
+        assert board.machine.violations == board.machine.faults == []
+
+
+@needs_snapshot
+def test_damaged_and_foreign_states_are_refused_and_told() -> None:
+    """A flipped bit in the newest: the older one is taken, and the next save overwrites the damaged one. In both: none is taken. Of
+    another model: refused as foreign."""
+    board, first, _, _, _ = two_saves()
+    flash = bytearray(board.retained())
+    newest = 0x20000 if first[0x20000] == 0xFF else 0
+    flash[newest + 5000] ^= 4
+    board.power_cycle(bytes(flash))
+    outcome, refused, _ = found(board)
+    assert (outcome, refused) == (OLDER, 7)
+    erased = list(board.flash.erases)
+    board.run(4.0)
+    assert board.flash.erases[10 + newest // 0x20000] == erased[10 + newest // 0x20000] + 1
+    flash[0x20000 - newest + 5000] ^= 4
+    board.power_cycle(bytes(flash))
+    assert found(board) == (REFUSED, 7, 0)
+    board.run(1.0)
+    assert status(board)["state_found"] == REFUSED
+    other = Board(image("other model", SAVING[1], True, 0.02), seed=22, retained=first)
+    assert found(other) == (REFUSED, 8, 0)
+
+
+@needs_snapshot
+def test_flash_that_refuses_is_told_and_loses_nothing() -> None:
+    """An operation that the flash refuses voids the save: counted, and what was saved before stands."""
+    board, _, _, _, _ = two_saves()
+    board.flash.fail_at = board.flash.operations + 100
+    board.run(5.0)
+    assert board.value("app.told.state_save_failures") == 1
+    assert board.value("sensor.state") == 1
+    assert not board.machine.resets
+    kept = board.retained()
+    board.power_cycle(kept)
+    assert found(board)[:2] == (NEWEST, 0)
