@@ -1,9 +1,9 @@
 """ADIS16405 at its pins: SPI frames, registers, data-ready, self-test, and what can go wrong with it.
 
-Data sheet of the ADIS16400/ADIS16405: serial interface, tables 8 to 22. Reads are pipelined: the answer to a frame comes in
-the next one. A burst is the frame 0x3E00 and then 12 words with chip select low throughout. ND is set in an output register
-when a sample is written to it and cleared when it is read; EA is set in all while DIAG_STAT has a bit set.
-"""
+Data sheet of the ADIS16400/ADIS16405: serial interface, tables 8 to 22. Reads are pipelined: the answer to a frame
+comes in the next one. A burst is the frame 0x3E00 and then 12 words with chip select low throughout. ND is set in an
+output register when a sample is written to it and cleared when it is read; EA is set in all while DIAG_STAT has a bit
+set."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ class Adis16405:
         self._event: Event | None = None
         self.power_on()
 
-    # -------------------------------------------------------------------------------------------------------------- life
+    # --------------------------------------------------------------------------------------------------------------
+    # life
 
     def power_on(self) -> None:
         """Registers as delivered; ready after 220 ms."""
@@ -118,7 +119,8 @@ class Adis16405:
             self.on_ready(active)
             self.machine.at(200.0, lambda: self.on_ready(not active))
 
-    # --------------------------------------------------------------------------------------------------------------- SPI
+    # ---------------------------------------------------------------------------------------------------------------
+    # SPI
 
     def select(self, low: bool) -> None:
         """Chip select. Its rise ends a burst."""

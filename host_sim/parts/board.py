@@ -20,8 +20,8 @@ from .usart import Usart
 
 
 def resting(seed: int) -> Callable[[int], Sample]:
-    """Readings of a sensor at rest, LSB: noise of 0.9 deg/s and 0.09 m/s^2 (the data sheet's), gravity on z. The same sample
-    for the same seed and index, in whatever order they are asked for."""
+    """Readings of a sensor at rest, LSB: noise of 0.9 deg/s and 0.09 m/s^2 (the data sheet's), gravity on z. The same
+    sample for the same seed and index, in whatever order they are asked for."""
 
     def sample(index: int) -> Sample:
         rng = random.Random(seed * 1_000_003 + index)
@@ -33,8 +33,9 @@ def resting(seed: int) -> Callable[[int], Sample]:
 
 
 class Board:
-    """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is given.
-    `text`: what the USART said. `retained`: content of the flash's two last sectors to start with. `clock_broken`: "crystal" or "pll"."""
+    """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is
+    given. `text`: what the USART said. `retained`: content of the flash's two last sectors to start with.
+    `clock_broken`: "crystal" or "pll"."""
 
     def __init__(
         self,
@@ -60,9 +61,7 @@ class Board:
         self.exti = Exti(machine)
         self.spi = Spi(machine, self.rcc)
         self.dma2 = Dma2(machine, self.spi)
-        self.can = Bxcan(
-            machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9
-        )
+        self.can = Bxcan(machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9)
         self.usart = Usart(machine, self.rcc)
         self.flash = Flash(machine)
         self.sensor = Adis16405(machine, source or resting(seed))

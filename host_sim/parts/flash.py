@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import random
 
-from unicorn import UC_HOOK_MEM_WRITE, Uc
+from unicorn.unicorn_const import UC_HOOK_MEM_WRITE
 
-from .machine import FLASH, FLASH_BYTES, Machine, Part
+from .machine import FLASH, FLASH_BYTES, Machine, Part, Uc
 
 #: Start and size of every sector, RM0090 table 5.
 SECTORS = [(FLASH + 0x4000 * i, 0x4000) for i in range(4)]
@@ -30,8 +30,8 @@ def half_erased(old: bytes, rng: random.Random) -> bytes:
 
 
 class Flash(Part):
-    """RM0090 3.9. `operations` counts erases and words; `cut_at` cuts the power within that operation, whose cells are then
-    left in between: each bit that was to change has done so or not."""
+    """RM0090 3.9. `operations` counts erases and words; `cut_at` cuts the power within that operation, whose cells are
+    then left in between: each bit that was to change has done so or not."""
 
     base = 0x40023C00
 

@@ -8,7 +8,7 @@ board_clock_t board_clock;
 static volatile uint32_t milliseconds;
 
 /* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16 MHz. */
-static bool await(volatile uint32_t *reg, uint32_t mask, uint32_t value)
+static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
 {
     for (uint32_t turn = 0; turn < 60000U; turn++) {
         if ((*reg & mask) == value) {

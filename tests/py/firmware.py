@@ -34,7 +34,8 @@ QUIET_BANK_HZ = 0.01
 
 @lru_cache
 def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIET_BANK_HZ) -> Path:
-    """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at `bank_hz`."""
+    """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at
+    `bank_hz`."""
     folder = ROOT / "build" / "firmware" / name
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
@@ -88,8 +89,8 @@ def readings(samples: list[tuple[int, ...]]) -> NDArray[np.float32]:
 
 
 class Tap:
-    """What the application gives to the library: every selfcal_push() with its place on the sensor's count of samples, found by
-    what selfcal_push() and selfcal_skip() have been given before. Watches only."""
+    """What the application gives to the library: every selfcal_push() with its place on the sensor's count of samples,
+    found by what selfcal_push() and selfcal_skip() have been given before. Watches only."""
 
     def __init__(self, board: parts.Board) -> None:
         self.board = board

@@ -1,19 +1,17 @@
-"""The unmodified STM32F405 image on a board of behavioural models: what it sends is what the host computes from the samples the
-sensor made, and the ways it is set up follow the manuals (each model notes what breaks a rule: `violations`).
+"""The unmodified STM32F405 image on a board of behavioural models: what it sends is what the host computes from the
+samples the sensor made, and the ways it is set up follow the manuals (each model notes what breaks a rule:
+`violations`).
 
-Truth of the telemetry: the same C library over the same samples, called directly on the host. Probabilities and evidence within
-what the wire rounds (contract: 1e-4, 0.01 nat). The libms of newlib and glibc differ in last bits of float functions, which moves
-the edges of the cells that quantiles are read from: statistics within 0.02 posterior sd, the tolerance of a float build.
-"""
+Truth of the telemetry: the same C library over the same samples, called directly on the host. Probabilities and
+evidence within what the wire rounds (contract: 1e-4, 0.01 nat). The libms of newlib and glibc differ in last bits of
+float functions, which moves the edges of the cells that quantiles are read from: statistics within 0.02 posterior sd,
+the tolerance of a float build."""
 
 from __future__ import annotations
 
-import math
-
 import can
 import numpy as np
-import pytest
-from firmware import AXES, Board, image, messages, parts, readings, reports, status
+from firmware import AXES, Board, image, readings, reports
 
 from selfcal.engines.library import Bank
 from selfcal.model import Model

@@ -1,9 +1,8 @@
 """Fault campaigns on the unmodified STM32F405 image: trials, and how many were survived. Each prints a line with both.
 
-A trial is survived when the image does not reset, hang or fault, breaks no rule of a part, gives the library no sample that the
-sensor did not make (wrong = 0) and puts every sample where it belongs in time (misplaced = 0). SELFCAL_CAMPAIGN=N runs N times as
-many trials (`make campaigns`).
-"""
+A trial is survived when the image does not reset, hang or fault, breaks no rule of a part, gives the library no sample
+that the sensor did not make (wrong = 0) and puts every sample where it belongs in time (misplaced = 0).
+SELFCAL_CAMPAIGN=N runs N times as many trials (`make campaigns`)."""
 
 from __future__ import annotations
 
@@ -75,7 +74,10 @@ FAULTS: dict[str, tuple[int, Callable[[parts.Adis16405, bool], None]]] = {
     "silent": (SILENT, lambda sensor, on: setattr(sensor, "silent", on)),
     "dead": (ABSENT, lambda sensor, on: setattr(sensor, "dead", on)),
     "stuck": (STUCK, lambda sensor, on: setattr(sensor, "frozen", on)),
-    "no new data": (NO_DATA, lambda sensor, on: setattr(sensor, "stale", (lambda k: True) if on else (lambda k: False))),
+    "no new data": (
+        NO_DATA,
+        lambda sensor, on: setattr(sensor, "stale", (lambda k: True) if on else (lambda k: False)),
+    ),
     "supply low": (STATUS, lambda sensor, on: setattr(sensor, "trouble", 1 if on else 0)),
     "flash checksum": (STATUS, lambda sensor, on: setattr(sensor, "trouble", 0x40 if on else 0)),
 }
@@ -108,7 +110,9 @@ def test_sensor_fails_and_heals(name: str) -> None:
     tell(f"sensor {name}", 1, 1)
 
 
-@pytest.mark.parametrize(("name", "code"), [("wrong product", ABSENT), ("self-test fails", SELF_TEST), ("absent", ABSENT)])
+@pytest.mark.parametrize(
+    ("name", "code"), [("wrong product", ABSENT), ("self-test fails", SELF_TEST), ("absent", ABSENT)]
+)
 def test_sensor_bad_from_the_start(name: str, code: int) -> None:
     """A fault is told before the first sample, there is none, and tries come at growing intervals."""
     board = Board(image(*QUIET), seed=5)
@@ -131,8 +135,8 @@ def test_sensor_bad_from_the_start(name: str, code: int) -> None:
 
 @pytest.mark.parametrize("chance", [1e-5, 1e-4, 1e-3])
 def test_spi_bit_flips(chance: float) -> None:
-    """Bits turned over on either wire: no wrong sample is taken. A sample has 2 x 13 words of 16 bits both ways, so that at 1e-3
-    more than half are lost."""
+    """Bits turned over on either wire: no wrong sample is taken. A sample has 2 x 13 words of 16 bits both ways, so
+    that at 1e-3 more than half are lost."""
     seconds = 8.0 * MANY
     board = Board(image(*QUIET), seed=int(1 / chance))
     tap = Tap(board)
@@ -164,7 +168,9 @@ def test_lost_sign_bit() -> None:
     tap = Tap(board)
     board.sensor.lose_sign = lambda k: k % 10 == 0
     board.run(6.0)
-    struck = sum(index % 10 == 0 and sample[0] < 0 for index, _, sample in board.sensor.taken if index in board.sensor.read_twice)
+    struck = sum(
+        index % 10 == 0 and sample[0] < 0 for index, _, sample in board.sensor.taken if index in board.sensor.read_twice
+    )
     told = status(board)
     tell("lost sign bit", struck, struck - tap.wrong(), f"{told['sensor_anomaly_count']:.0f} counted")
     assert struck > 20
@@ -173,7 +179,8 @@ def test_lost_sign_bit() -> None:
 
 
 def test_missed_and_stale_samples_become_gaps_in_place() -> None:
-    """Data-ready without new data, and samples whose data-ready is missed, at random: every sample stays in its place."""
+    """Data-ready without new data, and samples whose data-ready is missed, at random: every sample stays in its
+    place."""
     rng = random.Random(4)
     board = Board(image(*QUIET), seed=4)
     tap = Tap(board)
@@ -189,8 +196,8 @@ def test_missed_and_stale_samples_become_gaps_in_place() -> None:
 
 
 def test_gap_of_a_minute_and_clock_error() -> None:
-    """60 s without data-ready, from a sensor whose clock is 2 % fast: the gap is counted in its samples, whose period the driver has
-    tracked, to one part in a thousand."""
+    """60 s without data-ready, from a sensor whose clock is 2 % fast: the gap is counted in its samples, whose period
+    the driver has tracked, to one part in a thousand."""
     board = Board(image(*QUIET), seed=6)
     tap = Tap(board)
     board.sensor.clock_error = -0.02
@@ -260,7 +267,8 @@ def test_nobody_on_the_bus() -> None:
 
 
 def test_random_serial_lines() -> None:
-    """Random, truncated and overlong SLCAN lines: each is answered or ignored, the channel still opens, frames are whole."""
+    """Random, truncated and overlong SLCAN lines: each is answered or ignored, the channel still opens, frames are
+    whole."""
     lines = 1000 * MANY
     rng = random.Random(12)
     board = Board(image(*SERIAL), seed=12)
@@ -295,8 +303,8 @@ def test_random_serial_lines() -> None:
 
 
 def test_watchdog_and_faults_are_told() -> None:
-    """A main loop that is not healthy is reset by the watchdog within 9 s; a jump into nothing by the fault handler, with its
-    address; either is told as the reset cause."""
+    """A main loop that is not healthy is reset by the watchdog within 9 s; a jump into nothing by the fault handler,
+    with its address; either is told as the reset cause."""
     board = Board(image(*QUIET), seed=13)
     board.run(1.0)
     address, _ = parts.place(board.elf, "app.corrupt")
@@ -318,7 +326,8 @@ def test_watchdog_and_faults_are_told() -> None:
 
 @pytest.mark.parametrize("broken", ["crystal", "pll"])
 def test_clock_falls_back(broken: str) -> None:
-    """Without the crystal the internal oscillator serves, without the PLL at 16 MHz; telemetry still has the right bit rate."""
+    """Without the crystal the internal oscillator serves, without the PLL at 16 MHz; telemetry still has the right bit
+    rate."""
     board = Board(image(*QUIET), seed=14, clock_broken=broken)
     tap = Tap(board)
     board.run(2.5)
@@ -348,8 +357,8 @@ def found(board: parts.Board) -> tuple[int, int, int]:
 
 
 def two_saves() -> tuple[parts.Board, bytes, int, int, int]:
-    """A board after two saves; what the flash held after the first, with the samples of either, and the first operation of
-    the second."""
+    """A board after two saves; what the flash held after the first, with the samples of either, and the first operation
+    of the second."""
     board = Board(image(*SAVING), seed=21)
     board.run(2.5)
     while board.value("app.told.state_saves") < 1:
@@ -367,8 +376,9 @@ def two_saves() -> tuple[parts.Board, bytes, int, int, int]:
 
 @needs_snapshot
 def test_power_cut_at_every_flash_operation_of_a_save() -> None:
-    """A start after a cut anywhere in a save finds the state before it whole, or, once the header is complete, the new one. Short
-    run: the erase, the header, both ends of the payload and some between; SELFCAL_CAMPAIGN=2 or more: every operation."""
+    """A start after a cut anywhere in a save finds the state before it whole, or, once the header is complete, the new
+    one. Short run: the erase, the header, both ends of the payload and some between; SELFCAL_CAMPAIGN=2 or more: every
+    operation."""
     board, flash, _, _, start = two_saves()
     history = board.flash.history
     total = len(history)
@@ -403,7 +413,8 @@ def test_power_cut_at_every_flash_operation_of_a_save() -> None:
 
 @needs_snapshot
 def test_power_cut_while_running() -> None:
-    """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves again."""
+    """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves
+    again."""
     for k in (0, 3, 500):
         board, _, _, _, _ = two_saves()
         third = board.flash.operations + k
@@ -421,8 +432,8 @@ def test_power_cut_while_running() -> None:
 
 @needs_snapshot
 def test_damaged_and_foreign_states_are_refused_and_told() -> None:
-    """A flipped bit in the newest: the older one is taken, and the next save overwrites the damaged one. In both: none is taken. Of
-    another model: refused as foreign."""
+    """A flipped bit in the newest: the older one is taken, and the next save overwrites the damaged one. In both: none
+    is taken. Of another model: refused as foreign."""
     board, first, _, _, _ = two_saves()
     flash = bytearray(board.retained())
     newest = 0x20000 if first[0x20000] == 0xFF else 0
@@ -438,7 +449,7 @@ def test_damaged_and_foreign_states_are_refused_and_told() -> None:
     assert found(board) == (REFUSED, 7, 0)
     board.run(1.0)
     assert status(board)["state_found"] == REFUSED
-    other = Board(image("other model", SAVING[1], True, 0.02), seed=22, retained=first)
+    other = Board(image("other", SAVING[1], True, 0.02), seed=22, retained=first)
     assert found(other) == (REFUSED, 8, 0)
 
 
