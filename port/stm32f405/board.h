@@ -35,10 +35,13 @@ extern board_clock_t board_clock;
  * longer than about 20 ms. */
 void clock_init(void);
 
-/* Time since start. The second is for interrupt handlers, modulo 2^32. */
+/* Time since start: for the main loop; the last for interrupt handlers too, modulo 2^32. */
 uint32_t clock_ms(void);
 uint64_t clock_us(void);
 uint32_t clock_us32(void);
+
+/* Goes up each millisecond that interrupts are served. */
+uint32_t clock_ticks(void);
 
 /* At least this long, at most twice. */
 void clock_spin_us(uint32_t us);

@@ -1,11 +1,12 @@
-/* Clocks: 168 MHz by the PLL; SysTick counts milliseconds, TIM2 microseconds. RM0090 7.2 and 7.3, figure 21. */
+/* Clocks: 168 MHz by the PLL; TIM2 counts microseconds, SysTick wakes the main loop each millisecond. RM0090 7.2 and 7.3,
+ * figure 21. */
 #include "board.h"
 #include "stm32f405.h"
 
 enum { HSE_HZ = 8000000, HSI_HZ = 16000000, PLL_HZ = 168000000 };
 
 board_clock_t board_clock;
-static volatile uint32_t milliseconds;
+static volatile uint32_t ticks;
 
 /* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16 MHz. */
 static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
@@ -65,12 +66,18 @@ void clock_init(void)
 
 void systick_handler(void)
 {
-    milliseconds++;
+    ticks++;
 }
 
+uint32_t clock_ticks(void)
+{
+    return ticks;
+}
+
+/* Not from the ticks, which an erase of the flash keeps from being counted. */
 uint32_t clock_ms(void)
 {
-    return milliseconds;
+    return (uint32_t)(clock_us() / 1000U);
 }
 
 uint32_t clock_us32(void)

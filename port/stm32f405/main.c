@@ -154,14 +154,14 @@ static const port_module_t module = {
     (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 
-/* Fed once in 100 ms at most, and only if the millisecond clock goes on (a main loop that turns without its interrupts is not
- * healthy) and the application is well. */
+/* Fed once in 100 ms at most, and only if the ticks go on (a main loop that turns without its interrupts is not healthy) and the
+ * application is well. */
 static void feed(void)
 {
-    static uint32_t fed_ms;
-    const uint32_t now = clock_ms();
-    if (now - fed_ms >= 100U && app_healthy(&app)) {
-        fed_ms = now;
+    static uint32_t fed;
+    const uint32_t now = clock_ticks();
+    if (now - fed >= 100U && app_healthy(&app)) {
+        fed = now;
         watchdog_feed();
     }
 }

@@ -9,16 +9,21 @@ the tolerance of a float build."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import can
 import numpy as np
-from firmware import AXES, Board, image, readings, reports
+import pytest
+from firmware import AXES, Board, image, readings, reports, status
 
 from selfcal.engines.library import Bank
 from selfcal.model import Model
 from selfcal.tables import make_tables
 
 P_TOLERANCE, NAT_TOLERANCE, SD_TOLERANCE = 1e-4, 0.01, 0.02
-QUIET = {"flags": "-DBOARD_REPORT_MS=500", "quiet": True}
+STATUS_FRAMES = 34
+QUIET: dict[str, Any] = {"flags": "-DBOARD_REPORT_MS=500", "quiet": True}
 
 
 def test_telemetry_on_the_bus_equals_the_host() -> None:
@@ -64,3 +69,69 @@ def test_telemetry_on_the_bus_equals_the_host() -> None:
                     worst = max(worst, abs(difference) / estimate.sd)
                     assert abs(difference) <= SD_TOLERANCE * estimate.sd, (name, law, parameter, statistic)
     print(f"{len(delivered)} samples, {len(frames)} frames; statistics within {worst:.4f} posterior sd")
+
+
+@pytest.mark.parametrize("kbit_per_s", [125, 250, 500, 1000])
+def test_can_bit_rate_is_what_it_is_built_for(kbit_per_s: int) -> None:
+    """From BTR by RM0090 32.7.7: the rate exactly, the sample point within 80 to 90 %. The model acknowledges only what
+    fits its own rate to 0.5 %."""
+    board = Board(
+        image(f"can{kbit_per_s}", f"-DBOARD_REPORT_MS=500 -DBOARD_CAN_KBITPS={kbit_per_s}", quiet=True), seed=1
+    )
+    board.can.bus_bit_s = 1000.0 * kbit_per_s
+    board.run(0.9)
+    ts1, ts2 = (board.can.btr >> 16 & 15) + 1, (board.can.btr >> 20 & 7) + 1
+    assert math.isclose(board.can.bit_us, 1000.0 / kbit_per_s, rel_tol=1e-12)
+    assert 0.80 <= (1 + ts1) / (1 + ts1 + ts2) <= 0.90
+    assert len(board.frames) == STATUS_FRAMES
+    assert board.machine.violations == []
+
+
+def test_frames_leave_in_order_without_gaps() -> None:
+    """Counters of the frames on the bus: each one more than the last, though three mailboxes are filled at once."""
+    board = Board(image("quiet", **QUIET), seed=1)
+    board.run(2.2)
+    counters = [int.from_bytes(frame[1], "little") >> 38 & 0x3F for _, frame in board.frames]
+    assert counters == [i % 64 for i in range(len(counters))]
+    assert len(counters) == 4 * STATUS_FRAMES
+
+
+def test_serial_line_speaks_slcan() -> None:
+    """What python-can sends on opening is answered, frames follow; after C there are none."""
+    board = Board(
+        image("serial", "-DBOARD_REPORT_MS=500 -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD=1000000", quiet=True), seed=1
+    )
+    board.usart.host_baud = 1e6
+    board.run(0.2)
+    board.usart.say(b"C\rS6\r\rO\rO\rV\rN\r")
+    board.run(0.2)
+    assert bytes(board.text) == b"\r\r\r\r\rV0101\rNSCAL\r"
+    board.run(0.7)
+    lines = bytes(board.text).split(b"\r")[7:]
+    frames = [
+        can.Message(arbitration_id=int(line[1:4], 16), data=bytes.fromhex(line[5:].decode()), is_extended_id=False)
+        for line in lines
+        if line
+    ]
+    decoder, _ = reports(frames)
+    assert len(frames) == 2 * STATUS_FRAMES  # at 0.5 and 1 s
+    assert decoder.statistics.damaged == decoder.statistics.lost == 0
+    assert decoder.status["sensor_state"] == 2
+    board.usart.say(b"C\r")
+    board.run(0.1)
+    board.text.clear()
+    board.run(1.0)
+    assert bytes(board.text) == b""
+    assert board.machine.violations == []
+
+
+def test_set_up_of_the_sensor() -> None:
+    """Registers after start, data sheet tables 15 to 18: 102.4 samples a second, +-300 deg/s, two taps, data-ready on
+    DIO1 rising; one self-test; every sample read by two bursts."""
+    board = Board(image("quiet", **QUIET), seed=1)
+    board.run(1.5)
+    registers = board.sensor.registers
+    assert (registers[0x36], registers[0x38], registers[0x34]) == (15, 0x0401, 0x0006)
+    made = [index for index, us, _ in board.sensor.taken if 0.6e6 < us < 1.49e6]  # the last may still be being read
+    assert [index for index in board.sensor.read_twice if made[0] <= index <= made[-1]] == made
+    assert status(board)["sensor_fault_count"] == 0
