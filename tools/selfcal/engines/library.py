@@ -22,7 +22,7 @@ def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
 
 
 class Bank:
-    """A bank over the axes of `tables`; `double` picks the verification build, `dense` one of 64 nodes a dimension."""
+    """A bank over the axes of `tables`; `double`: the verification build, `dense`: 64 nodes a dimension."""
 
     def __init__(self, tables: Tables, *, double: bool = False, dense: bool = False) -> None:
         self.tables = tables
