@@ -260,6 +260,12 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         a = r_fma(u, gains->u[i], a);
         node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
         node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
+        if (r < R(0.5)) { /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
+            const selfcal_wide_t ln_s = log((selfcal_wide_t)r + (selfcal_wide_t)p);
+            const selfcal_real_t hi = (selfcal_real_t)ln_s;
+            sum_add(&node->ln_s, hi, (selfcal_real_t)(ln_s - (selfcal_wide_t)hi));
+            continue;
+        }
         const selfcal_real_t s_less_1 = (r - R(1.0)) + p;
         product_less_1 = r_fma(product_less_1, s_less_1, product_less_1 + s_less_1);
         if (product_less_1 > R(1e15)) {
