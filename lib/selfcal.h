@@ -154,7 +154,7 @@ typedef enum { SELFCAL_N = 0, SELFCAL_K = 1, SELFCAL_SIGMA_M = 2, SELFCAL_ALPHA 
 
 /* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
 typedef struct {
-    float ln_min, ln_max; /* ln of the parameter in the units above */
+    float ln_min, ln_max; /* ln of the parameter in the units above, within 46 of 0: 1e-20 to 1e20 */
     bool uniform;         /* false: log-uniform */
 } selfcal_prior_t;
 
@@ -185,7 +185,7 @@ typedef struct {
 
 typedef struct {
     uint32_t id;        /* checksum of the tables: what a snapshot or a monitor tells models apart by */
-    float dt_s;         /* bank interval */
+    float dt_s;         /* bank interval, 1e-6 to 1e6 */
     uint32_t block;     /* samples averaged into one bank sample */
     uint8_t axes;
     uint8_t hypotheses;
