@@ -22,11 +22,17 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
     return (self->retired >> axis & 1U) != 0U;
 }
 
+/* `count` bank intervals without a value. A counter that is at its end stays there. */
+static void lose_blocks(selfcal_t *self, uint64_t count) {
+    const uint32_t room = UINT32_MAX - self->counters.blocks_lost;
+    self->counters.blocks_lost += count < room ? (uint32_t)count : room;
+    selfcal_bank_gap(self, count);
+}
+
 static void close_block(selfcal_t *self) {
     const uint32_t block = self->block;
     if (self->used < block - self->used) {
-        self->counters.blocks_lost++;
-        selfcal_bank_gap(self, 1U);
+        lose_blocks(self, 1U);
         start_block(self);
         return;
     }
@@ -75,8 +81,7 @@ static void pass(selfcal_t *self, uint64_t count) {
     close_block(self);
     count -= left;
     const uint64_t whole = count / block;
-    self->counters.blocks_lost += (uint32_t)whole;
-    selfcal_bank_gap(self, whole);
+    lose_blocks(self, whole);
     self->position = (uint32_t)(count % block);
 }
 
@@ -84,7 +89,8 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    self->counters.missing += count;
+    const uint64_t room = UINT64_MAX - self->counters.missing;
+    self->counters.missing += count < room ? count : room;
     pass(self, count);
     return SELFCAL_OK;
 }

@@ -28,8 +28,19 @@
 #define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
 
+/* ln of what a prior may reach, 1e-20 to 1e20 of any unit: rounding alone would carry wider limits out of a float's range. */
+#define LN_LIMIT 46.0F
+
+/* s; a bank interval of a microsecond or of ten days is no sensor's. */
+#define DT_MIN 1e-6F
+#define DT_MAX 1e6F
+
+/* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
+ * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
+#define LN_RHO_MAX R(13.8)
+
 static bool valid_prior(const selfcal_prior_t *prior) {
-    return isfinite(prior->ln_min) && isfinite(prior->ln_max) && prior->ln_min < prior->ln_max;
+    return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
 }
 
 static bool valid_grid(const selfcal_grid_t *grid) {
@@ -60,7 +71,7 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
 }
 
 static bool valid_model(const selfcal_model_t *model) {
-    if (!(model->dt_s > 0.0F) || !isfinite(model->dt_s) || model->block == 0U || model->axes == 0U ||
+    if (!(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {
         return false;
@@ -195,6 +206,8 @@ static void place_nodes(selfcal_t *self) {
             alpha_hi = r_fmax(alpha_hi, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max);
         }
         const uint16_t rows = grid_rows(hypothesis), columns = grid_columns(hypothesis);
+        rho_lo = r_fmin(rho_lo, LN_RHO_MAX - R(1.0));
+        rho_hi = r_fmin(rho_hi, LN_RHO_MAX);
         self->rho_lo[h] = rho_lo;
         self->rho_step[h] = rows > 1U ? (rho_hi - rho_lo) / (selfcal_real_t)(rows - 1U) : R(0.0);
         self->alpha_lo[h] = alpha_lo;
@@ -260,6 +273,12 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         a = r_fma(u, gains->u[i], a);
         node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
         node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
+        if (r < R(0.5)) { /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
+            const selfcal_wide_t ln_s = log((selfcal_wide_t)r + (selfcal_wide_t)p);
+            const selfcal_real_t hi = (selfcal_real_t)ln_s;
+            sum_add(&node->ln_s, hi, (selfcal_real_t)(ln_s - (selfcal_wide_t)hi));
+            continue;
+        }
         const selfcal_real_t s_less_1 = (r - R(1.0)) + p;
         product_less_1 = r_fma(product_less_1, s_less_1, product_less_1 + s_less_1);
         if (product_less_1 > R(1e15)) {

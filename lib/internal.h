@@ -39,6 +39,9 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 
 #define SELFCAL_LN_2PI 1.8378770664093454836
 
+/* C99 has no _Static_assert. `name` says what holds. */
+#define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
+
 /* bank.c */
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);

@@ -488,7 +488,7 @@ static void step_scan(selfcal_work_t *work) {
             work->best_at[1] = row.ln_alpha;
             memcpy(work->best_ln, ln_value, sizeof ln_value);
         }
-        if (cell.profile < work->best - DEPTH) {
+        if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
             continue;
         }
         const selfcal_real_t middle[2] = {cell.ln_rho, row.ln_alpha};
@@ -508,8 +508,15 @@ static void step_scan(selfcal_work_t *work) {
 /* Takes what the pass found as the next box; true when the search is over. The first pass only finds the peak, so that the
  * next ones need not keep what lay near an earlier, lower best. */
 static bool end_scan(selfcal_work_t *work) {
-    if (work->pass == 0U || !(work->found_lo[0] < work->found_hi[0])) {
-        return !(work->found_lo[0] < work->found_hi[0]) || hypothesis_of(work)->rho == NULL;
+    if (!(work->found_lo[0] < work->found_hi[0])) {
+        /* Against a limit where the likelihood is steep, a wide cell reaches in from where no narrow one does, and all that is left
+         * lies far below what it promised: once more in this box, for the best that is in it. */
+        const bool again = work->best > (selfcal_real_t)-INFINITY && work->pass < PASSES_MAX;
+        work->best = -INFINITY;
+        return !again;
+    }
+    if (work->pass == 0U) {
+        return hypothesis_of(work)->rho == NULL;
     }
     bool shrunk = false;
     selfcal_real_t hi[2];
@@ -673,13 +680,15 @@ static void step_sum(selfcal_work_t *work) {
         if (i < last) {
             make_cell(work, &row, (uint16_t)(i + 1U), &after);
         }
-        if (cell.profile < work->best - DEPTH) {
+        if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
             continue;
         }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         cell_parameters(work, &row, &cell, ln_value);
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
-        const moments_t sum = sum_cell(work, ln_value, r_exp(cell.profile - work->best) * alpha_density, fall);
+        /* Above the best of the search are cells out of the priors' reach, however far: their mass is 0 times a finite height. */
+        const selfcal_real_t height = r_exp(r_fmin(cell.profile - work->best, DEPTH));
+        const moments_t sum = sum_cell(work, ln_value, height * alpha_density, fall);
         part_mass += (selfcal_wide_t)sum.mass;
         work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
         work->first[SELFCAL_N] += (selfcal_wide_t)sum.n1;

@@ -154,7 +154,7 @@ typedef enum { SELFCAL_N = 0, SELFCAL_K = 1, SELFCAL_SIGMA_M = 2, SELFCAL_ALPHA 
 
 /* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
 typedef struct {
-    float ln_min, ln_max; /* ln of the parameter in the units above */
+    float ln_min, ln_max; /* ln of the parameter in the units above, within 46 of 0: 1e-20 to 1e20 */
     bool uniform;         /* false: log-uniform */
 } selfcal_prior_t;
 
@@ -185,7 +185,7 @@ typedef struct {
 
 typedef struct {
     uint32_t id;        /* checksum of the tables: what a snapshot or a monitor tells models apart by */
-    float dt_s;         /* bank interval */
+    float dt_s;         /* bank interval, 1e-6 to 1e6 */
     uint32_t block;     /* samples averaged into one bank sample */
     uint8_t axes;
     uint8_t hypotheses;
@@ -204,7 +204,14 @@ typedef enum {
     SELFCAL_AXIS_RETIRED = 4,    /* the axis failed for SELFCAL_RETIRE_BLOCKS: it has no sums any more */
     SELFCAL_BAD_ARGUMENT = -1,   /* null pointer, axis or node out of range, sigma_v not positive */
     SELFCAL_BAD_MODEL = -2,      /* tables contradict themselves or exceed a configured maximum */
-    SELFCAL_BAD_MEMORY = -3      /* too small, or not aligned to 8 bytes */
+    SELFCAL_BAD_MEMORY = -3,     /* too small, or not aligned to 8 bytes */
+    SELFCAL_WRITE_FAILED = -4,         /* the callback of selfcal_save() said so */
+    SELFCAL_SNAPSHOT_TRUNCATED = -5,   /* fewer bytes than a snapshot says it has */
+    SELFCAL_SNAPSHOT_TOO_LONG = -6,    /* more bytes than it says */
+    SELFCAL_SNAPSHOT_DAMAGED = -7,     /* its checksum does not fit */
+    SELFCAL_SNAPSHOT_FOREIGN = -8,     /* not a snapshot, or of another model or build */
+    SELFCAL_SNAPSHOT_VERSION = -9,     /* of another format version */
+    SELFCAL_CORRUPT = -10              /* an invariant is broken */
 } selfcal_status_t;
 
 /* Monotonic since selfcal_init(). */
@@ -237,7 +244,7 @@ typedef struct {
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
 } selfcal_node_t;
 
-/* Bytes of memory selfcal_init() needs: for each node in the float build, 56 and 20 more per axis. */
+/* Bytes of memory selfcal_init() needs: for each node in the float build, 56 and 20 more per axis (check.c holds it to that). */
 #define SELFCAL_SIZE(nodes, axes) \
     ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
 
@@ -359,6 +366,40 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
 
 /* Exact ln p(Y | node, sigma_v) of everything pushed on one axis, x0 integrated out; sigma_v in unit per bank interval. */
 selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v, selfcal_wide_t *ln_p);
+
+/* Whether the bank can be what pushes and skips have made of it: pointers, places within their arrays, counts that fit each other,
+ * sums finite and of the right sign. SELFCAL_CORRUPT: memory was overwritten, by a bug or by a fault; nothing but selfcal_init()
+ * or selfcal_restore() should follow. SELFCAL_BAD_ARGUMENT on NULL. O(nodes * axes), no logarithm, no division. */
+selfcal_status_t selfcal_check(const selfcal_t *self);
+
+/* --------------------------------------------------------------------------------------------------------- snapshot
+ * Everything a bank knows as a stream of bytes, the same on every machine (little-endian; format in snapshot.c), with a version and
+ * a CRC-32. A bank saved and restored goes on bit for bit like one that was never stopped, whatever was under way: a block, a
+ * batch, a gap. Not part of it: a report under way, and telemetry. */
+
+/* Takes the next `count` bytes, `context` as given to selfcal_save(). false: the medium failed, nothing more is written. */
+typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
+
+/* selfcal_save() writes this many bytes at a time, and the rest at last. */
+#define SELFCAL_SNAPSHOT_CHUNK 64U
+
+/* No snapshot of a model is longer: for a flash slot or a buffer laid out by the compiler. */
+#define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
+
+/* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. */
+size_t selfcal_snapshot_size(const selfcal_t *self);
+
+/* Writes the bank. It is not changed, and not flushed. SELFCAL_WRITE_FAILED; SELFCAL_CORRUPT if selfcal_check() fails: nothing is
+ * written, so that the last good snapshot stays; SELFCAL_BAD_ARGUMENT on NULL. */
+selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void *context);
+
+/* selfcal_init(), then the state that `snapshot` holds: `length` bytes, aligned or not, all of them and no more. `model` must be
+ * that of the saved bank, known by its id, axes and nodes; the build must have the same selfcal_real_t and configuration.
+ * Refused with one of SELFCAL_SNAPSHOT_..., SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL or SELFCAL_BAD_MEMORY: `self` and `memory` are as
+ * they were. SELFCAL_CORRUPT (the checksum fits what no bank can be): `self` is as selfcal_init() leaves it, without a sample.
+ * O(nodes * axes). */
+selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size, const void *snapshot,
+                                 size_t length);
 
 /* ----------------------------------------------------------------------------------------------------------- report */
 

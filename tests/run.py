@@ -16,7 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build"
 #: s; a suite that takes longer hangs.
-TIMEOUT = {"check": 900, "c": 600, "bench": 300, "pytest": 3000}
+TIMEOUT = {"check": 900, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
+#: s
+FUZZ_SECONDS = 20
 WORKERS = "2"
 
 
@@ -110,6 +112,17 @@ def bench() -> Count:
     return count
 
 
+def fuzz() -> Count:
+    """Random calls of the library for a while, after those that failed it once: one test."""
+    code, output = run(["make", "--silent", "fuzz", f"SECONDS={FUZZ_SECONDS}"], TIMEOUT["fuzz"])
+    runs = re.search(r"number_of_executed_units: (\d+)", output)
+    passed = code == 0 and runs is not None and int(runs[1]) > 0
+    print(f"{'ok    ' if passed else 'FAILED'} fuzz: {runs[1] if runs else 'no'} executions")
+    if not passed:
+        print(output)
+    return Count(passed=1) if passed else Count(failed=1)
+
+
 def pytest() -> Count:
     """The Python tests; their output is shown as it comes."""
     report = BUILD / "pytest.xml"
@@ -142,7 +155,7 @@ def main() -> None:
     """All suites, each timed; exit code 1 if anything failed."""
     BUILD.mkdir(exist_ok=True)
     total = Count()
-    for suite in (checks, c_tests, bench, pytest):
+    for suite in (checks, c_tests, fuzz, bench, pytest):
         start = time.monotonic()
         count = suite()
         print(f"{suite.__name__}: {count} ({time.monotonic() - start:.0f} s)", flush=True)

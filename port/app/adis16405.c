@@ -369,7 +369,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         if (self->state != ADIS16405_RUNNING) {
             continue;
         }
-        if (self->anchored && stamp - self->last_us > 10ULL * (self->nominal_q8 >> 8)) {
+        if (self->anchored && stamp - self->last_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {
             self->anchored = false;
         }
         if (sign_lost(self, raw[0])) {

@@ -400,6 +400,34 @@ static void a_change_of_rate_changes_the_weight_alone(void) {
     TEST_ASSERT_EQUAL(10, selfcal_counters(&bank)->blocks_lost);
 }
 
+/* Found by fuzzing: a whole batch at a small ratio. The constant law's s is r, so D = n ln r; 1e-12 of it, for the long sum has twice
+ * the digits of float. */
+static void better_samples_than_the_models_keep_ln_s(void) {
+    const float ratio = 1.0F / 768.0F;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 1U, ratio));
+    for (int i = 0; i < 1000; i++) {
+        push(1.0F + 0.01F * noise());
+    }
+    selfcal_node_view_t view;
+    for (uint16_t index = 0; index < model.nodes; index++) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, index, &view));
+        TEST_ASSERT_TRUE(isfinite(view.ln_s));
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, 0, &view));
+    TEST_ASSERT_EQUAL(SELFCAL_CONSTANT, view.law);
+    TEST_ASSERT_TRUE(fabs(view.ln_s - 1000.0 * log((selfcal_wide_t)ratio)) < 1e-12 * 1000.0 * 6.7);
+}
+
+/* Found by fuzzing: counts beyond their type stay at its end rather than start anew. */
+static void counters_never_run_backwards(void) {
+    push(1.0F);
+    for (int i = 0; i < 3; i++) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_skip(&bank, UINT64_MAX - 5U));
+        TEST_ASSERT_TRUE(selfcal_counters(&bank)->missing == (i == 0 ? UINT64_MAX - 5U : UINT64_MAX));
+        TEST_ASSERT_TRUE(selfcal_counters(&bank)->blocks_lost == UINT32_MAX);
+    }
+}
+
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(a_block_is_averaged);
@@ -415,5 +443,7 @@ int main(void) {
     RUN_TEST(only_an_axis_that_starves_the_others_is_retired);
     RUN_TEST(motion_drops_the_block_in_progress);
     RUN_TEST(a_change_of_rate_changes_the_weight_alone);
+    RUN_TEST(counters_never_run_backwards);
+    RUN_TEST(better_samples_than_the_models_keep_ln_s);
     return UNITY_END();
 }

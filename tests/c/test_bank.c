@@ -86,6 +86,54 @@ static void models_that_contradict_themselves_are_refused(void) {
     bad = model;
     bad.block = 0;
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
+    static const float intervals[] = {0.0F, -1.0F, 0.9e-6F, 1.1e6F, INFINITY};
+    for (unsigned i = 0; i < sizeof intervals / sizeof intervals[0]; i++) {
+        bad = model;
+        bad.dt_s = intervals[i];
+        TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
+    }
+    static const selfcal_prior_t priors[] = {{-47.0F, 0.0F, false}, {0.0F, 47.0F, false}, {1.0F, 1.0F, false}, {NAN, 1.0F, false},
+                                             {0.0F, NAN, false},    {-INFINITY, 0.0F, true}, {0.0F, INFINITY, true}};
+    for (unsigned i = 0; i < sizeof priors / sizeof priors[0]; i++) {
+        selfcal_axis_t axis[AXES];
+        memcpy(axis, model.axis, sizeof axis);
+        axis[AXES - 1U].prior[SELFCAL_SIGMA_M] = priors[i];
+        bad = model;
+        bad.axis = axis;
+        TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
+    }
+}
+
+/* Found by fuzzing: drift over white noise is anything here, up to 1e40. Through the longest gaps there are, with blocks of every
+ * weight, nothing overflows. */
+static void the_widest_priors_keep_every_sum_finite(void) {
+    selfcal_axis_t axis[AXES];
+    memcpy(axis, model.axis, sizeof axis);
+    for (unsigned i = 0; i < AXES; i++) {
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            axis[i].prior[p].ln_min = -46.0F;
+            axis[i].prior[p].ln_max = 46.0F;
+        }
+    }
+    model.axis = axis;
+    model.block = 2;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&bank, &model, memory, sizeof memory));
+    for (int i = 0; i < 200; i++) {
+        push(i % 50 == 0 ? 1e9F : 0.0F, i < 100 ? 0.0F : 0.02F);
+        if (i % 7 == 3) {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_skip(&bank, i % 2 == 0 ? 1U : UINT64_MAX));
+        }
+        if (i % 40 == 20) {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 2, i == 60 ? SELFCAL_VARIANCE_RATIO_MAX : 1.0F));
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
+    }
+    selfcal_node_view_t view;
+    for (uint16_t node = 0; node < model.nodes; node++) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, node, &view));
+        TEST_ASSERT_TRUE(isfinite(view.a) && isfinite(view.b) && isfinite(view.c) && isfinite(view.ln_s) && view.a > 0.0);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
 }
 
 /* Node 0 is the constant law: s = 1, nu = y, so A = n, B = sum y, C = sum y^2 about the offset, D = 0. */
@@ -303,6 +351,7 @@ int main(void) {
     UNITY_BEGIN();
     RUN_TEST(bad_arguments_change_nothing);
     RUN_TEST(models_that_contradict_themselves_are_refused);
+    RUN_TEST(the_widest_priors_keep_every_sum_finite);
     RUN_TEST(the_constant_law_sums_the_data);
     RUN_TEST(the_likelihood_of_the_constant_law_is_the_normal_density);
     RUN_TEST(a_gap_may_be_told_in_pieces);

@@ -197,17 +197,17 @@ static void test_status_counts_stop_at_the_end_of_their_range(void)
     counters.saturated[1] = 2;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_status(&telemetry, &counters, SELFCAL_FINISHED, 3, 5000));
     selfcal_frame_t frame;
-    for (uint32_t item = 0; item < 16; item++) {
+    for (uint32_t item = 0; item < 34; item++) {
         frame = next(item);
         TEST_ASSERT_EQUAL_HEX16(0x200, frame.id);
         switch (item) {
-        case 1: TEST_ASSERT_EQUAL_UINT32(1, value(&frame)); break;
+        case 1: TEST_ASSERT_EQUAL_UINT32(2, value(&frame)); break;
         case 2: TEST_ASSERT_EQUAL_HEX32(0xCAFEF00D, value(&frame)); break;
         case 5: TEST_ASSERT_EQUAL_UINT32(2, value(&frame)); break;
         case 6: TEST_ASSERT_EQUAL_UINT32(3, value(&frame)); break;
         case 7:
         case 13: TEST_ASSERT_EQUAL_HEX32(0xFFFFFFFF, value(&frame)); break;
-        case 15: TEST_ASSERT_EQUAL_UINT32(15, value(&frame)); break; /* frames before this one */
+        case 33: TEST_ASSERT_EQUAL_UINT32(33, value(&frame)); break; /* frames before this one */
         default: break;
         }
     }

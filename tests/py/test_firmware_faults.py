@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable
 
 import pytest
-from firmware import ROOT, Board, Tap, image, messages, parts, reports, status
+from firmware import Board, Tap, image, messages, parts, reports, status
 from parts.flash import half_erased, half_programmed
 
 MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
@@ -339,9 +339,6 @@ def test_clock_falls_back(broken: str) -> None:
 # ---------------------------------------------------------------------------------------------------------- saved state
 
 SAVING = ("saving", "-DBOARD_REPORT_MS=500 -DBOARD_SAVE_PERIOD_S=2U", True)
-needs_snapshot = pytest.mark.skipif(
-    "SELFCAL_SNAPSHOT_MAX" not in (ROOT / "lib" / "selfcal.h").read_text(), reason="THE LIBRARY HAS NO SNAPSHOT YET"
-)
 NEWEST, OLDER, REFUSED = 1, 2, 3
 SLOTS = 0x080C0000
 
@@ -374,7 +371,6 @@ def two_saves() -> tuple[parts.Board, bytes, int, int, int]:
     return board, first, samples[0], samples[1], operations
 
 
-@needs_snapshot
 def test_power_cut_at_every_flash_operation_of_a_save() -> None:
     """A start after a cut anywhere in a save finds the state before it whole, or, once the header is complete, the new
     one. Short run: the erase, the header, both ends of the payload and some between; SELFCAL_CAMPAIGN=2 or more: every
@@ -411,7 +407,6 @@ def test_power_cut_at_every_flash_operation_of_a_save() -> None:
     assert survived == trials
 
 
-@needs_snapshot
 def test_power_cut_while_running() -> None:
     """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves
     again."""
@@ -430,7 +425,6 @@ def test_power_cut_while_running() -> None:
         assert board.machine.violations == board.machine.faults == []
 
 
-@needs_snapshot
 def test_damaged_and_foreign_states_are_refused_and_told() -> None:
     """A flipped bit in the newest: the older one is taken, and the next save overwrites the damaged one. In both: none
     is taken. Of another model: refused as foreign."""
@@ -453,7 +447,6 @@ def test_damaged_and_foreign_states_are_refused_and_told() -> None:
     assert found(other) == (REFUSED, 8, 0)
 
 
-@needs_snapshot
 def test_flash_that_refuses_is_told_and_loses_nothing() -> None:
     """An operation that the flash refuses voids the save: counted, and what was saved before stands."""
     board, _, _, _, _ = two_saves()

@@ -34,7 +34,7 @@ from wire_stream import ROOT, Sent, lines, message, serial_line, stream
 DBC = ROOT / "lib" / "selfcal.dbc"
 COMMON = {"item", "counter", "time", "crc"}
 REPORT_FRAMES = 44
-STATUS_FRAMES = 16
+STATUS_FRAMES = 34
 ALL_FLAGS = (
     "constant_N_flags",
     "random_walk_N_flags",

@@ -34,7 +34,8 @@ struct Grid {
 
 class Bank {
 public:
-    Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses) {
+    Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses,
+         uint32_t id) {
         for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
             if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || uniform.size() != SELFCAL_PARAMETERS)
@@ -52,7 +53,7 @@ public:
             nodes += size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
             hypotheses_.push_back(h);
         }
-        model_ = {0,
+        model_ = {id,
                   static_cast<float>(dt_s),
                   block,
                   static_cast<uint8_t>(axes_.size()),
@@ -172,6 +173,23 @@ public:
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const { return SELFCAL_SIZE(model_.nodes, model_.axes); }
 
+    bool sound() const { return selfcal_check(&bank_) == SELFCAL_OK; }
+
+    nb::bytes save() const {
+        std::string bytes;
+        const auto append = [](void *to, const void *from, size_t count) {
+            static_cast<std::string *>(to)->append(static_cast<const char *>(from), count);
+            return true;
+        };
+        bytes.reserve(selfcal_snapshot_size(&bank_));
+        check(selfcal_save(&bank_, append, &bytes));
+        return nb::bytes(bytes.data(), bytes.size());
+    }
+
+    void restore(const nb::bytes &snapshot) {
+        check(selfcal_restore(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double), snapshot.data(), snapshot.size()));
+    }
+
     float within_sd(uint8_t axis) const {
         if (axis >= axes_.size())
             throw std::invalid_argument("axis out of range");
@@ -198,6 +216,16 @@ private:
             throw std::invalid_argument("argument out of range");
         case SELFCAL_BAD_MODEL:
             throw std::invalid_argument("the model's tables contradict themselves or exceed what the library is built for");
+        case SELFCAL_SNAPSHOT_TRUNCATED:
+            throw std::invalid_argument("the snapshot is truncated");
+        case SELFCAL_SNAPSHOT_TOO_LONG:
+            throw std::invalid_argument("the snapshot is longer than it says");
+        case SELFCAL_SNAPSHOT_DAMAGED:
+            throw std::invalid_argument("the snapshot is damaged");
+        case SELFCAL_SNAPSHOT_FOREIGN:
+            throw std::invalid_argument("not a snapshot of this model and build");
+        case SELFCAL_SNAPSHOT_VERSION:
+            throw std::invalid_argument("the snapshot is of another format version");
         default:
             throw std::runtime_error("selfcal status " + std::to_string(static_cast<int>(status)));
         }
@@ -283,7 +311,7 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("AT_MAX") = static_cast<int>(SELFCAL_AT_MAX);
     m.attr("OFF_GRID") = static_cast<int>(SELFCAL_OFF_GRID);
     nb::class_<Bank>(m, "Bank")
-        .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &>())
+        .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t>())
         .def("push", &Bank::push)
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
@@ -295,6 +323,9 @@ NB_MODULE(MODULE_NAME, m) {
         .def("log_likelihood", &Bank::log_likelihood)
         .def("counters", &Bank::counters)
         .def("within_sd", &Bank::within_sd)
+        .def("save", &Bank::save)
+        .def("restore", &Bank::restore)
+        .def_prop_ro("sound", &Bank::sound)
         .def_prop_ro("count", &Bank::count)
         .def_prop_ro("nodes", &Bank::nodes)
         .def_prop_ro("size", &Bank::size);

@@ -11,6 +11,9 @@ need() { # need PACKAGE COMMAND...: the package unless the command succeeds
 }
 have() { command -v "$1"; }
 header() { printf '#if !__has_include(<%s>)\n#error\n#endif\n' "$1" | "$2" -x c -E -; } # header NAME COMPILER
+# Without clang: the version that Debian 12 has.
+clang_major() { clang -dumpversion 2>/dev/null | grep -o '^[0-9]*' || echo 14; }
+fuzzer_runtime() { test -f "$(clang -print-runtime-dir)/libclang_rt.fuzzer-$(uname -m).a"; }
 python_header() { test -f "$("$PYTHON" -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h"; }
 
 missing_packages() {
@@ -24,6 +27,7 @@ missing_packages() {
     need libeigen3-dev header eigen3/Eigen/Core g++
     need clang have clang
     need clang-tidy have clang-tidy
+    need "libclang-rt-$(clang_major)-dev" fuzzer_runtime
     need gcc-arm-none-eabi have arm-none-eabi-gcc
     need libnewlib-arm-none-eabi header math.h arm-none-eabi-gcc
     need qemu-system-arm have qemu-system-arm

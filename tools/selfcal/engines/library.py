@@ -22,7 +22,7 @@ def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
 
 
 class Bank:
-    """A bank over the axes of `tables`; `double` picks the verification build, `dense` that for up to 64 nodes a dimension."""
+    """A bank over the axes of `tables`; `double`: the verification build, `dense`: 64 nodes a dimension."""
 
     def __init__(self, tables: Tables, *, double: bool = False, dense: bool = False) -> None:
         self.tables = tables
@@ -34,6 +34,7 @@ class Bank:
                 for a in tables.axes
             ],
             [(h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha)) for h in tables.hypotheses],
+            tables.id,
         )
 
     def push(self, samples: NDArray[np.floating[Any]], missing_before: NDArray[np.integer[Any]] | None = None) -> None:
@@ -41,6 +42,17 @@ class Bank:
         rows = np.ascontiguousarray(samples, dtype=np.float32)
         missing = np.zeros(len(rows)) if missing_before is None else missing_before
         self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64))
+
+    def save(self) -> bytes:
+        """Everything the bank knows, in the format of lib/snapshot.c."""
+        return bytes(self.raw.save())
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from `snapshot`. Unless it is a whole one of this model and build: UserError, and nothing changes."""
+        try:
+            self.raw.restore(snapshot)
+        except ValueError as error:  # std::invalid_argument
+            raise UserError(str(error)) from error
 
     def report(self, axis: int) -> AxisResult:
         """Posterior of one axis now. Raises UserError of an axis that failed, or with too few bank samples."""

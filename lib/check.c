@@ -1,0 +1,141 @@
+/* Invariants of a bank: what every push, skip and report leaves true, whatever came in. */
+#include "internal.h"
+
+/* The prices that selfcal.h states. */
+#ifndef SELFCAL_REAL_DOUBLE
+SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
+SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
+#endif
+
+/* Room for rounding in quantities that are bounded by 1 or by each other. */
+#define SLACK R(1e-5)
+
+/* False for NaN. */
+static bool within(selfcal_real_t value, selfcal_real_t lo, selfcal_real_t hi) {
+    return value >= lo && value <= hi;
+}
+
+static bool finite_sum(selfcal_sum_t sum) {
+    return isfinite(sum.hi) && isfinite(sum.lo);
+}
+
+static bool memory_is_laid_out(const selfcal_t *self) {
+    const selfcal_model_t *model = self->model;
+    if (model == NULL || model->axes == 0U || model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U ||
+        model->hypotheses > SELFCAL_HYPOTHESES_MAX || model->block == 0U) {
+        return false;
+    }
+    const size_t cells = (size_t)model->nodes * model->axes;
+    return self->b != NULL && self->c == self->b + cells && (const void *)self->node == (const void *)(self->c + cells) &&
+           (const void *)self->x == (const void *)(self->node + model->nodes);
+}
+
+static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) {
+    const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
+    for (uint32_t i = 0; i < batch->count; i++) {
+        /* a block counts from half of its samples on */
+        if (!within(batch->r[i], R(1.0) / ratio_max, R(2.0) * ratio_max)) {
+            return false;
+        }
+        for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+            if (!isfinite(batch->y[axis][i])) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+/* One batch is gathered and never full: then it is handed over. The other waits for the nodes or is empty. */
+static bool batches_are_sound(const selfcal_t *self) {
+    if (self->gathering > 1U) {
+        return false;
+    }
+    const selfcal_batch_t *gathered = &self->batch[self->gathering], *waits = &self->batch[1U - self->gathering];
+    if (gathered->count >= SELFCAL_BATCH || gathered->gap_after > 0U || waits->count > SELFCAL_BATCH ||
+        self->ran >= self->model->nodes || (self->ran > 0U && waits->count == 0U && waits->gap_after == 0U) ||
+        self->push_nodes == 0U) {
+        return false;
+    }
+    /* time before the first sample is no gap */
+    if (self->n == 0U && (waits->count > 0U ? waits->gap[0] : gathered->count > 0U ? gathered->gap[0] : self->pending_gap) > 0U) {
+        return false;
+    }
+    return batch_is_sound(self, gathered) && batch_is_sound(self, waits);
+}
+
+static bool averager_is_sound(const selfcal_t *self) {
+    const selfcal_counters_t *count = &self->counters;
+    const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
+    if (self->position >= self->block || self->used > self->position || self->started != (count->samples > 0U) ||
+        (!self->started && (self->position > 0U || self->in_gap)) || count->samples < self->used ||
+        selfcal_count(self) > count->samples - self->used || count->samples - self->used < self->within_dof ||
+        count->blocks_part > selfcal_count(self) || (self->in_gap && count->gaps == 0U) || (self->dropped && self->used > 0U) ||
+        !within(self->variance_ratio, R(1.0) / ratio_max, ratio_max) ||
+        self->retired >= (1UL << self->model->axes) - 1U) { /* the last axis is never retired */
+        return false;
+    }
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        if (self->bad[axis] > self->watched || !isfinite(self->last[axis])) {
+            return false;
+        }
+        if (!selfcal_retired(self, axis) &&
+            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !isfinite(self->first[axis]) ||
+             !isfinite(self->sum[axis]) || !(self->sum_sq[axis] >= R(0.0)) || !isfinite(self->sum_sq[axis]) ||
+             !(self->within[axis] >= 0.0) || !isfinite(self->within[axis]))) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool node_is_sound(const selfcal_t *self, size_t j) {
+    const selfcal_node_t *node = &self->node[j];
+    const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
+    if (!within(node->beta, R(0.0), R(1.0)) || !(node->q >= R(0.0)) || !isfinite(node->q) || !(node->p_inf >= R(0.0)) ||
+        !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
+        node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
+        !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
+        (node->level ? node->d != R(0.0) || node->e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
+        node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
+        return false;
+    }
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* The nodes have a place once the first batch has run. */
+static bool grid_is_sound(const selfcal_t *self) {
+    for (uint8_t h = 0; h < self->model->hypotheses; h++) {
+        const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[h];
+        if (!isfinite(self->rho_lo[h]) || !isfinite(self->alpha_lo[h]) || !isfinite(self->rho_step[h]) ||
+            !isfinite(self->alpha_step[h]) || (hypothesis->rho != NULL && !(self->rho_step[h] > R(0.0))) ||
+            (hypothesis->alpha != NULL && !(self->alpha_step[h] > R(0.0)))) {
+            return false;
+        }
+    }
+    return true;
+}
+
+selfcal_status_t selfcal_check(const selfcal_t *self) {
+    if (self == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self)) {
+        return SELFCAL_CORRUPT;
+    }
+    if (self->n > 0U && !grid_is_sound(self)) {
+        return SELFCAL_CORRUPT;
+    }
+    for (size_t j = 0; j < self->model->nodes; j++) {
+        if (!node_is_sound(self, j)) {
+            return SELFCAL_CORRUPT;
+        }
+    }
+    return SELFCAL_OK;
+}

@@ -1,0 +1,111 @@
+"""Snapshots through the bindings: the format as a reader of another language sees it, and records cut anywhere."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+from selfcal.engines.library import Bank
+from selfcal.errors import UserError
+from selfcal.model import Model
+from selfcal.tables import Tables, make_tables
+
+#: 10 Hz averaged to 1 Hz, two axes of the gyro.
+AXES = ("gx", "gy")
+SAMPLES = 3000
+HEADER = struct.Struct("<4sIHBBHHII")
+
+
+def tables() -> Tables:
+    return make_tables(Model.load(), 10.0, AXES, "cortex-m4f")
+
+
+def record() -> tuple[np.ndarray, np.ndarray]:
+    """Samples [n, 2] with a random walk, NaN and saturated ones among them; missing ones before each [n], up to 2 h."""
+    rng = np.random.default_rng(3)
+    drift = np.cumsum(rng.normal(0.0, 1e-3, (SAMPLES, 2)), axis=0)
+    samples = (0.1 + drift + rng.normal(0.0, 0.05, (SAMPLES, 2))).astype(np.float32)
+    samples[rng.integers(0, SAMPLES, 40), 0] = np.nan
+    samples[rng.integers(0, SAMPLES, 40), 1] = 300.0
+    missing = np.where(rng.random(SAMPLES) < 0.01, rng.integers(1, 200, SAMPLES), 0).astype(np.uint64)
+    missing[SAMPLES // 2] = 72_000
+    return samples, missing
+
+
+@pytest.mark.parametrize("double", [False, True], ids=["float", "double"])
+def test_restored_at_any_cut_the_rest_is_the_same(double: bool) -> None:
+    """Bit for bit: equal snapshots at the end hold every bit of the state, and the reports are made from it."""
+    samples, missing = record()
+    whole = Bank(tables(), double=double)
+    # every sample of some blocks, and places all over the record
+    cuts = sorted({*range(0, 25), *range(1500, 1525), *np.random.default_rng(4).integers(0, SAMPLES, 100).tolist()})
+    snapshots = {}
+    at = 0
+    for cut in cuts:
+        whole.push(samples[at:cut], missing[at:cut])
+        snapshots[cut] = whole.save()
+        at = cut
+    whole.push(samples[at:], missing[at:])
+    end = whole.save()
+    counters = whole.raw.counters()
+    assert counters["gaps"] > 50 and counters["blocks_part"] > 20 and sum(counters["saturated"]) > 20
+    report = whole.report(1)
+    for cut, snapshot in snapshots.items():
+        bank = Bank(tables(), double=double)
+        bank.restore(snapshot)
+        assert bank.raw.sound
+        assert bank.save() == snapshot
+        bank.push(samples[cut:], missing[cut:])
+        assert bank.save() == end, f"cut at sample {cut}"
+    assert bank.report(1) == report
+
+
+def test_the_header_and_checksum_are_those_of_the_format() -> None:
+    """Truth: the format's description in lib/snapshot.c, and zlib's CRC-32."""
+    made = tables()
+    for double, real in ((False, 4), (True, 8)):
+        bank = Bank(made, double=double)
+        samples, missing = record()
+        bank.push(samples, missing)
+        snapshot = bank.save()
+        magic, length, version, size, axes, nodes, zero, model, _ = HEADER.unpack_from(snapshot)
+        assert (magic, length, version, size) == (b"SFCL", len(snapshot), 1, real)
+        assert (axes, nodes, zero, model) == (len(AXES), bank.raw.nodes, 0, made.id)
+        assert struct.unpack("<I", snapshot[-4:])[0] == zlib.crc32(snapshot[:-4])
+        (x,) = struct.unpack("<f" if real == 4 else "<d", snapshot[-4 - real : -4])
+        assert np.isfinite(x) and x != 0.0  # the last axis's drift as the last node predicts it
+
+
+def test_flips_and_truncations_are_refused_and_change_nothing() -> None:
+    samples, missing = record()
+    bank = Bank(tables())
+    bank.push(samples, missing)
+    snapshot = bank.save()
+    other = Bank(tables())
+    other.push(samples[:777], missing[:777])
+    before = other.save()
+    rng = np.random.default_rng(5)
+    for bit in [*range(8 * HEADER.size), *rng.integers(8 * HEADER.size, 8 * len(snapshot), 2000).tolist()]:
+        flipped = bytearray(snapshot)
+        flipped[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(UserError):
+            other.restore(bytes(flipped))
+    for length in range(len(snapshot)):
+        with pytest.raises(UserError, match="truncated"):
+            other.restore(snapshot[:length])
+    with pytest.raises(UserError, match="longer"):
+        other.restore(snapshot + b"\0")
+    assert other.save() == before
+
+
+def test_builds_and_models_refuse_each_others_snapshots() -> None:
+    made = tables()
+    other_model = make_tables(Model.load(), 20.0, AXES, "cortex-m4f")
+    for double in (False, True):
+        bank = Bank(made, double=double)
+        for stranger in (Bank(made, double=not double), Bank(other_model, double=double)):
+            with pytest.raises(UserError, match="not a snapshot of this model and build"):
+                stranger.restore(bank.save())
