@@ -383,7 +383,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
             self->unproven--;
         }
         if (self->unproven > 0U || self->equal > REPEATS_TAKEN) {
-            self->counters.stale += self->equal > 0U ? 1U : 0U;
+            self->counters.repeated += self->equal > 0U ? 1U : 0U;
             continue;
         }
         const uint32_t passed = self->counters.samples > 0U ? periods(self, stamp) : 1U;

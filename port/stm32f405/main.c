@@ -115,7 +115,7 @@ static void module_tell(void *context, selfcal_module_t *told)
     told->sensor_fault = (uint32_t)sensor.fault;
     told->sensor_fault_count = sensor.counters.faults;
     told->sensor_diagnosis = sensor.diagnosis;
-    told->sensor_stale_count = sensor.counters.stale;
+    told->sensor_stale_count = sensor.counters.stale + sensor.counters.repeated;
     told->sensor_alarm_count = sensor.counters.alarms;
     told->sensor_damaged_count = sensor.counters.damaged;
     told->sensor_anomaly_count = sensor.counters.anomalies;

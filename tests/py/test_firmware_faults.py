@@ -195,6 +195,25 @@ def test_missed_and_stale_samples_become_gaps_in_place() -> None:
     assert sum(tap.skips) == tap.place + 1 - len(tap.pushed)
 
 
+def test_bursts_that_never_end() -> None:
+    """DMA that stops in mid-burst, with chip select low: for a moment, and for long enough to be a fault. The sensor is
+    reached again, and whatever was under way is no sample."""
+    board = Board(image(*QUIET), seed=15)
+    tap = Tap(board)
+    board.run(1.5)
+    board.dma2.hang = 1
+    board.run(0.5)
+    assert status(board)["sensor_fault_count"] == 0
+    board.dma2.hang = 20
+    board.run(5.0)
+    told = status(board)
+    assert board.dma2.hang == 0
+    assert told["sensor_fault"] == NO_DATA
+    assert told["sensor_state"] == RUNNING
+    assert sound(board, None, 0)
+    assert tap.wrong() == 0
+
+
 def test_gap_of_a_minute_and_clock_error() -> None:
     """60 s without data-ready, from a sensor whose clock is 2 % fast: the gap is counted in its samples, whose period
     the driver has tracked, to one part in a thousand."""
