@@ -508,8 +508,14 @@ static void step_scan(selfcal_work_t *work) {
 /* Takes what the pass found as the next box; true when the search is over. The first pass only finds the peak, so that the
  * next ones need not keep what lay near an earlier, lower best. */
 static bool end_scan(selfcal_work_t *work) {
-    if (work->pass == 0U || !(work->found_lo[0] < work->found_hi[0])) {
-        return !(work->found_lo[0] < work->found_hi[0]) || hypothesis_of(work)->rho == NULL;
+    if (!(work->found_lo[0] < work->found_hi[0])) {
+        /* The best was within the priors' reach by the width of an earlier pass's cells only: once more without it. */
+        const bool out_of_reach = work->best > (selfcal_real_t)-INFINITY;
+        work->best = -INFINITY;
+        return !out_of_reach;
+    }
+    if (work->pass == 0U) {
+        return hypothesis_of(work)->rho == NULL;
     }
     bool shrunk = false;
     selfcal_real_t hi[2];
@@ -980,6 +986,7 @@ static void next_scan(selfcal_work_t *work) {
     if (!over) {
         begin_pass(work);
     } else if (!found) {
+        work->mass = 0.0;
         go_to(work, EVIDENCE); /* nothing within the priors' limits */
     } else if (!work->refined && hypothesis_of(work)->rho != NULL) {
         work->refined = true; /* once more, about the peak that was found */
