@@ -1032,6 +1032,7 @@ static void next_scan(selfcal_work_t *work) {
     if (!over) {
         begin_pass(work);
     } else if (!found) {
+        work->mass = 0.0;
         go_to(work, EVIDENCE); /* nothing within the priors' limits */
     } else if (!work->refined && hypothesis_of(work)->rho != NULL) {
         work->refined = true; /* once more, about the peak that was found */
