@@ -12,10 +12,15 @@ namespace {
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr double ln_2pi = 1.8378770664093454836;
 
-// Model (1), (2) at one node, and the Kalman filter over it.
-class Filter {
+// Model (1), (2) at one node, and the Kalman filter over it. `size` is that of the state [drift; x0; c].
+template <int size> class Filter {
+    static constexpr int most = size == Eigen::Dynamic ? static_cast<int>(2 + regressors_max) : size;
+    using Vector = Eigen::Matrix<double, size, 1, 0, most, 1>;
+    using Row = Eigen::Matrix<double, 1, size, Eigen::RowMajor, 1, most>;
+    using Square = Eigen::Matrix<double, size, size, 0, most, most>;
+
   public:
-    Filter(const Record &record, const Node &node) : r_(node.sigma_v * node.sigma_v) {
+    Filter(const Record &record, const Node &node) : record_(record), r_(node.sigma_v * node.sigma_v) {
         double phi = 1.0;
         double drift_variance = 0.0; // at the instant before the first sample
         double step_variance = 0.0;
@@ -31,46 +36,75 @@ class Filter {
             step_variance = -drift_variance * std::expm1(-2.0 * node.alpha * record.dt_s);
             break;
         }
-        transition_ << phi, 0.0, 0.0, 1.0;
-        step_ << step_variance, 0.0, 0.0, 0.0;
-        state_.ln_p = 0.0;
-        state_.mean << 0.0, record.bias_mean;
-        state_.covariance << drift_variance, 0.0, 0.0, record.bias_sd * record.bias_sd;
+        const auto n = static_cast<Eigen::Index>(2 + record.regressors);
+        transition_ = Square::Identity(n, n);
+        transition_(0, 0) = phi;
+        step_ = Square::Zero(n, n);
+        step_(0, 0) = step_variance;
+        mean_ = Vector::Zero(n);
+        mean_(1) = record.bias_mean;
+        covariance_ = Square::Zero(n, n);
+        covariance_(0, 0) = drift_variance;
+        covariance_(1, 1) = record.bias_sd * record.bias_sd;
+        h_ = Row::Zero(n);
+        h_(0) = h_(1) = 1.0;
+        for (std::size_t k = 0; k < record.regressors; ++k) {
+            const auto at = static_cast<Eigen::Index>(2 + k);
+            covariance_(at, at) = record.coefficient_sd[k] * record.coefficient_sd[k];
+        }
     }
 
+    // Sample i of the record. Returns nu / sqrt(s), NaN where it is missing.
+    double sample(std::size_t i) {
+        predict();
+        if (std::isnan(record_.y[i])) {
+            return nan;
+        }
+        for (std::size_t k = 0; k < record_.regressors; ++k) {
+            h_(static_cast<Eigen::Index>(2 + k)) = record_.z[i * record_.regressors + k];
+        }
+        return update(record_.y[i], record_.r == nullptr ? 1.0 : record_.r[i]);
+    }
+
+    Filtered state() const { return {ln_p_, mean_, covariance_, h_ * mean_, h_ * covariance_ * h_.transpose()}; }
+
+  private:
     void predict() {
-        state_.mean = transition_ * state_.mean;
-        state_.covariance = transition_ * state_.covariance * transition_.transpose() + step_;
+        mean_ = transition_ * mean_;
+        covariance_ = transition_ * covariance_ * transition_.transpose() + step_;
     }
 
-    // Returns nu / sqrt(s). Adds ln N(nu; 0, s), the factor of (11), to ln_p.
+    // Adds ln N(nu; 0, s), the factor of (11), to ln_p.
     double update(double y, double r) {
-        const Eigen::RowVector2d h(1.0, 1.0);
         const double variance_v = r * r_;
-        const double nu = y - h * state_.mean;
-        const double s = h * state_.covariance * h.transpose() + variance_v;
-        const Eigen::Vector2d gain = state_.covariance * h.transpose() / s;
-        const Eigen::Matrix2d rest = Eigen::Matrix2d::Identity() - gain * h;
-        state_.mean += gain * nu;
-        state_.covariance = rest * state_.covariance * rest.transpose() + gain * variance_v * gain.transpose();
-        state_.ln_p -= 0.5 * (ln_2pi + std::log(s) + nu * nu / s);
+        const double nu = y - h_ * mean_;
+        const double s = h_ * covariance_ * h_.transpose() + variance_v;
+        const Vector gain = covariance_ * h_.transpose() / s;
+        const Square rest = Square::Identity(mean_.size(), mean_.size()) - gain * h_;
+        mean_ += gain * nu;
+        covariance_ = rest * covariance_ * rest.transpose() + gain * variance_v * gain.transpose();
+        ln_p_ -= 0.5 * (ln_2pi + std::log(s) + nu * nu / s);
         return nu / std::sqrt(s);
     }
 
-    double sample(double y, double r) {
-        predict();
-        return std::isnan(y) ? nan : update(y, r);
-    }
-
-    const Filtered &state() const { return state_; }
-
-  private:
+    const Record &record_;
     double r_;
-    Eigen::Matrix2d transition_, step_;
-    Filtered state_;
+    double ln_p_ = 0.0;
+    Square transition_, step_, covariance_;
+    Vector mean_;
+    Row h_; // of the last sample
 };
 
-double factor(const Record &record, std::size_t i) { return record.r == nullptr ? 1.0 : record.r[i]; }
+// Calls use(filter), with the state's size known to the compiler where nothing is added to the paper's.
+template <typename Use> void with_filter(const Record &record, const Node &node, const Use &use) {
+    if (record.regressors == 0) {
+        Filter<2> filter(record, node);
+        use(filter);
+    } else {
+        Filter<Eigen::Dynamic> filter(record, node);
+        use(filter);
+    }
+}
 
 // Equations (11) to (14) from the filters of one instant.
 Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_prior,
@@ -97,7 +131,7 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
         out.weight[j] /= sum;
         out.probability[k] += out.weight[j];
         out.mean[k] += out.weight[j] * value(j);
-        out.bias_mean[k] += out.weight[j] * filtered[j].mean.sum();
+        out.bias_mean[k] += out.weight[j] * filtered[j].now_mean;
     }
     for (std::size_t k = 0; k < laws; ++k) {
         out.mean[k] /= out.probability[k];
@@ -107,9 +141,9 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
         const auto k = static_cast<std::size_t>(nodes[j].law);
         const double mu = out.weight[j] / out.probability[k];
         const Eigen::Vector3d error = value(j) - out.mean[k];
-        const double bias_error = filtered[j].mean.sum() - out.bias_mean[k];
+        const double bias_error = filtered[j].now_mean - out.bias_mean[k];
         out.covariance[k] += mu * error * error.transpose();
-        out.bias_var[k] += mu * (bias_error * bias_error + filtered[j].covariance.sum());
+        out.bias_var[k] += mu * (bias_error * bias_error + filtered[j].now_var);
     }
     for (std::size_t k = 0; k < laws; ++k) {
         if (out.probability[k] == 0.0) {
@@ -123,14 +157,17 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
 } // namespace
 
 Filtered run_filter(const Record &record, const Node &node, double *standardized) {
-    Filter filter(record, node);
-    for (std::size_t i = 0; i < record.n; ++i) {
-        const double innovation = filter.sample(record.y[i], factor(record, i));
-        if (standardized != nullptr) {
-            standardized[i] = innovation;
+    Filtered out;
+    with_filter(record, node, [&](auto &filter) {
+        for (std::size_t i = 0; i < record.n; ++i) {
+            const double innovation = filter.sample(i);
+            if (standardized != nullptr) {
+                standardized[i] = innovation;
+            }
         }
-    }
-    return filter.state();
+        out = filter.state();
+    });
+    return out;
 }
 
 std::vector<Filtered> run_filters(const Record &record, const std::vector<Node> &nodes) {
@@ -145,14 +182,15 @@ std::vector<Posterior> run_bank(const Record &record, const std::vector<Node> &n
     // are normalised where they are wanted.
     std::vector<std::vector<Filtered>> at(after.size(), std::vector<Filtered>(nodes.size()));
     parallel_for(nodes.size(), [&](std::size_t j) {
-        Filter filter(record, nodes[j]);
-        std::size_t i = 0;
-        for (std::size_t m = 0; m < after.size(); ++m) {
-            for (; i < after[m]; ++i) {
-                filter.sample(record.y[i], factor(record, i));
+        with_filter(record, nodes[j], [&](auto &filter) {
+            std::size_t i = 0;
+            for (std::size_t m = 0; m < after.size(); ++m) {
+                for (; i < after[m]; ++i) {
+                    filter.sample(i);
+                }
+                at[m][j] = filter.state();
             }
-            at[m][j] = filter.state();
-        }
+        });
     });
     std::vector<Posterior> out;
     out.reserve(at.size());

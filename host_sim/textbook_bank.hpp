@@ -3,6 +3,8 @@
 // against, so it takes none of lib/'s short cuts and shares no code with it. Equation numbers are the paper's.
 //
 // One axis, sampled every dt:  y_i = x0 + x_i + v_i  (22),  x0 ~ N(bias mean, P0),  v_i ~ N(0, r_i sigma_v^2).
+// Known disturbances z (temperature, time, ...) enter as the paper's bias does, as constant states with a row of H each:
+// y_i = x0 + x_i + c' z_i + v_i,  c ~ N(0, diag(sd^2)).
 // Two deviations from the print:
 //   - the Gauss-Markov noise gain is the exact sigma_m sqrt(1 - phi^2); the printed one,
 //     sigma_m sqrt(2 / (alpha dt)) (1 - phi), is (alpha dt)^2 / 24 off it, relatively;
@@ -19,6 +21,7 @@ namespace selfcal_reference {
 
 enum class Law { constant = 0, random_walk = 1, gauss_markov = 2 };
 constexpr std::size_t laws = 3;
+constexpr std::size_t regressors_max = 6;
 
 // One value theta^kj of the parameters of hypothesis k.
 struct Node {
@@ -35,13 +38,17 @@ struct Record {
     std::size_t n;
     double dt_s;
     double bias_mean, bias_sd; // prior of x0, unit
+    std::size_t regressors = 0;              // at most regressors_max
+    const double *z = nullptr;               // [n][regressors], finite where y is
+    const double *coefficient_sd = nullptr;  // [regressors] prior of each coefficient, unit per unit of its regressor
 };
 
-// What a filter knows after its last sample: ln p(Y | h_k, theta_kj), and the state [drift; x0] given them.
+// What a filter knows after its last sample: ln p(Y | h_k, theta_kj), and the state [drift; x0; c] given them.
 struct Filtered {
     double ln_p;
-    Eigen::Vector2d mean;
-    Eigen::Matrix2d covariance;
+    Eigen::VectorXd mean;
+    Eigen::MatrixXd covariance;
+    double now_mean, now_var; // of x0 + x_i + c' z_i, with z of the last sample that is not missing
 };
 
 // One filter over the whole record. If `standardized` is not null it receives nu_i / sqrt(s_i) [n], NaN where missing.
@@ -56,7 +63,7 @@ struct Posterior {
     std::array<double, laws> probability;         //                                                     (13)
     std::array<Eigen::Vector3d, laws> mean;       // of (drift, alpha, sigma_v) under each hypothesis    (12)
     std::array<Eigen::Matrix3d, laws> covariance; //                                                     (14)
-    std::array<double, laws> bias_mean, bias_var; // of x0 + x_i under each hypothesis                   (12), (14)
+    std::array<double, laws> bias_mean, bias_var; // of x0 + x_i + c' z_i under each hypothesis          (12), (14)
 };
 
 // The bank at chosen samples. `ln_prior` [nodes] is ln(mu_0^kj Pr(H = h_k)) up to one constant; `after` [m] ascending,

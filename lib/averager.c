@@ -55,6 +55,9 @@ static void close_block(selfcal_t *self) {
     if (self->used < block) {
         self->counters.blocks_part++;
     }
+    if (self->columns != NULL) {
+        self->model->regressors->code->close(self);
+    }
     selfcal_bank_sample(self, y, self->variance_ratio * ((selfcal_real_t)block / (selfcal_real_t)self->used));
     start_block(self);
 }
@@ -184,7 +187,11 @@ static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
 }
 
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
-    if (self == NULL || sample == NULL) {
+    return selfcal_push_with(self, sample, NULL);
+}
+
+selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]) {
+    if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
         return SELFCAL_BAD_ARGUMENT;
     }
     (void)selfcal_bank_run(self, self->push_nodes);
@@ -192,7 +199,8 @@ selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
     const uint32_t live = ((1U << axes) - 1U) & ~self->retired;
     const uint32_t bad = faults(self, sample) & live;
     retire(self, bad, live);
-    if (bad != 0U || self->dropped) {
+    const bool known = self->columns == NULL || self->model->regressors->code->usable(self, regressors);
+    if (bad != 0U || !known || self->dropped) {
         pass(self, 1U);
         return SELFCAL_OK;
     }
@@ -213,6 +221,9 @@ selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
         const selfcal_real_t from_first = (selfcal_real_t)sample[axis] - (selfcal_real_t)self->first[axis];
         self->sum[axis] += from_first;
         self->sum_sq[axis] = r_fma(from_first, from_first, self->sum_sq[axis]);
+    }
+    if (self->columns != NULL) {
+        self->model->regressors->code->add(self, regressors);
     }
     self->counters.samples++;
     self->used++;

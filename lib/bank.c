@@ -98,7 +98,8 @@ static bool valid_model(const selfcal_model_t *model) {
         }
         nodes += hypothesis_nodes(hypothesis);
     }
-    return nodes == model->nodes;
+    const selfcal_regressors_t *regressors = model->regressors;
+    return nodes == model->nodes && (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
 }
 
 /* A node at the instant of its first sample. */
@@ -230,18 +231,24 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     if (!valid_model(model)) {
         return SELFCAL_BAD_MODEL;
     }
-    if (size < SELFCAL_SIZE(model->nodes, model->axes) || ((uintptr_t)memory & 7U) != 0U) {
+    const size_t used = SELFCAL_SIZE(model->nodes, model->axes);
+    const size_t regressors = model->regressors != NULL ? model->regressors->count : 0U;
+    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors);
+    if (size < needed || ((uintptr_t)memory & 7U) != 0U) {
         return SELFCAL_BAD_MEMORY;
     }
     const size_t cells = (size_t)model->nodes * model->axes;
     memset(self, 0, sizeof *self);
-    memset(memory, 0, SELFCAL_SIZE(model->nodes, model->axes));
+    memset(memory, 0, needed);
     self->model = model;
     self->variance_ratio = R(1.0);
     self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
     self->node = (selfcal_node_t *)(void *)(self->c + cells);
     self->x = (selfcal_drift_t *)(void *)(self->node + model->nodes);
+    if (regressors > 0U) {
+        model->regressors->code->init(self, (unsigned char *)memory + used);
+    }
     selfcal_bank_pace(self, model->block);
     return SELFCAL_OK;
 }
@@ -321,7 +328,10 @@ static void leave_level(selfcal_node_t *node) {
     }
 }
 
+/* With regressors no node counts as level: their columns always move. */
 static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
+    const selfcal_regressors_t *regressors = self->model->regressors;
+    void (*const run)(selfcal_t *, size_t, const gains_t *) = regressors != NULL ? regressors->code->run : selfcal_kernel_run;
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
     for (uint32_t i = span.from; i < span.to; i++) {
@@ -340,17 +350,17 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
         }
         if (whole && node->d == R(0.0)) {
             gains_steady(node, &gains);
-            selfcal_kernel_run(self, j, &gains);
+            run(self, j, &gains);
             node->steady += span.to - span.from;
             if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
                 node->e = R(0.0);
-                node->level = true;
-                node->level_from = node->steady;
+                node->level = self->columns == NULL;
+                node->level_from = node->level ? node->steady : 0U;
             }
         } else {
             leave_level(node);
             gains_varying(batch, node, &gains);
-            selfcal_kernel_run(self, j, &gains);
+            run(self, j, &gains);
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
                 node->d = R(0.0);
             }
@@ -377,7 +387,11 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         const selfcal_wide_t stationary = (selfcal_wide_t)node->q / (beta * (2.0 - beta));
         node->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
         node->e = (selfcal_real_t)(e + less * (1.0 - (selfcal_wide_t)node->u_inf - e));
-        selfcal_kernel_gap(self, j, less);
+        if (self->columns != NULL) {
+            self->model->regressors->code->gap(self, j, less);
+        } else {
+            selfcal_kernel_gap(self, j, less);
+        }
     }
 }
 
@@ -431,6 +445,9 @@ bool selfcal_bank_hand_over(selfcal_t *self) {
     self->pending_gap = 0;
     self->gathering = (uint8_t)(1U - self->gathering);
     self->batches++;
+    if (self->columns != NULL) {
+        self->model->regressors->code->hand_over(self);
+    }
     if (self->n == 0U) {
         place_nodes(self);
     }
@@ -524,21 +541,5 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
 }
 
 selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v, selfcal_wide_t *ln_p) {
-    selfcal_node_view_t v;
-    if (ln_p == NULL || !(sigma_v > 0.0)) {
-        return SELFCAL_BAD_ARGUMENT;
-    }
-    const selfcal_status_t status = selfcal_node(self, axis, node, &v);
-    if (status != SELFCAL_OK) {
-        return status;
-    }
-    /* Generalised least squares with x0 about the offset and the square completed: the residual C - B^2/A does not feel the bias, the
-     * estimate B/A is weighed against N(-offset, P0). The same number without the cancellation of large terms. */
-    const selfcal_wide_t p0 = (selfcal_wide_t)self->model->axis[axis].bias_sd * (selfcal_wide_t)self->model->axis[axis].bias_sd;
-    const selfcal_wide_t var = sigma_v * sigma_v;
-    const selfcal_wide_t residual = v.c - v.b * v.b / v.a;
-    const selfcal_wide_t miss = v.b / v.a + selfcal_offset(self, axis);
-    *ln_p = -0.5 * ((selfcal_wide_t)self->n * (SELFCAL_LN_2PI + 2.0 * log(sigma_v)) + v.ln_s + residual / var +
-                    log1p(p0 * v.a / var) + miss * miss / (var / v.a + p0));
-    return SELFCAL_OK;
+    return selfcal_log_likelihood_subset(self, axis, node, 0U, sigma_v, ln_p);
 }

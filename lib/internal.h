@@ -64,4 +64,38 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index);
 /* selfcal_node() of the sums as they are, without what has only been gathered. */
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 
+/* What is read now at one node, given sigma_v: its mean less the offset, the drift's part of that, and its variance over sigma_v^2
+ * without that of the drift given the bias (and the coefficients): as it is now, and with d of the drift gone
+ * own[0] + 2 d own[1] + d^2 own[2]. */
+typedef struct {
+    selfcal_wide_t mean, drift, own[3];
+} selfcal_now_t;
+
+/* regressors.c, for a model with regressors. */
+typedef struct gains gains_t; /* kernel.h */
+struct selfcal_regressors_code {
+    bool (*valid)(const selfcal_model_t *model);
+    /* In the memory that follows the bank's. */
+    void (*init)(selfcal_t *self, unsigned char *memory);
+    /* A sample's values: whether all are finite (else counted); into the block; the block's means into the batch. */
+    bool (*usable)(selfcal_t *self, const float values[]);
+    void (*add)(selfcal_t *self, const float values[]);
+    void (*close)(selfcal_t *self);
+    /* The batch that waits is about to enter the sums. */
+    void (*hand_over)(selfcal_t *self);
+    /* selfcal_kernel_run() and selfcal_kernel_gap(), columns and all. */
+    void (*run)(selfcal_t *self, size_t j, const gains_t *gains);
+    void (*gap)(selfcal_t *self, size_t j, selfcal_wide_t less);
+    /* With the regressors of a report in use: ln of sigma_v's mode, profile ln-likelihood and the share of samples that went into the
+     * bias and the coefficients, of one node; the residual is `least` at least. */
+    void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_wide_t *ln_sigma,
+                  selfcal_wide_t *profile, selfcal_wide_t *share);
+    /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
+    void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
+    void (*finish)(const selfcal_work_t *work);
+};
+
+/* Regressors that an axis has, a bit each. */
+uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);
+
 #endif

@@ -11,13 +11,13 @@ typedef struct {
 } span_t;
 
 /* The gain side of a batch, shared by the axes. */
-typedef struct {
+struct gains {
     span_t span;
     selfcal_real_t g[SELFCAL_BATCH];     /* phi K + beta */
     selfcal_real_t u[SELFCAL_BATCH];     /* innovation of "1" over s */
     selfcal_real_t inv_s[SELFCAL_BATCH]; /* 1 where s is constant and left to the scales */
     selfcal_sum_t scale;                 /* what the span's sums of nu and nu^2 are still to be multiplied by */
-} gains_t;
+};
 
 /* The batch that the nodes run over. */
 static inline selfcal_batch_t *waiting(selfcal_t *self) {

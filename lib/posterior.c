@@ -7,7 +7,8 @@
  * ln alpha. Both follow from the innovations' variance. What that is expected to be, for data of the law's own best (rho,
  * alpha), has a closed form (expected() below); it carries the terms of order n. A quintic spline takes what is left, of order
  * sqrt(n): the error of the interpolation is that much smaller than that of a spline through the whole. n_eff = n - w: the bias takes the share w = P0 A/(P0 A + sigma_v^2)
- * of one sample, 1 under a wide bias prior; w is taken at the best node (exact for w = 0 or 1, else first order in delta).
+ * of one sample, 1 under a wide bias prior; w is taken at the best node (exact for w = 0 or 1, else first order in delta). With
+ * regressors in use each coefficient takes such a share as well.
  *
  * The integral runs over cells (midpoint rule: for a smooth peak it converges faster than any power of the cell). First
  * passes find the box that holds the posterior, the last one sums. Priors enter per cell, limits by the part of the cell
@@ -35,6 +36,11 @@ static const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {
 
 static uint16_t grid_nodes(const selfcal_grid_t *grid) {
     return grid != NULL ? grid->nodes : 1U;
+}
+
+/* A node is dearer with regressors in use: one a step. */
+static unsigned step_nodes(const selfcal_work_t *work) {
+    return work->mask == 0U ? STEP_NODES : 1U;
 }
 
 static const selfcal_axis_t *axis_of(const selfcal_work_t *work) {
@@ -191,14 +197,20 @@ typedef struct {
 /* Profile ln-likelihood of the hypothesis's node k and ln of the conditional mode of sigma_v, for the given n_eff. */
 static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
     const selfcal_t *bank = work->bank;
-    selfcal_node_view_t v;
-    selfcal_bank_view(bank, work->axis, (uint16_t)(work->first_node + k), &v);
+    const uint16_t index = (uint16_t)(work->first_node + k);
     const selfcal_wide_t n = (selfcal_wide_t)bank->n;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t p0 = sd * sd;
     /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior. */
-    const selfcal_wide_t floor_sd = 1e-9 * sd;
-    const selfcal_wide_t residual = fmax(v.c - v.b * v.b / v.a, n_eff * floor_sd * floor_sd);
+    const selfcal_wide_t floor_sd = 1e-9 * sd, least = n_eff * floor_sd * floor_sd;
+    if (work->mask != 0U) {
+        field_t field;
+        bank->model->regressors->code->field(work, index, n_eff, least, &field.ln_sigma, &field.profile, bias_share);
+        return field;
+    }
+    selfcal_node_view_t v;
+    selfcal_bank_view(bank, work->axis, index, &v);
+    const selfcal_wide_t residual = fmax(v.c - v.b * v.b / v.a, least);
     const selfcal_wide_t var = residual / n_eff;
     const selfcal_wide_t miss = v.b / v.a + selfcal_offset(bank, work->axis);
     field_t field;
@@ -269,11 +281,11 @@ static void step_peak(selfcal_work_t *work) {
     const selfcal_wide_t n = (selfcal_wide_t)work->bank->n;
     if (work->at == 0U) {
         work->peak = (selfcal_wide_t)-INFINITY;
-        work->n_eff = n - 1.0;
+        work->n_eff = n - (selfcal_wide_t)work->unknowns;
     }
-    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         selfcal_wide_t share;
-        const field_t field = node_field(work, k, n - 1.0, &share);
+        const field_t field = node_field(work, k, n - (selfcal_wide_t)work->unknowns, &share);
         if (field.profile > work->peak) {
             work->peak = field.profile;
             work->n_eff = n - share;
@@ -297,7 +309,7 @@ static expectation_t node_expectation(const selfcal_work_t *work, const selfcal_
 
 /* What the splines have to carry at the nodes. */
 static void step_values(selfcal_work_t *work) {
-    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         selfcal_wide_t unused;
         const field_t exact = node_field(work, k, work->n_eff, &unused);
         const expectation_t expected_of = node_expectation(work, &work->truth, k);
@@ -820,40 +832,49 @@ static void cardinal_weights(const selfcal_work_t *work, const selfcal_real_t of
     }
 }
 
-/* Moments of x0 + drift now: the mean over the nodes, the scatter of their means, and their own variance, which goes with
+/* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void step_bias(selfcal_work_t *work) {
     const selfcal_wide_t best_n = exp((selfcal_wide_t)work->best_ln[SELFCAL_N]);
     const selfcal_wide_t best_sq = best_n * best_n / (selfcal_wide_t)work->bank->model->dt_s;
     const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
-    const selfcal_wide_t prior_precision = best_sq * (1.0 + 2.0 * first + second) / (sd * sd);
+    const selfcal_wide_t mean_sq = best_sq * (1.0 + 2.0 * first + second), prior_precision = mean_sq / (sd * sd);
     const selfcal_wide_t offset = selfcal_offset(work->bank, work->axis);
     const bool begins = work->at == 0U;
-    for (uint16_t k = part(work, STEP_NODES, nodes_of(work)); k < work->at; k++) {
+    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         selfcal_node_view_t v;
+        selfcal_now_t now;
         selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
-        const selfcal_wide_t variance = 1.0 / (v.a + prior_precision);
-        const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
-        const selfcal_wide_t now = v.drift + x0 * v.bias_left;
-        if (begins && k == 0U) {
-            work->bias_about = now;
+        if (work->mask != 0U) {
+            work->bank->model->regressors->code->now(work, k, mean_sq, &now);
+        } else {
+            const selfcal_wide_t variance = 1.0 / (v.a + prior_precision), lost = 1.0 - v.bias_left;
+            const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
+            now.mean = v.drift + x0 * v.bias_left;
+            now.drift = now.mean - x0;
+            now.own[0] = v.bias_left * v.bias_left * variance;
+            now.own[1] = v.bias_left * lost * variance;
+            now.own[2] = lost * lost * variance;
         }
-        const selfcal_wide_t off = now - work->bias_about, weighed = (selfcal_wide_t)work->values[0][k] * off;
+        if (begins && k == 0U) {
+            work->bias_about = now.mean;
+        }
+        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->values[0][k] * off;
         work->bias_weight += (selfcal_wide_t)work->values[0][k];
         work->bias_first += weighed;
         work->bias_second += weighed * off;
-        work->bias_own += (selfcal_wide_t)work->values[1][k] * (v.drift_var + v.bias_left * v.bias_left * variance);
+        work->bias_own += (selfcal_wide_t)work->values[1][k] * (v.drift_var + now.own[0]);
         if (v.law == SELFCAL_GAUSS_MARKOV) {
-            /* As the drift decays by 1 - psi, the mean goes to now - psi (now - x0) and the node's own variance to
+            /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-            const selfcal_wide_t fall = now - x0, lost = 1.0 - v.bias_left, own = (selfcal_wide_t)work->values[1][k] * best_sq;
-            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->values[0][k] * fall;
+            const selfcal_wide_t own = (selfcal_wide_t)work->values[1][k] * best_sq;
+            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->values[0][k] * now.drift;
             const selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
             decay[0] += weighed_fall;
-            decay[1] += 2.0 * (own * (stationary - v.drift_var + v.bias_left * lost * variance) - weighed_fall * off);
-            decay[2] += own * (v.drift_var + lost * lost * variance - stationary) + weighed_fall * fall;
+            decay[1] += 2.0 * (own * (stationary - v.drift_var + now.own[1]) - weighed_fall * off);
+            decay[2] += own * (v.drift_var + now.own[2] - stationary) + weighed_fall * now.drift;
         }
     }
     work->bias_scale = best_sq;
@@ -900,6 +921,9 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
         }
     }
     finish_bias(work, posterior);
+    if (work->mask != 0U) {
+        work->bank->model->regressors->code->finish(work);
+    }
 }
 
 /* (13), and the bias over all hypotheses. */
@@ -930,18 +954,37 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
 /* --------------------------------------------------------------------------------------------------------------- slices */
 
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report) {
-    if (work == NULL || self == NULL || report == NULL || axis >= self->model->axes) {
+    return selfcal_report_begin_subset(work, self, axis, 0U, NULL, report);
+}
+
+selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *self, uint8_t axis, uint8_t mask,
+                                             selfcal_coefficients_t coefficients[], selfcal_report_t *report) {
+    if (work == NULL || self == NULL || report == NULL || axis >= self->model->axes ||
+        ((unsigned)mask & ~(unsigned)selfcal_regressors_mask(self->model, axis)) != 0U) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (selfcal_retired(self, axis)) {
         return SELFCAL_AXIS_RETIRED;
     }
-    if (selfcal_count(self) < SELFCAL_REPORT_MIN) {
+    uint8_t unknowns = 1;
+    for (uint8_t r = 0; r < SELFCAL_REGRESSORS_MAX; r++) {
+        unknowns = (uint8_t)(unknowns + ((unsigned)mask >> r & 1U));
+    }
+    if (selfcal_count(self) + 1U < SELFCAL_REPORT_MIN + (uint32_t)unknowns) {
         return SELFCAL_TOO_SHORT;
     }
     memset(work, 0, sizeof *work);
     work->bank = self;
     work->axis = axis;
+    work->mask = mask;
+    work->unknowns = unknowns;
+    work->coefficients = coefficients;
+    for (int h = 0; coefficients != NULL && h < self->model->hypotheses; h++) {
+        for (int r = 0; r < SELFCAL_REGRESSORS_MAX; r++) {
+            coefficients[h].mean[r] = NAN;
+            coefficients[h].sd[r] = NAN;
+        }
+    }
     work->stage = GATHER;
     memset(report, 0, sizeof *report);
     report->axis = axis;
@@ -989,6 +1032,7 @@ static void next_scan(selfcal_work_t *work) {
     if (!over) {
         begin_pass(work);
     } else if (!found) {
+        work->mass = 0.0;
         go_to(work, EVIDENCE); /* nothing within the priors' limits */
     } else if (!work->refined && hypothesis_of(work)->rho != NULL) {
         work->refined = true; /* once more, about the peak that was found */

@@ -115,6 +115,14 @@ extern "C" {
 #error "SELFCAL_RETIRE_BLOCKS must be 0 or above"
 #endif
 
+/* Regressors one model holds at most (selfcal_regressors_t). Fewer: less stack in a report. */
+#ifndef SELFCAL_REGRESSORS_MAX
+#define SELFCAL_REGRESSORS_MAX 6
+#endif
+#if SELFCAL_REGRESSORS_MAX < 1 || SELFCAL_REGRESSORS_MAX > 6
+#error "SELFCAL_REGRESSORS_MAX must be 1 to 6"
+#endif
+
 #ifndef SELFCAL_ASSERT
 #define SELFCAL_ASSERT(condition) ((void)0)
 #endif
@@ -183,6 +191,19 @@ typedef struct {
     const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV */
 } selfcal_hypothesis_t;
 
+typedef struct selfcal_regressors_code selfcal_regressors_code_t;
+extern const selfcal_regressors_code_t selfcal_regressors_code;
+
+/* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step): each adds a constant
+ * coefficient times its value to every reading, and every subset of them is a hypothesis of its own. The values come with
+ * the samples, selfcal_push_with(); their unit is the application's. */
+typedef struct {
+    const selfcal_regressors_code_t *code; /* &selfcal_regressors_code: only a model with regressors links what they take */
+    uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
+    const float *reference;      /* [count] value at which x0 alone is the bias */
+    const float *coefficient_sd; /* [axes][count] prior N(0, sd^2), unit per unit of the regressor; 0: not for this axis */
+} selfcal_regressors_t;
+
 typedef struct {
     uint32_t id;        /* checksum of the tables: what a snapshot or a monitor tells models apart by */
     float dt_s;         /* bank interval, 1e-6 to 1e6 */
@@ -192,6 +213,7 @@ typedef struct {
     uint16_t nodes;     /* of all hypotheses together */
     const selfcal_axis_t *axis;             /* [axes] */
     const selfcal_hypothesis_t *hypothesis; /* [hypotheses] */
+    const selfcal_regressors_t *regressors; /* NULL: none, and none of their cost */
 } selfcal_model_t;
 
 /* ------------------------------------------------------------------------------------------------------------- bank */
@@ -225,6 +247,7 @@ typedef struct {
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
+    uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite */
 } selfcal_counters_t;
 
 /* One filter: the gain side, shared by all axes because covariances do not depend on the data. Relative to sigma_v.
@@ -256,10 +279,38 @@ typedef struct {
     uint32_t gap_after;
     uint32_t count;
 } selfcal_batch_t;
+/* One regressor's front end. Private, as selfcal_columns_t; here for the caller's sizing. */
+typedef struct {
+    selfcal_real_t z[2][SELFCAL_BATCH];   /* beside the batches, less the first bank sample's value */
+    selfcal_real_t last;                  /* of the last bank sample that the nodes run over */
+    float origin, first;                  /* the first sample of all, and of this block */
+    selfcal_real_t offset;                /* the first bank sample less origin */
+    selfcal_real_t sum;                   /* of this block about its first */
+} selfcal_column_t;
+
+typedef struct {
+    selfcal_column_t *column; /* [regressors] */
+    selfcal_sum_t *a;    /* [nodes][rows]: for "1" and each regressor, sums of its innovation times those up to its own, over s */
+    selfcal_sum_t *b;    /* [nodes][axes][regressors]: sum of its innovation times nu over s */
+    selfcal_sum_t *x;    /* [nodes][1 + regressors]: predicted drift of the zero-bias filter over each column */
+    selfcal_real_t *low; /* [nodes][axes]: low part of x of the readings */
+} selfcal_columns_t;
+
+/* Sums of the first p rows of A. */
+#define SELFCAL_REGRESSORS_ROWS(p) ((size_t)(p) * ((size_t)(p) + 1U) / 2U)
+
+/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per axis 8 p + 4. */
+#define SELFCAL_REGRESSORS_SIZE(nodes, axes, p) \
+    ((size_t)(p) == 0U ? (size_t)0U \
+                       : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) + \
+                             (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) * \
+                                                    sizeof(selfcal_sum_t) + \
+                                                (size_t)(axes) * sizeof(selfcal_real_t)))
 
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
+    selfcal_columns_t *columns; /* of the regressors; NULL: there are none */
     selfcal_node_t *node;    /* [nodes] */
     selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_drift_t *x;      /* [nodes][axes]: predicted drift of the zero-bias filter */
@@ -295,7 +346,7 @@ typedef struct {
     selfcal_counters_t counters;
 } selfcal_t;
 
-/* Prepares `self` over `memory` (SELFCAL_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
+/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
@@ -314,6 +365,10 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
  * ones neither help nor harm an axis.) */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
 
+/* The same with the values of the model's regressors, in its order; a value that is not finite keeps the sample out. Values are
+ * averaged over a block as the samples are. A model with regressors takes this call only (else SELFCAL_BAD_ARGUMENT), one
+ * without does not look at `regressors`. Per node O(count^2 + axes * count) more. */
+selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]);
 /* True once an axis is retired. */
 bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
@@ -366,6 +421,10 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
 
 /* Exact ln p(Y | node, sigma_v) of everything pushed on one axis, x0 integrated out; sigma_v in unit per bank interval. */
 selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v, selfcal_wide_t *ln_p);
+
+/* The same with the regressors of `mask` in use, a bit each. SELFCAL_BAD_ARGUMENT if the axis does not have them all. */
+selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, uint16_t node, uint8_t mask,
+                                               selfcal_wide_t sigma_v, selfcal_wide_t *ln_p);
 
 /* Whether the bank can be what pushes and skips have made of it: pointers, places within their arrays, counts that fit each other,
  * sums finite and of the right sign. SELFCAL_CORRUPT: memory was overwritten, by a bug or by a fault; nothing but selfcal_init()
@@ -430,7 +489,7 @@ typedef struct {
     float probability;
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
-    float bias_mean, bias_sd;   /* x0 + drift now, under this hypothesis, unit */
+    float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
     selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov: of each alpha node; else 0 */
 } selfcal_posterior_t;
 
@@ -440,6 +499,12 @@ typedef struct {
     float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit */
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
+
+/* Coefficients of the regressors under one hypothesis, unit per unit of each; NaN for those not in use. */
+typedef struct {
+    float mean[SELFCAL_REGRESSORS_MAX], sd[SELFCAL_REGRESSORS_MAX];
+    selfcal_wide_t first[SELFCAL_REGRESSORS_MAX], second[SELFCAL_REGRESSORS_MAX], own[SELFCAL_REGRESSORS_MAX]; /* private */
+} selfcal_coefficients_t;
 
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {
@@ -456,6 +521,8 @@ typedef struct {
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     uint32_t batches; /* of the bank, when the sums came to rest */
     bool gathered;    /* the nodes run over the last batch */
+    uint8_t mask, unknowns; /* regressors in use; those and the bias */
+    selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
@@ -489,7 +556,14 @@ typedef struct {
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. */
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
-/* One slice of it, below 60 000 instructions on a Cortex-M4F. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is
+/* The same with the regressors of `mask` in use, a bit each: one subset, whose ln_evidence compares with those of the others. Bias
+ * then means x0 + c' z + drift with z of the last bank sample. `coefficients`: room for one a hypothesis, or NULL.
+ * SELFCAL_BAD_ARGUMENT also if the axis does not have them all; SELFCAL_TOO_SHORT with fewer than SELFCAL_REPORT_MIN samples and one
+ * more for each. */
+selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *self, uint8_t axis, uint8_t mask,
+                                             selfcal_coefficients_t coefficients[], selfcal_report_t *report);
+
+/* One slice of it, below 60 000 instructions on a Cortex-M4F without regressors in use, else one node's least squares. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is
  * whole. It first runs the nodes over what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a
  * call that looks at the sums, it is SELFCAL_OVERTAKEN; begin anew. */
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);

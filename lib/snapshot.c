@@ -11,7 +11,7 @@
  *       16  4  id of the model
  *       20  4  layout: CRC-32 over kind (1 byte) and count (2 bytes) of every field below, so that a build with other fields or
  *              other maxima of the configuration is told apart without anyone counting up the version
- *       24     selfcal_t, its batches, its counters, every node, b, c, x: the fields below, in their order
+ *       24     selfcal_t, its batches, its counters, every node, b, c, x, what the regressors have: the fields below, in their order
  *     last  4  CRC-32 of all before (IEEE 802.3: reflected polynomial 0xEDB88320, start and final inversion 0xFFFFFFFF)
  * The first 8 bytes and the checksum are where they are in every version.
  *
@@ -95,7 +95,8 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_counters_t, blocks_moving, U32) \
     F(selfcal_counters_t, not_finite, U32)    \
     F(selfcal_counters_t, saturated, U32)     \
-    F(selfcal_counters_t, stuck, U32)
+    F(selfcal_counters_t, stuck, U32)         \
+    F(selfcal_counters_t, regressor_not_finite, U32)
 
 #define NODE_FIELDS(F)                 \
     F(selfcal_node_t, beta, REAL)      \
@@ -110,6 +111,14 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
     F(selfcal_node_t, ln_s, REAL)
+
+#define COLUMN_FIELDS(F)              \
+    F(selfcal_column_t, z, REAL)      \
+    F(selfcal_column_t, last, REAL)   \
+    F(selfcal_column_t, origin, FLOAT) \
+    F(selfcal_column_t, first, FLOAT) \
+    F(selfcal_column_t, offset, REAL) \
+    F(selfcal_column_t, sum, REAL)
 
 /* What a part of the bank is made of. */
 typedef struct {
@@ -127,6 +136,8 @@ static const field_t bank_fields[] = {BANK_FIELDS(ROW, NO_ROW)};
 static const field_t batch_fields[] = {BATCH_FIELDS(ROW)};
 static const field_t counter_fields[] = {COUNTER_FIELDS(ROW)};
 static const field_t node_fields[] = {NODE_FIELDS(ROW)};
+static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
+static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
 
 /* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
@@ -134,7 +145,7 @@ static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0,
 #define MIRROR(struct_t, member, kind) TYPE_##kind member[COUNT(struct_t, member, kind)];
 #define MIRROR_PART(struct_t, member, type) type member[sizeof(((struct_t *)0)->member) / sizeof(type)];
 typedef struct {
-    const void *pointer[5]; /* model, node, b, c, x */
+    const void *pointer[6]; /* model, columns, node, b, c, x */
     BANK_FIELDS(MIRROR, MIRROR_PART)
 } selfcal_t_mirror;
 typedef struct {
@@ -146,6 +157,9 @@ typedef struct {
 typedef struct {
     NODE_FIELDS(MIRROR)
 } selfcal_node_t_mirror;
+typedef struct {
+    COLUMN_FIELDS(MIRROR)
+} selfcal_column_t_mirror;
 /* NOLINTEND(bugprone-sizeof-expression) */
 
 #define IN_PLACE(struct_t, member, kind) \
@@ -154,10 +168,14 @@ BANK_FIELDS(IN_PLACE, IN_PLACE)
 BATCH_FIELDS(IN_PLACE)
 COUNTER_FIELDS(IN_PLACE)
 NODE_FIELDS(IN_PLACE)
+COLUMN_FIELDS(IN_PLACE)
 SELFCAL_STATIC_ASSERT(all_of_the_bank, sizeof(selfcal_t) == sizeof(selfcal_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_a_batch, sizeof(selfcal_batch_t) == sizeof(selfcal_batch_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_the_counters, sizeof(selfcal_counters_t) == sizeof(selfcal_counters_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_a_node, sizeof(selfcal_node_t) == sizeof(selfcal_node_t_mirror));
+SELFCAL_STATIC_ASSERT(all_of_a_column, sizeof(selfcal_column_t) == sizeof(selfcal_column_t_mirror));
+SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeof(void *));
+SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
 SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 2 * sizeof(selfcal_real_t));
 SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == sizeof(selfcal_real_t));
 SELFCAL_STATIC_ASSERT(float_is_ieee_single, sizeof(float) == 4 && FLT_MANT_DIG == 24 && FLT_MAX_EXP == 128);
@@ -172,12 +190,15 @@ typedef struct {
     size_t records, stride;
 } part_t;
 
-enum { PARTS = 7 };
+enum { PARTS = 12 };
 
 /* The parts of a bank of `model`; without `self`, their sizes alone. */
 static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t part[PARTS]) {
     const size_t nodes = model->nodes, cells = nodes * model->axes;
     const bool there = self != NULL;
+    const size_t p = model->regressors != NULL ? model->regressors->count : 0U, used = p > 0U ? 1U : 0U;
+    const selfcal_columns_t *columns = there ? self->columns : NULL;
+    const bool more = columns != NULL;
     const part_t parts[PARTS] = {
         {bank_fields, LENGTH(bank_fields), self, 1, sizeof *self},
         {batch_fields, LENGTH(batch_fields), there ? self->batch : NULL, LENGTH(self->batch), sizeof self->batch[0]},
@@ -186,6 +207,11 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {total_fields, LENGTH(total_fields), there ? self->b : NULL, cells, sizeof *self->b},
         {total_fields, LENGTH(total_fields), there ? self->c : NULL, cells, sizeof *self->c},
         {drift_fields, LENGTH(drift_fields), there ? self->x : NULL, cells, sizeof *self->x},
+        {column_fields, LENGTH(column_fields), more ? columns->column : NULL, p, sizeof *columns->column},
+        {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
+        {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
+        {sum_fields, 1, more ? columns->x : NULL, used * nodes * (p + 1U), sizeof *columns->x},
+        {real_fields, 1, more ? columns->low : NULL, used * cells, sizeof *columns->low},
     };
     memcpy(part, parts, sizeof parts);
 }

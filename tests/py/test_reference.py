@@ -119,6 +119,47 @@ def test_bank_over_time_follows_equations_11_to_14() -> None:
     assert bias_var[-1, 0] == pytest.approx(state_covariance[0].sum(), abs=1e-12)
 
 
+@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("p", [1, 3, 6])
+def test_regressors_are_those_of_the_joint_normal_density(node: tuple, p: int) -> None:
+    """y = x0 + drift + Z c + v with c ~ N(0, diag(sd^2)): covariance of the record, conditional mean and covariance of
+    (x0 + drift + z c, c) at the last sample, and the bank's weights, from the dense matrices."""
+    n = 30
+    y, r = a_record(n)
+    y[-1] = 0.7  # what is read now is asked for at the last sample
+    have = np.isfinite(y)
+    rng = np.random.default_rng(p)
+    z = np.column_stack([np.arange(n) * 0.1, (np.arange(n) >= 12) * 1.0, np.sin(np.arange(n)), rng.normal(size=(n, 3))])
+    z = np.ascontiguousarray(z[:, :p])
+    z[~have] = np.nan
+    sd = np.geomspace(0.1, 10.0, p)
+    used = z[have]
+    covariance = record_covariance(node, n, DT, BIAS_SD, r)[np.ix_(have, have)] + used * sd**2 @ used.T
+    ln_p, mean, state_covariance = _reference.run_filters(
+        y, DT, BIAS_MEAN, BIAS_SD, *arrays([node]), r=r, z=z, coefficient_sd=sd
+    )
+    expected = stats.multivariate_normal(np.full(have.sum(), BIAS_MEAN), covariance).logpdf(y[have])
+    assert ln_p[0] == pytest.approx(expected, abs=LN_P_TOLERANCE)
+
+    drift = drift_covariance(*node[:3], n, DT)
+    cross = np.vstack([drift[-1, have], np.full(have.sum(), BIAS_SD**2), (used * sd**2).T])
+    gain = np.linalg.solve(covariance, cross.T).T
+    prior = np.diag([drift[-1, -1], BIAS_SD**2, *sd**2])
+    expected_mean = np.concatenate([[0.0, BIAS_MEAN], np.zeros(p)]) + gain @ (y[have] - BIAS_MEAN)
+    expected_covariance = prior - gain @ cross.T
+    # The dense solve has P0 / sigma_v^2 = 1e8 in it at the worst node.
+    np.testing.assert_allclose(mean[0], expected_mean, atol=1e-6)
+    np.testing.assert_allclose(state_covariance[0], expected_covariance, atol=1e-6)
+    now = np.concatenate([[1.0, 1.0], z[-1]])
+    law = node[0]
+    _, probability, _, _, bias_mean, bias_var = _reference.run_bank(
+        y, DT, BIAS_MEAN, BIAS_SD, *arrays([node]), ln_prior=[0.0], after=[n], r=r, z=z, coefficient_sd=sd
+    )
+    assert probability[0, law] == 1.0
+    assert bias_mean[0, law] == pytest.approx(now @ expected_mean, abs=1e-6)
+    assert bias_var[0, law] == pytest.approx(now @ expected_covariance @ now, abs=1e-6)
+
+
 def test_bad_arguments_are_refused() -> None:
     y = np.zeros(5)
     with pytest.raises(ValueError, match="sigma_v"):
@@ -127,6 +168,15 @@ def test_bad_arguments_are_refused() -> None:
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(3, 0.0, 1.0, 1.0)]))
     with pytest.raises(ValueError, match="length"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), r=np.ones(4))
+    with pytest.raises(ValueError, match="come together"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), z=np.ones((5, 1)))
+    for z in (np.ones((4, 1)), np.ones((5, 7))):
+        with pytest.raises(ValueError, match="at most 6"):
+            _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), z=z, coefficient_sd=np.ones(z.shape[1]))
+    with pytest.raises(ValueError, match="finite where y is"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), z=np.full((5, 1), np.nan), coefficient_sd=np.ones(1))
+    with pytest.raises(ValueError, match="at least 0"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), z=np.ones((5, 1)), coefficient_sd=np.array([-1.0]))
     with pytest.raises(ValueError, match="after"):
         _reference.run_bank(y, 1.0, 0.0, 1.0, *arrays(NODES), ln_prior=[0.0] * len(NODES), after=[6])
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import Model
+from selfcal.model import Model, Regressor
 from selfcal.tables import Tables, make_tables
 
 #: 10 Hz averaged to 1 Hz, two axes of the gyro.
@@ -109,3 +110,28 @@ def test_builds_and_models_refuse_each_others_snapshots() -> None:
         for stranger in (Bank(made, double=not double), Bank(other_model, double=double)):
             with pytest.raises(UserError, match="not a snapshot of this model and build"):
                 stranger.restore(bank.save())
+
+
+@pytest.mark.parametrize("double", [False, True], ids=["float", "double"])
+def test_a_bank_with_regressors_goes_on_bit_for_bit(double: bool) -> None:
+    """As above, with two columns beside the constant: their sums and averagers are state as well."""
+    model = replace(
+        Model.load(),
+        regressors=(
+            Regressor("temperature", "column", "degC", {"gyro": 0.05, "accel": 0.05}, column="temp", reference=25.0),
+            Regressor("time", "time", "s", {"gyro": 3e-4, "accel": 3e-4}),
+        ),
+    )
+    made = make_tables(model, 10.0, AXES, "cortex-m4f")
+    samples, missing = record()
+    z = np.column_stack([20.0 + 5.0 * np.sin(np.arange(SAMPLES) / 300.0), np.arange(SAMPLES) / 10.0]).astype(np.float32)
+    whole = Bank(made, double=double)
+    whole.push(samples, missing, z)
+    end, report = whole.save(), whole.report(0, mask=3)
+    for cut in (0, 1, 7, 160, 1501, 1507, 2999):
+        bank, other = Bank(made, double=double), Bank(made, double=double)
+        bank.push(samples[:cut], missing[:cut], z[:cut])
+        other.restore(bank.save())
+        other.push(samples[cut:], missing[cut:], z[cut:])
+        assert other.save() == end, f"cut at sample {cut}"
+        assert other.report(0, mask=3) == report

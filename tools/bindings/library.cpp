@@ -11,6 +11,7 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "selfcal.h"
@@ -19,6 +20,9 @@ namespace nb = nanobind;
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
 using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>>;
+
+using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
+using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 // Not an anonymous namespace: two builds of one name in one process would be the same type to nanobind.
 namespace MODULE_NAME {
@@ -35,7 +39,7 @@ struct Grid {
 class Bank {
 public:
     Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses,
-         uint32_t id) {
+         uint32_t id, const std::optional<RegressorsTuple> &regressors) {
         for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
             if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || uniform.size() != SELFCAL_PARAMETERS)
@@ -60,24 +64,36 @@ public:
                   static_cast<uint8_t>(hypotheses_.size()),
                   static_cast<uint16_t>(nodes),
                   axes_.data(),
-                  hypotheses_.data()};
+                  hypotheses_.data(),
+                  nullptr};
         if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
             throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
-        memory_.resize(SELFCAL_SIZE(nodes, axes_.size()) / sizeof(double) + 1);
+        if (regressors) {
+            std::tie(reference_, coefficient_sd_) = *regressors;
+            if (reference_.size() > SELFCAL_REGRESSORS_MAX || coefficient_sd_.size() != axes_.size() * reference_.size())
+                throw std::invalid_argument("regressors need a reference each and a prior for every axis");
+            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(), coefficient_sd_.data()};
+            model_.regressors = &regressors_;
+        }
+        memory_.resize(size() / sizeof(double) + 1);
         check(selfcal_init(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double)));
     }
     Bank(const Bank &) = delete;
     Bank &operator=(const Bank &) = delete;
 
-    void push(const nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu> &samples,
-              const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before) {
+    void push(const Rows &samples,
+              const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before,
+              const std::optional<Rows> &regressors) {
+        if (regressors && (regressors->shape(0) != samples.shape(0) || regressors->shape(1) != reference_.size()))
+            throw std::invalid_argument("regressors must be [n, regressors]");
         if (samples.shape(1) != axes_.size() || missing_before.shape(0) != samples.shape(0))
             throw std::invalid_argument("samples must be [n, axes] and missing_before [n]");
         nb::gil_scoped_release release;
         for (size_t i = 0; i < samples.shape(0); i++) {
             if (missing_before.data()[i] > 0)
                 check(selfcal_skip(&bank_, missing_before.data()[i]));
-            check(selfcal_push(&bank_, samples.data() + i * axes_.size()));
+            check(selfcal_push_with(&bank_, samples.data() + i * axes_.size(),
+                                    regressors ? regressors->data() + i * reference_.size() : nullptr));
         }
     }
 
@@ -91,11 +107,16 @@ public:
         return selfcal_retired(&bank_, axis);
     }
 
-    nb::dict report(uint8_t axis) {
+    nb::dict report(uint8_t axis, uint8_t mask) {
         selfcal_report_t r{};
+        std::vector<selfcal_coefficients_t> coefficients(hypotheses_.size());
         {
             nb::gil_scoped_release release;
-            check(selfcal_report(work_.get(), &bank_, axis, &r));
+            check(selfcal_report_begin_subset(work_.get(), &bank_, axis, mask, coefficients.data(), &r));
+            selfcal_status_t status = SELFCAL_BUSY;
+            while (status == SELFCAL_BUSY)
+                status = selfcal_report_step(work_.get(), &r);
+            check(status);
         }
         nb::list hypotheses;
         for (size_t h = 0; h < hypotheses_.size(); h++) {
@@ -107,6 +128,10 @@ public:
             d["probability"] = p.probability;
             d["ln_evidence"] = p.ln_evidence;
             d["parameters"] = parameters;
+            nb::list of_regressors;
+            for (size_t k = 0; k < reference_.size(); k++)
+                of_regressors.append(nb::make_tuple(coefficients[h].mean[k], coefficients[h].sd[k]));
+            d["coefficients"] = of_regressors;
             d["bias_mean"] = p.bias_mean;
             d["bias_sd"] = p.bias_sd;
             hypotheses.append(d);
@@ -152,6 +177,12 @@ public:
         return ln_p;
     }
 
+    double log_likelihood_subset(uint8_t axis, uint16_t node, uint8_t mask, double sigma_v) {
+        double ln_p = 0.0;
+        check(selfcal_log_likelihood_subset(&bank_, axis, node, mask, sigma_v, &ln_p));
+        return ln_p;
+    }
+
     nb::dict counters() const {
         const selfcal_counters_t *c = selfcal_counters(&bank_);
         const size_t axes = axes_.size();
@@ -166,12 +197,15 @@ public:
         d["not_finite"] = list(c->not_finite);
         d["saturated"] = list(c->saturated);
         d["stuck"] = list(c->stuck);
+        d["regressor_not_finite"] = c->regressor_not_finite;
         return d;
     }
 
     uint32_t count() const { return selfcal_count(&bank_); }
     uint16_t nodes() const { return model_.nodes; }
-    size_t size() const { return SELFCAL_SIZE(model_.nodes, model_.axes); }
+    size_t size() const {
+        return SELFCAL_SIZE(model_.nodes, model_.axes) + SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size());
+    }
 
     bool sound() const { return selfcal_check(&bank_) == SELFCAL_OK; }
 
@@ -234,6 +268,8 @@ private:
     std::vector<selfcal_axis_t> axes_;
     std::vector<selfcal_hypothesis_t> hypotheses_;
     std::vector<std::unique_ptr<Grid>> grids_;
+    std::vector<float> reference_, coefficient_sd_;
+    selfcal_regressors_t regressors_{};
     std::vector<double> memory_;
     selfcal_model_t model_{};
     selfcal_t bank_{};
@@ -305,22 +341,26 @@ NB_MODULE(MODULE_NAME, m) {
     using MODULE_NAME::Bank;
     m.attr("version") = SELFCAL_VERSION;
     m.attr("GRID_MAX") = SELFCAL_GRID_MAX;
+    m.attr("REGRESSORS_MAX") = SELFCAL_REGRESSORS_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
     m.attr("AT_MIN") = static_cast<int>(SELFCAL_AT_MIN);
     m.attr("AT_MAX") = static_cast<int>(SELFCAL_AT_MAX);
     m.attr("OFF_GRID") = static_cast<int>(SELFCAL_OFF_GRID);
     nb::class_<Bank>(m, "Bank")
-        .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t>())
-        .def("push", &Bank::push)
+        .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t,
+                      const std::optional<RegressorsTuple> &>(),
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
+        .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
         .def("rate", &Bank::rate)
         .def("retired", &Bank::retired)
-        .def("report", &Bank::report)
+        .def("report", &Bank::report, nb::arg("axis"), nb::arg("mask") = 0)
         .def("predict", &Bank::predict)
         .def("node", &Bank::node)
         .def("log_likelihood", &Bank::log_likelihood)
+        .def("log_likelihood_subset", &Bank::log_likelihood_subset)
         .def("counters", &Bank::counters)
         .def("within_sd", &Bank::within_sd)
         .def("save", &Bank::save)

@@ -5,9 +5,11 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <stdexcept>
+#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -22,6 +24,7 @@ namespace sr = selfcal_reference;
 namespace {
 
 using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Columns = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Laws = nb::ndarray<const int, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // A numpy array that owns what it is filled with.
@@ -45,12 +48,31 @@ private:
 
 using Output = nb::ndarray<nb::numpy, double>;
 
-sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, double bias_mean, double bias_sd) {
+sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, double bias_mean, double bias_sd,
+                  const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd) {
     if (r && r->shape(0) != y.shape(0))
         throw std::invalid_argument("r must have the length of y");
     if (!(dt_s > 0.0) || !(bias_sd >= 0.0) || !std::isfinite(bias_mean))
         throw std::invalid_argument("dt_s must be positive, bias_sd at least 0 and bias_mean finite");
-    return {y.data(), r ? r->data() : nullptr, y.shape(0), dt_s, bias_mean, bias_sd};
+    sr::Record out{y.data(), r ? r->data() : nullptr, y.shape(0), dt_s, bias_mean, bias_sd};
+    if (z.has_value() != coefficient_sd.has_value())
+        throw std::invalid_argument("z and coefficient_sd come together");
+    if (!z)
+        return out;
+    out.regressors = z->shape(1);
+    if (z->shape(0) != y.shape(0) || coefficient_sd->shape(0) != out.regressors || out.regressors > sr::regressors_max)
+        throw std::invalid_argument("z must be [n, regressors] with at most " + std::to_string(sr::regressors_max) +
+                                    " regressors, and coefficient_sd [regressors]");
+    for (std::size_t i = 0; i < y.shape(0); i++)
+        for (std::size_t k = 0; k < out.regressors; k++)
+            if (!std::isnan(y(i)) && !std::isfinite((*z)(i, k)))
+                throw std::invalid_argument("z must be finite where y is");
+    for (std::size_t k = 0; k < out.regressors; k++)
+        if (!((*coefficient_sd)(k) >= 0.0))
+            throw std::invalid_argument("coefficient_sd must be at least 0");
+    out.z = z->data();
+    out.coefficient_sd = coefficient_sd->data();
+    return out;
 }
 
 sr::Node node(int law, double drift, double alpha, double sigma_v) {
@@ -73,19 +95,22 @@ std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vect
 
 std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, double bias_mean, double bias_sd,
                                                const Laws &law, const Vector &drift, const Vector &alpha,
-                                               const Vector &sigma_v, const std::optional<Vector> &r) {
+                                               const Vector &sigma_v, const std::optional<Vector> &r,
+                                               const std::optional<Columns> &z,
+                                               const std::optional<Vector> &coefficient_sd) {
     const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     std::vector<sr::Filtered> filtered;
     {
         nb::gil_scoped_release release;
         filtered = sr::run_filters(rec, nodes);
     }
-    const Array<double> ln_p({nodes.size()}), mean({nodes.size(), 2}), covariance({nodes.size(), 2, 2});
+    const std::size_t size = 2 + rec.regressors;
+    const Array<double> ln_p({nodes.size()}), mean({nodes.size(), size}), covariance({nodes.size(), size, size});
     for (std::size_t j = 0; j < nodes.size(); j++) {
         ln_p.data()[j] = filtered[j].ln_p;
-        Eigen::Map<Eigen::Vector2d>(mean.data() + 2 * j) = filtered[j].mean;
-        Eigen::Map<Eigen::Matrix2d>(covariance.data() + 4 * j) = filtered[j].covariance; // symmetric
+        std::copy_n(filtered[j].mean.data(), size, mean.data() + size * j);
+        std::copy_n(filtered[j].covariance.data(), size * size, covariance.data() + size * size * j); // symmetric
     }
     return {ln_p.numpy(), mean.numpy(), covariance.numpy()};
 }
@@ -93,14 +118,15 @@ std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, dou
 std::tuple<Output, Output, Output, Output, Output, Output>
 run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const Laws &law, const Vector &drift,
          const Vector &alpha, const Vector &sigma_v, const std::vector<double> &ln_prior,
-         const std::vector<std::size_t> &after, const std::optional<Vector> &r) {
+         const std::vector<std::size_t> &after, const std::optional<Vector> &r, const std::optional<Columns> &z,
+         const std::optional<Vector> &coefficient_sd) {
     const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
     if (ln_prior.size() != nodes.size())
         throw std::invalid_argument("ln_prior must have one value a node");
     for (std::size_t m = 0; m < after.size(); m++)
         if (after[m] > y.shape(0) || (m > 0 && after[m] < after[m - 1]))
             throw std::invalid_argument("after must ascend and stay within the record");
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     std::vector<sr::Posterior> posterior;
     {
         nb::gil_scoped_release release;
@@ -125,9 +151,10 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const L
 }
 
 Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, int law, double drift, double alpha,
-                   double sigma_v, const std::optional<Vector> &r) {
+                   double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
+                   const std::optional<Vector> &coefficient_sd) {
     const sr::Node one = node(law, drift, alpha, sigma_v);
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     const Array<double> out({rec.n});
     {
         nb::gil_scoped_release release;
@@ -166,11 +193,11 @@ NB_MODULE(_reference, m) {
     using namespace nb::literals;
     m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
     m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none());
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
     m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none());
+          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
     m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none());
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
 
     nb::class_<sr::Scene>(m, "Scene")
         .def(nb::init<>())

@@ -4,8 +4,10 @@
 Nodes are four arrays of one length m: `law` int32 (0 constant, 1 random walk, 2 Gauss-Markov: the order of model.LAWS),
 `drift` (K in unit/s/sqrt(Hz), or sigma_m in unit; not used by law 0), `alpha` (1/s, law 2 only), `sigma_v` (unit, per
 sample: N / sqrt(dt_s)). A record is `y` float64[n] in its unit, NaN where a sample is missing, every `dt_s`; `r`
-float64[n] multiplies sigma_v^2, None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Arguments that do not
-fit raise ValueError. All cores are used, the interpreter's lock is released.
+float64[n] multiplies sigma_v^2, None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z`
+float64[n, p], p <= 6, finite where y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in the
+unit of y per unit of each column. Arguments that do not fit raise ValueError. All cores are used, the interpreter's
+lock is released.
 """
 
 from collections.abc import Sequence
@@ -28,9 +30,11 @@ def run_filters(
     alpha: _Floats,
     sigma_v: _Floats,
     r: _Floats | None = None,
+    z: _Floats | None = None,
+    coefficient_sd: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats]:
-    """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, 2] and covariance [m,
-    2, 2] of the state (drift, x0)."""
+    """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, 2 + p] and
+    covariance [m, 2 + p, 2 + p] of the state (drift, x0, c)."""
 
 def run_bank(
     y: _Floats,
@@ -44,13 +48,15 @@ def run_bank(
     ln_prior: Sequence[float],
     after: Sequence[int],
     r: _Floats | None = None,
+    z: _Floats | None = None,
+    coefficient_sd: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
     """The bank at t instants, `after` so many samples (ascending). `ln_prior`: ln of each node's prior probability, up
     to a constant.
 
     Returns weight [t, m] (equations 11 and 13: they sum to 1 over all nodes), probability [t, 3] of the laws (13), mean
     [t, 3, 3] and covariance [t, 3, 3, 3] of (drift, alpha, sigma_v) under each law (12, 14), and mean and variance [t,
-    3] of x0 + drift under each law. A law of probability 0 has NaN moments.
+    3] of x0 + drift + c z now under each law. A law of probability 0 has NaN moments.
     """
 
 def innovations(
@@ -63,6 +69,8 @@ def innovations(
     alpha: float,
     sigma_v: float,
     r: _Floats | None = None,
+    z: _Floats | None = None,
+    coefficient_sd: _Floats | None = None,
 ) -> _Floats:
     """Standardised innovations nu / sqrt(s) [n] of one node's filter, NaN where a sample is missing."""
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from selfcal import units
 from selfcal.errors import UserError
 
 SCHEMA = "selfcal.model/1"
@@ -25,6 +26,16 @@ LAWS: dict[str, tuple[str, ...]] = {
 NODES = (6, 16)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
+#: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
+REGRESSORS: dict[str, tuple[str, ...]] = {
+    "time": ("reference",),
+    "column": ("column", "unit", "reference"),
+    "rate": ("column", "unit", "reference", "window_s"),
+    "periodic": ("frequency_hz",),
+    "step": ("time_s",),
+}
+#: Columns of all regressors together: SELFCAL_REGRESSORS_MAX.
+MOST_COLUMNS = 6
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,32 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Regressor:
+    """A known disturbance: its value times a constant coefficient is in every reading (values: `regressors.py`).
+
+    `sd`: by group, the standard deviation of the coefficient's normal prior about 0, in the group's unit per `unit`; a
+    group that is not there does not have this regressor. `reference`: the value at which x0 alone is the bias.
+    `probability`: prior one that the regressor is in use.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    sd: Mapping[str, float]
+    probability: float = 0.5
+    reference: float = 0.0
+    column: str = ""
+    window_s: float = math.nan
+    frequency_hz: float = math.nan
+    time_s: float = math.nan
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of its columns: a periodic one has a sine and a cosine."""
+        return (f"{self.name}.sin", f"{self.name}.cos") if self.kind == "periodic" else (self.name,)
+
+
+@dataclass(frozen=True)
 class GridNodes:
     """Filter nodes of one target: random walk (rho) and Gauss-Markov (rho, alpha)."""
 
@@ -72,6 +109,7 @@ class Model:
     hypotheses: Mapping[str, float]
     nodes: Mapping[str, GridNodes]
     simulate: Mapping[str, Any]
+    regressors: tuple[Regressor, ...] = ()
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -196,6 +234,53 @@ class _Reader:
             },
         )
 
+    def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
+        if not isinstance(tree, dict):
+            raise self.fail(where, "must be a mapping")
+        kind = self.entry(tree, "kind", where)
+        if kind not in REGRESSORS:
+            raise self.fail(where, f"unknown kind '{kind}' ({', '.join(REGRESSORS)})")
+        fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
+        unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or str(self.entry(fields, "unit", where))
+        try:
+            units.parse(unit)
+        except UserError as error:
+            raise self.fail(f"{where}.unit", str(error)) from None
+        priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
+        if not priors:
+            raise self.fail(f"{where}.sd", "must name at least one group")
+        probability = self.number(fields.get("probability", 0.5), f"{where}.probability")
+        if probability >= 1.0:
+            raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
+        needed = {
+            key: self.number(self.entry(fields, key, where), f"{where}.{key}")
+            for key in ("window_s", "frequency_hz", "time_s")
+            if key in REGRESSORS[kind]
+        }
+        return Regressor(
+            name=str(self.entry(fields, "name", where)),
+            kind=kind,
+            unit=f"{unit}/s" if kind == "rate" else unit,
+            sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
+            probability=probability,
+            reference=self.number(fields.get("reference", 0.0), f"{where}.reference", low=-math.inf, strict=False),
+            column=str(self.entry(fields, "column", where)) if "column" in REGRESSORS[kind] else "",
+            **needed,
+        )
+
+    def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
+        if not isinstance(tree, list):
+            raise self.fail("regressors", "must be a list")
+        found = tuple(self.regressor(one, f"regressors[{i}]", groups) for i, one in enumerate(tree))
+        names = [regressor.name for regressor in found]
+        for name in names:
+            if names.count(name) > 1:
+                raise self.fail("regressors", f"'{name}' appears twice")
+        columns = sum(len(regressor.columns) for regressor in found)
+        if columns > MOST_COLUMNS:
+            raise self.fail("regressors", f"{columns} columns are more than {MOST_COLUMNS} (periodic: two each)")
+        return found
+
     def nodes(self, tree: Any, where: str) -> GridNodes:
         fields = self.only(tree, ("random_walk", "gauss_markov"), where)
         pair = self.entry(fields, "gauss_markov", where)
@@ -210,7 +295,7 @@ class _Reader:
         )
 
     def model(self) -> Model:
-        top = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
+        top = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate", "regressors")
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
@@ -243,4 +328,5 @@ class _Reader:
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
             nodes={name: self.nodes(fields, f"nodes.{name}") for name, fields in targets.items()},
             simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
+            regressors=self.regressors(tree.get("regressors") or [], groups),
         )

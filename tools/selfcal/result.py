@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Estimate:
 class AxisResult:
     """Posterior of one axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
 
-    `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample.
+    `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample, with regressors in use x0 +
+    drift + c z there. `coefficients`: mean and sd by hypothesis, in the order of the columns in use.
     """
 
     n: int
@@ -41,3 +43,4 @@ class AxisResult:
     parameters: dict[str, dict[str, Estimate]]
     bias_mean: float
     bias_sd: float
+    coefficients: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, Model
+from selfcal.model import LAWS, PARAMETERS, Model, Regressor
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
 RATE_LIMITS = (1e-6, 1e6)
@@ -51,6 +51,16 @@ class AxisTable:
 
 
 @dataclass(frozen=True)
+class RegressorTable:
+    """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not."""
+
+    name: str
+    unit: str
+    reference: float
+    coefficient_sd: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class HypothesisTable:
     """One hypothesis: its law (index into LAWS), prior probability and grids."""
 
@@ -74,6 +84,7 @@ class Tables:
     block: int
     axes: tuple[AxisTable, ...]
     hypotheses: tuple[HypothesisTable, ...]
+    regressors: tuple[RegressorTable, ...] = ()
 
     @property
     def nodes(self) -> int:
@@ -87,7 +98,7 @@ class Tables:
             (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0)
             for h in self.hypotheses
         ]
-        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses)).encode())
+        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses, *self.regressors)).encode())
 
 
 def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
@@ -147,4 +158,14 @@ def make_tables(
             HypothesisTable(name, list(LAWS).index(name), math.log(probability), *grids[name])
             for name, probability in model.hypotheses.items()
         ),
+        regressors=tuple(
+            RegressorTable(column, one.unit, one.reference, tuple(_coefficient_sd(model, one, name) for name in names))
+            for one in model.regressors
+            for column in one.columns
+        ),
     )
+
+
+def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:
+    """0 where the axis does not have the regressor: no prior for its group, or it is the axis itself."""
+    return 0.0 if regressor.column == axis else regressor.sd.get(model.group_of(axis).name, 0.0)

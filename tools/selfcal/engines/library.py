@@ -12,13 +12,22 @@ from selfcal import _dense, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS
 from selfcal.result import AxisResult, Estimate
-from selfcal.tables import Grid, Tables
+from selfcal.tables import AxisTable, Grid, Tables
 
 
 def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
     if grid is None:
         return None
     return (grid.nodes, grid.fit.ravel().tolist())
+
+
+def _regressors(tables: Tables) -> tuple[list[float], list[float]] | None:
+    """Reference [p] and prior sd [axes * p] of the columns."""
+    columns = tables.regressors
+    if not columns:
+        return None
+    sd = [column.coefficient_sd[axis] for axis in range(len(tables.axes)) for column in columns]
+    return [column.reference for column in columns], sd
 
 
 class Bank:
@@ -35,13 +44,21 @@ class Bank:
             ],
             [(h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha)) for h in tables.hypotheses],
             tables.id,
+            _regressors(tables),
         )
 
-    def push(self, samples: NDArray[np.floating[Any]], missing_before: NDArray[np.integer[Any]] | None = None) -> None:
-        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing ones each."""
+    def push(
+        self,
+        samples: NDArray[np.floating[Any]],
+        missing_before: NDArray[np.integer[Any]] | None = None,
+        regressors: NDArray[np.floating[Any]] | None = None,
+    ) -> None:
+        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing ones each, with the values
+        of the `regressors` [n, p] if the tables have any."""
         rows = np.ascontiguousarray(samples, dtype=np.float32)
         missing = np.zeros(len(rows)) if missing_before is None else missing_before
-        self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64))
+        values = None if regressors is None else np.ascontiguousarray(regressors, dtype=np.float32)
+        self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64), values)
 
     def save(self) -> bytes:
         """Everything the bank knows, in the format of lib/snapshot.c."""
@@ -54,32 +71,41 @@ class Bank:
         except ValueError as error:  # std::invalid_argument
             raise UserError(str(error)) from error
 
-    def report(self, axis: int) -> AxisResult:
-        """Posterior of one axis now. Raises UserError of an axis that failed, or with too few bank samples."""
+    def report(self, axis: int, mask: int = 0) -> AxisResult:
+        """Posterior of one axis now, with the columns of `mask` in use, a bit each. Raises UserError of an axis that
+        failed, with too few bank samples, and where the priors leave nothing (with regressors an evidence of -inf)."""
         if self.raw.retired(axis):
             raise UserError(
                 f"{self.tables.axes[axis].name} was out of range or stuck for too long and is left out: choose the "
                 "others with --axis"
             )
         try:
-            report = self.raw.report(axis)
+            report = self.raw.report(axis, mask)
         except ValueError as error:  # std::length_error
             raise UserError(_too_short(self.tables, self.raw.count)) from error
-        log_evidence, probability, parameters = {}, {}, {}
+        log_evidence, probability, parameters, coefficients = {}, {}, {}, {}
+        used = [k for k in range(len(self.tables.regressors)) if mask >> k & 1]
         for table, entry in zip(self.tables.hypotheses, report["hypotheses"], strict=True):
             log_evidence[table.name] = entry["ln_evidence"]
             probability[table.name] = entry["probability"]
+            coefficients[table.name] = tuple(entry["coefficients"][k] for k in used)
             parameters[table.name] = {
                 name: _estimate(entry["parameters"][PARAMETERS.index(name)]) for name in LAWS[table.name]
             }
-        if not any(math.isfinite(p) for p in probability.values()):
-            prior = self.tables.axes[axis]
-            raise UserError(
-                f"the record lies outside the model's priors of {prior.name}, whose white noise N runs from "
-                f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz): widen "
-                "them in the model file, or check the unit and whether the sensor was at rest"
-            )
-        return AxisResult(report["n"], log_evidence, probability, parameters, report["bias_mean"], report["bias_sd"])
+        if not self.tables.regressors and not any(math.isfinite(p) for p in probability.values()):
+            raise UserError(outside_priors(self.tables.axes[axis]))
+        return AxisResult(
+            report["n"], log_evidence, probability, parameters, report["bias_mean"], report["bias_sd"], coefficients
+        )
+
+
+def outside_priors(prior: AxisTable) -> str:
+    """What to tell the user when no hypothesis has any evidence."""
+    return (
+        f"the record lies outside the model's priors of {prior.name}, whose white noise N runs from "
+        f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz): widen "
+        "them in the model file, or check the unit and whether the sensor was at rest"
+    )
 
 
 def _too_short(tables: Tables, count: int) -> str:

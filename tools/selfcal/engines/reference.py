@@ -10,7 +10,7 @@ second node changes nothing that matters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,28 +45,36 @@ _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
 @dataclass(frozen=True)
 class _Filtered:
-    """m nodes: `value` [m] ln of likelihood times prior density in ln parameters; moments [m] of x0 + drift now."""
+    """m nodes: `value` [m] ln of likelihood times prior density in ln parameters; moments [m, 1 + p] of x0 + drift +
+    c z now and of the coefficients c."""
 
     value: _Floats
-    bias_mean: _Floats
-    bias_var: _Floats
+    mean: _Floats
+    var: _Floats
 
 
 @dataclass(frozen=True)
 class _Posterior:
     ln_evidence: float
     parameters: dict[str, Estimate]
-    bias_mean: float
-    bias_var: float
+    mean: _Floats
+    var: _Floats
 
 
 def identify_axis(
-    y: _Floats, dt: float, group: Group, hypotheses: Mapping[str, float], r: _Floats | None = None
+    y: _Floats,
+    dt: float,
+    group: Group,
+    hypotheses: Mapping[str, float],
+    r: _Floats | None = None,
+    z: _Floats | None = None,
+    coefficient_sd: Sequence[float] = (),
 ) -> AxisResult:
     """Posterior of one axis under the continuous priors of its group.
 
     `y` float64[n] in the group's unit every `dt` s, NaN where a sample is missing; `r` float64[n] is the factor on the
-    white noise variance of each (None: 1). `hypotheses`: prior probability by name. Raises UserError without a
+    white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
+    of the regressors in use, less their references, with the prior `coefficient_sd` of each. Raises UserError without a
     sample, and when a posterior would take more than `_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
@@ -76,24 +84,36 @@ def identify_axis(
     offset = float(np.nanmean(y))
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
-    found = {name: _posterior(centred, dt, offset, group, name, factors) for name in hypotheses}
+    columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
+    found = {name: _posterior(centred, dt, offset, group, name, factors, columns) for name in hypotheses}
     ln_weight = {name: math.log(hypotheses[name]) + found[name].ln_evidence for name in found if hypotheses[name] > 0.0}
     top = max(ln_weight.values())
     total = sum(math.exp(value - top) for value in ln_weight.values())
     probability = {name: math.exp(ln_weight[name] - top) / total if name in ln_weight else 0.0 for name in found}
-    bias_mean = sum(probability[name] * p.bias_mean for name, p in found.items())
-    spread = sum(probability[name] * (p.bias_var + (p.bias_mean - bias_mean) ** 2) for name, p in found.items())
+    bias_mean = sum(probability[name] * p.mean[0] for name, p in found.items())
+    spread = sum(probability[name] * (p.var[0] + (p.mean[0] - bias_mean) ** 2) for name, p in found.items())
     return AxisResult(
         n,
         {name: p.ln_evidence for name, p in found.items()},
         probability,
         {name: p.parameters for name, p in found.items()},
-        bias_mean + offset,
+        float(bias_mean + offset),
         math.sqrt(spread),
+        {name: tuple(zip(p.mean[1:].tolist(), np.sqrt(p.var[1:]).tolist(), strict=True)) for name, p in found.items()},
     )
 
 
-def _posterior(y: _Floats, dt: float, offset: float, group: Group, law: str, r: _Floats | None) -> _Posterior:
+def _posterior(
+    y: _Floats,
+    dt: float,
+    offset: float,
+    group: Group,
+    law: str,
+    r: _Floats | None,
+    columns: tuple[_Floats, _Floats] | None,
+) -> _Posterior:
+    z, sd = (None, None) if columns is None else columns
+    now = np.ones(2) if z is None else np.concatenate([[1.0, 1.0], z[np.flatnonzero(np.isfinite(y))[-1]]])
     names = LAWS[law]
     priors = [group.priors[name] for name in names]
     low = np.log([prior.min for prior in priors])
@@ -114,23 +134,30 @@ def _posterior(y: _Floats, dt: float, offset: float, group: Group, law: str, r: 
             np.ascontiguousarray(theta[:, 2]) if len(names) > 2 else np.ones(m),
             theta[:, 0] / math.sqrt(dt),
             r,
+            z,
+            sd,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
-        return _Filtered(ln_p + ln_prior, mean.sum(axis=1), covariance.sum(axis=(1, 2)))
+        own = np.diagonal(covariance, axis1=1, axis2=2)[:, 2:]
+        return _Filtered(
+            ln_p + ln_prior,
+            np.column_stack([mean @ now, mean[:, 2:]]),
+            np.column_stack([np.einsum("i,mij,j->m", now, covariance, now), own]),
+        )
 
     seeds = _modes(lambda x: filtered(x).value, low, high)
-    lattice = _Lattice(filtered, low, high, _widths(lambda x: filtered(x).value, seeds[0], low, high))
+    lattice = _Lattice(filtered, low, high, _widths(lambda x: filtered(x).value, seeds[0], low, high), len(now) - 1)
     lattice.start(seeds)
     lattice.refine()
     mass = lattice.mass(None)
     total = float(mass.sum())
-    mean_now = float(mass @ lattice.bias_mean) / total
-    var_now = float(mass @ (lattice.bias_var + (lattice.bias_mean - mean_now) ** 2)) / total
+    mean = mass @ lattice.mean / total
+    var = mass @ (lattice.var + (lattice.mean - mean) ** 2) / total
     return _Posterior(
         math.log(total) + lattice.top,
         {name: _estimate(lattice, d, priors[d]) for d, name in enumerate(names)},
-        mean_now,
-        var_now,
+        mean,
+        var,
     )
 
 
@@ -225,15 +252,18 @@ def _widths(value: Callable[[_Floats], _Floats], mode: _Floats, low: _Floats, hi
 class _Lattice:
     """Nodes low + index * step with indices 0 to `count` in each of D directions; those filtered so far.
 
-    `index` int64[m, D]; `value`, `bias_mean`, `bias_var` float64[m] as in _Filtered; `top` is the highest value.
+    `index` int64[m, D]; `value`, `mean`, `var` as in _Filtered; `top` is the highest value.
     """
 
-    def __init__(self, filtered: Callable[[_Floats], _Filtered], low: _Floats, high: _Floats, widths: _Floats) -> None:
+    def __init__(
+        self, filtered: Callable[[_Floats], _Filtered], low: _Floats, high: _Floats, widths: _Floats, moments: int
+    ) -> None:
         self.filtered, self.low, self.high = filtered, low, high
         steps = np.maximum(np.ceil((high - low) / (_STEP * widths)), _FEWEST)
         self.count: _Indices = (2 * np.ceil(np.minimum(steps, 2**20) / 2)).astype(np.int64)
         self.index: _Indices = np.empty((0, len(low)), np.int64)
-        self.value, self.bias_mean, self.bias_var = np.empty(0), np.empty(0), np.empty(0)
+        self.value = np.empty(0)
+        self.mean, self.var = np.empty((0, moments)), np.empty((0, moments))
         self.top = -math.inf
 
     def x(self, index: _Indices) -> _Floats:
@@ -319,8 +349,8 @@ class _Lattice:
         new = self.filtered(self.x(index))
         self.index = np.concatenate([self.index, index])
         self.value = np.concatenate([self.value, new.value])
-        self.bias_mean = np.concatenate([self.bias_mean, new.bias_mean])
-        self.bias_var = np.concatenate([self.bias_var, new.bias_var])
+        self.mean = np.concatenate([self.mean, new.mean])
+        self.var = np.concatenate([self.var, new.var])
         self.top = float(self.value.max())
 
     def _key(self, index: _Indices) -> _Indices:

@@ -46,6 +46,7 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_NODES {tables.nodes}U
 #define SELFCAL_MODEL_AXES {len(tables.axes)}U
 #define SELFCAL_MODEL_HYPOTHESES {len(tables.hypotheses)}U
+#define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
 
@@ -65,6 +66,7 @@ def _source(model: Model, tables: Tables) -> str:
     parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
     hypotheses = (_hypothesis(h) for h in tables.hypotheses)
     parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
+    parts += _regressors(tables)
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
     parts += [
         f"const char *const selfcal_model_axis_name[] = {{{names}}};",
@@ -74,6 +76,7 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {_f(tables.dt_s)}, /* dt_s */",
         f"    {tables.block}U, /* block */",
         "    SELFCAL_MODEL_AXES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_NODES, axes, hypotheses,",
+        f"    {'&regressors' if tables.regressors else 'NULL'},",
         "};",
         "",
     ]
@@ -101,6 +104,26 @@ def _axis(axis: AxisTable) -> str:
     )
     readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
     return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
+
+
+def _regressors(tables: Tables) -> list[str]:
+    if not tables.regressors:
+        return []
+    rows = (
+        ", ".join(_f(column.coefficient_sd[axis]) for column in tables.regressors) for axis in range(len(tables.axes))
+    )
+    references = ", ".join(_f(column.reference) for column in tables.regressors)
+    return [
+        "/* " + ", ".join(f"{column.name} [{column.unit}]" for column in tables.regressors) + " */",
+        f"static const float reference[] = {{{references}}};",
+        "static const float coefficient_sd[] = {",
+        *(f"    {row}, /* {axis.name} */" for row, axis in zip(rows, tables.axes, strict=True)),
+        "};",
+        "static const selfcal_regressors_t regressors = {",
+        f"    &selfcal_regressors_code, {len(tables.regressors)}U, reference, coefficient_sd,",
+        "};",
+        "",
+    ]
 
 
 def _hypothesis(hypothesis: HypothesisTable) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json as json_module
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import LAWS, Group, Model
 from selfcal.recording import Recording, Scale, load
+from selfcal.regressors import Scored, choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult
 from selfcal.tables import Tables, make_tables
 
@@ -38,12 +39,14 @@ CHECK_LIMIT = 4.0
 
 @dataclass(frozen=True)
 class Identified:
-    """One axis: the engine's `result` in `unit`, `checks` of its adequacy, and the samples `kept_out`."""
+    """One axis: the engine's `result` in `unit`, `checks` of its adequacy, the samples `kept_out`, and what is known of
+    the regressors, if the model has any for it (coefficients in `unit` too)."""
 
     unit: str
     result: AxisResult
     checks: Mapping[str, Mapping[str, Any]]
     kept_out: Mapping[str, int]
+    scored: Scored | None = None
 
     @property
     def adequate(self) -> bool:
@@ -84,14 +87,16 @@ def identify(
     found: dict[str, Identified] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("identify", total=len(names))
+        subsets = sum(len(choices_of(offered(loaded_model, name))) for name in names)
+        task = progress.add_task("identify", total=subsets)
         for name in names:
             progress.update(task, description=f"{name} ({engine})")
             try:
-                found[name] = identify_axis(recording, name, loaded_model, engine, decimate)
+                found[name] = identify_axis(
+                    recording, name, loaded_model, engine, decimate, lambda: progress.advance(task)
+                )
             except UserError as error:
                 raise UserError(f"{recording.path}: column {name}: {error}") from error
-            progress.advance(task)
     document = to_document(recording, found)
     if json is not None:
         write_json(document, json)
@@ -115,35 +120,73 @@ def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tu
     return names
 
 
-def identify_axis(recording: Recording, name: str, model: Model, engine: str, decimate: float | None) -> Identified:
-    """One axis by one engine. The record is fed as float32, as the firmware gets it."""
+def identify_axis(
+    recording: Recording,
+    name: str,
+    model: Model,
+    engine: str,
+    decimate: float | None,
+    advance: Callable[[], object] = lambda: None,
+) -> Identified:
+    """One axis by one engine. The record is fed as float32, as the firmware gets it. With regressors every subset of
+    them is scored; `advance` is called after each."""
     group = model.group_of(name)
-    tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=decimate)
+    regressors = offered(model, name)
+    tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
         samples = recording.in_unit(name, group.unit).astype(np.float32)
-    blocks = block_means(samples.astype(np.float64), recording.missing_before, tables.block, group)
+        columns = columns_of(regressors, recording).astype(np.float32)
+    blocks = block_means(
+        samples.astype(np.float64), recording.missing_before, tables.block, group, columns.astype(np.float64)
+    )
     present = blocks.mean[np.isfinite(blocks.mean)]
-    if present.size < REPORT_MIN:
+    needed = REPORT_MIN + len(tables.regressors)
+    if present.size < needed:
         kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
         found = f"{present.size} averages of {tables.dt_s:g} s"
-        raise UserError(f"too short: {found}, {REPORT_MIN} are needed (samples kept out: {kept})")
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
     if not present.std() > 0.0:
         raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
+    choices = choices_of(regressors)
+    results: list[AxisResult] = []
+    z = blocks.z - np.array([column.reference for column in tables.regressors])
+    sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
     if engine == "library":
         from selfcal.engines.library import Bank
 
         bank = Bank(tables)
-        bank.push(samples[:, None], recording.missing_before)
-        result = bank.report(0)
+        bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
+        for choice in choices:
+            results.append(bank.report(0, mask_of(regressors, choice)))
+            advance()
     else:
         from selfcal.engines import reference
 
         if blocks.mean.size > MOST_DENSE:
             raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")
-        result = reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r)
-    checks = _checks(blocks, tables, group, result)
+        for choice in choices:
+            used = _used(mask_of(regressors, choice))
+            with_columns = (z[:, used], sd[used].tolist()) if used else ()
+            results.append(
+                reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r, *with_columns)
+            )
+            advance()
     unit = recording.columns[name].unit
-    return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
+    if not regressors:
+        checks = _checks(blocks, tables, group, results[0], [])
+        return Identified(unit, in_unit(results[0], group.unit, unit), checks, blocks.kept_out)
+    if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
+        from selfcal.engines.library import outside_priors
+
+        raise UserError(outside_priors(tables.axes[0]))
+    inside = combine(choices, results, model.hypotheses, group.unit)
+    checks = _checks(blocks, tables, group, results[inside.best], _used(mask_of(regressors, choices[inside.best])))
+    scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
+    return Identified(unit, scored.result, checks, blocks.kept_out, scored)
+
+
+def _used(mask: int) -> list[int]:
+    return [k for k in range(mask.bit_length()) if mask >> k & 1]
 
 
 @dataclass(frozen=True)
@@ -152,19 +195,26 @@ class Blocks:
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
     those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
-    samples that were not used, by reason. Blocks beyond MOST_DENSE intervals are not worked out.
+    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. Blocks beyond MOST_DENSE
+    intervals are not worked out.
     """
 
     mean: NDArray[np.float64]
     r: NDArray[np.float64]
     within_sd: float
     kept_out: Mapping[str, int]
+    z: NDArray[np.float64]
 
 
 def block_means(
-    samples: NDArray[np.float64], missing_before: NDArray[np.int64], block: int, group: Group
+    samples: NDArray[np.float64],
+    missing_before: NDArray[np.int64],
+    block: int,
+    group: Group,
+    columns: NDArray[np.float64] | None = None,
 ) -> Blocks:
-    """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out."""
+    """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
+    `columns` [n, p] of the regressors are averaged over the same samples."""
     finite = np.isfinite(samples)
     limit = np.float32(group.range) if group.range > 0.0 else np.inf
     saturated = finite & (np.abs(samples) >= limit)
@@ -184,14 +234,16 @@ def block_means(
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
     at -= at[np.argmax(usable)]
-    values, index = samples[usable], at[usable] // block
+    columns = np.empty((samples.size, 0)) if columns is None else columns
+    values, index, rows = samples[usable], at[usable] // block, columns[usable]
     count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
     keep = index < count
-    values, index = values[keep], index[keep]
+    values, index, rows = values[keep], index[keep], rows[keep]
     used = np.bincount(index, minlength=count)
     total = np.bincount(index, values, minlength=count)
     with np.errstate(invalid="ignore", divide="ignore"):
         raw = total / used
+        z = np.array([np.bincount(index, column, minlength=count) / used for column in rows.T]).reshape(-1, count).T
         mean = np.where(used * 2 >= block, raw, np.nan)
         r = np.where(used * 2 >= block, block / used, 1.0)
     good = np.isfinite(mean)[index]
@@ -199,11 +251,14 @@ def block_means(
     squares = float(((values - raw[index])[good] ** 2).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within, kept_out)
+    return Blocks(mean[first:], r[first:], within, kept_out, z[first:])
 
 
-def _checks(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
-    """Are the innovations of the most probable law, at its posterior medians, white, normal and of one variance?"""
+def _checks(
+    blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
+) -> dict[str, dict[str, Any]]:
+    """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, white, normal
+    and of one variance?"""
     from selfcal import _reference
 
     if blocks.mean.size > MOST_DENSE:
@@ -211,6 +266,8 @@ def _checks(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) ->
     law = max(result.probability, key=lambda name: result.probability[name])
     at = {name: estimate.median for name, estimate in result.parameters[law].items()}
     offset = float(np.nanmean(blocks.mean))
+    z = blocks.z - np.array([column.reference for column in tables.regressors])
+    sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
     nu = _reference.innovations(
         np.ascontiguousarray(blocks.mean - offset),
         tables.dt_s,
@@ -221,7 +278,9 @@ def _checks(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) ->
         at.get("alpha", 1.0),
         at["N"] / math.sqrt(tables.dt_s),
         blocks.r,
-    )[1:]  # the first one is the bias
+        np.ascontiguousarray(z[:, used]) if used else None,
+        sd[used] if used else None,
+    )[1 + len(used) :]  # the first ones are the bias and the coefficients
     pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
     whole = nu[np.isfinite(nu)]
     n = whole.size
@@ -256,6 +315,7 @@ def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
         },
         result.bias_mean * factor,
         result.bias_sd * factor,
+        {law: tuple((mean * factor, sd * factor) for mean, sd in pairs) for law, pairs in result.coefficients.items()},
     )
 
 
@@ -292,9 +352,33 @@ def to_document(recording: Recording, found: Mapping[str, Identified]) -> dict[s
                 "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
                 "checks": {key: dict(check) for key, check in axis.checks.items()},
+                **_regressors(axis.scored),
             }
             for name, axis in found.items()
         },
+    }
+
+
+def _regressors(scored: Scored | None) -> dict[str, Any]:
+    """The keys an axis has beyond the contract's if its model has regressors."""
+    if scored is None:
+        return {}
+    return {
+        "regressors": {
+            name: {
+                "probability": inclusion.probability,
+                "coefficients": {
+                    c.column: {key: getattr(c, key) for key in ("mean", "median", "sd", "q05", "q95", "unit")}
+                    for c in inclusion.coefficients
+                },
+            }
+            for name, inclusion in scored.inclusion.items()
+        },
+        "regressors_in_use": [one.name for one in scored.choices[scored.best]],
+        "subsets": [
+            {"regressors": [one.name for one in choice], "probability": probability}
+            for choice, probability in zip(scored.choices, scored.probability, strict=True)
+        ],
     }
 
 
@@ -358,8 +442,34 @@ def show(document: Mapping[str, Any]) -> None:
     console = Console()
     console.width = max(console.width, TABLE_WIDTH)
     console.print(table)
+    if any("regressors" in axis for axis in document["axes"].values()):
+        console.print(_regressor_table(document))
     for line in (*kept, *failed):
         console.print(line, highlight=False)
+
+
+def _regressor_table(document: Mapping[str, Any]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        caption="coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset",
+        caption_justify="left",
+    )
+    for heading in ("axis", "regressor", "P(in use)", "coefficient", "unit"):
+        table.add_column(heading, no_wrap=True)
+    for name, axis in document["axes"].items():
+        entries = list(axis.get("regressors", {}).items())
+        for regressor, entry in entries:
+            for column, c in entry["coefficients"].items():
+                table.add_row(
+                    name,
+                    column,
+                    f"{entry['probability']:.4f}",
+                    "-" if not math.isfinite(c["median"]) else f"{c['median']:.4g} \\[{c['q05']:.4g}, {c['q95']:.4g}]",
+                    c["unit"],
+                    style="bold" if regressor in axis["regressors_in_use"] else None,
+                    end_section=(regressor, entry) == entries[-1],
+                )
+    return table
 
 
 def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> str:

@@ -1,0 +1,459 @@
+/* Regressors beside the constant, and the normal equations of a node.
+ *
+ * A reading is y_i = x0 + c' z_i + x_i + v_i with known columns z (time, temperature, a step, ...) and coefficients
+ * c ~ N(0, diag(sd^2)). As the constant does, every column goes through the node's zero-bias filter; with u = (u_0, u_1, ...) the
+ * innovations of "1" and of the columns, the sums A = sum u u'/s, B = sum u nu/s and C = sum nu^2/s give the likelihood of every
+ * subset of columns (generalised least squares; de Jong, Biometrika 78 (1991) 143-151). A belongs to the node, B to a node and
+ * an axis. Columns are taken about their first bank sample, as the readings are.
+ *
+ * What a regressor explains may be a thousand times the noise, and C - B'A^-1 B is what is left of it: all columns, "1" among them,
+ * and the readings must go through one and the same linear filter. Its gains may be rounded, for they are the same for all; the
+ * states carry twice the digits of selfcal_real_t, and so do the sums.
+ *
+ * All of it lies behind SELFCAL_SIZE() in the caller's memory; a model without regressors has none. */
+#include "kernel.h"
+
+/* A pivot below this part of its diagonal: the column is one of the others in all that was seen (or was constant). Nothing is lost
+ * by taking it so: what the estimate then leaves is carried along (`rest`). */
+#define COLLINEAR 1e-9
+
+static size_t columns_of(const selfcal_t *self) {
+    return self->model->regressors->count;
+}
+
+/* ------------------------------------------------------------------------------------------------------------ bank */
+
+static bool valid_regressors(const selfcal_model_t *model) {
+    const selfcal_regressors_t *regressors = model->regressors;
+    if (regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
+        regressors->coefficient_sd == NULL) {
+        return false;
+    }
+    for (size_t k = 0; k < regressors->count; k++) {
+        if (!isfinite(regressors->reference[k])) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < (size_t)model->axes * regressors->count; k++) {
+        if (!(regressors->coefficient_sd[k] >= 0.0F) || !isfinite(regressors->coefficient_sd[k])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
+static void init(selfcal_t *self, unsigned char *memory) {
+    const size_t p = columns_of(self), nodes = self->model->nodes, axes = self->model->axes;
+    memory += (8U - ((uintptr_t)memory & 7U)) & 7U;
+    self->columns = (selfcal_columns_t *)(void *)memory;
+    self->columns->column = (selfcal_column_t *)(void *)(self->columns + 1);
+    self->columns->a = (selfcal_sum_t *)(void *)(self->columns->column + p);
+    self->columns->b = self->columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U);
+    self->columns->x = self->columns->b + nodes * axes * p;
+    self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
+}
+
+static bool usable(selfcal_t *self, const float values[]) {
+    for (size_t k = 0; k < columns_of(self); k++) {
+        if (!isfinite(values[k])) {
+            self->counters.regressor_not_finite++;
+            return false;
+        }
+    }
+    return true;
+}
+
+static void add(selfcal_t *self, const float values[]) {
+    for (size_t k = 0; k < columns_of(self); k++) {
+        selfcal_column_t *column = &self->columns->column[k];
+        if (self->used == 0U) {
+            column->first = values[k];
+            column->sum = R(0.0);
+        }
+        column->sum += (selfcal_real_t)values[k] - (selfcal_real_t)column->first;
+    }
+}
+
+static void close_block(selfcal_t *self) {
+    const bool first = selfcal_count(self) == 0U;
+    for (size_t k = 0; k < columns_of(self); k++) {
+        selfcal_column_t *column = &self->columns->column[k];
+        const selfcal_real_t mean = column->sum / (selfcal_real_t)self->used;
+        if (first) {
+            column->origin = column->first;
+            column->offset = mean;
+        }
+        column->z[self->gathering][self->batch[self->gathering].count] =
+            ((selfcal_real_t)column->first - (selfcal_real_t)column->origin) + (mean - column->offset);
+    }
+}
+
+static void hand_over(selfcal_t *self) {
+    const uint8_t handed_over = (uint8_t)(1U - self->gathering);
+    const uint32_t count = waiting(self)->count;
+    for (size_t k = 0; k < columns_of(self) && count > 0U; k++) {
+        self->columns->column[k].last = self->columns->column[k].z[handed_over][count - 1U];
+    }
+}
+
+/* One series through a span. */
+typedef struct {
+    selfcal_real_t nu[SELFCAL_BATCH];
+    selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
+} innovations_t;
+
+/* a + b = sum + error (Knuth). */
+static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
+    const selfcal_real_t sum = a + b, part = sum - a;
+    const selfcal_sum_t result = {sum, (a - (sum - part)) + (b - part)};
+    return result;
+}
+
+/* Sum of nu of one over s times nu of the other, to twice the digits (Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26 (2005) 1955-1988,
+ * algorithm 5.3), added to `sum`. */
+static void add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
+    selfcal_sum_t value = {R(0.0), R(0.0)};
+    const uint32_t count = gains->span.to - gains->span.from;
+    for (uint32_t i = 0; i < count; i++) {
+        const selfcal_real_t product = one->weighted[i] * other->nu[i];
+        const selfcal_sum_t total = two_sum(value.hi, product);
+        value.hi = total.hi;
+        value.lo += r_fma(one->low[i], other->nu[i], r_fma(one->weighted[i], other->nu[i], -product)) + total.lo;
+    }
+    const selfcal_sum_t scale = gains->scale;
+    const selfcal_real_t product = scale.hi * value.hi;
+    const selfcal_real_t rest = r_fma(scale.hi, value.lo, r_fma(scale.lo, value.hi, r_fma(scale.hi, value.hi, -product)));
+    sum_add(sum, product, rest);
+}
+
+/* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What is rounded
+ * off each step is a part of its change, and the change is small where the filter is slow. */
+static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x,
+                            innovations_t *out) {
+    const selfcal_real_t minus_beta = -self->node[j].beta;
+    const uint32_t from = gains->span.from, count = gains->span.to - gains->span.from;
+    for (uint32_t i = 0; i < count; i++) {
+        const selfcal_real_t value = y != NULL ? y[from + i] : R(1.0), inv_s = gains->inv_s[from + i];
+        const selfcal_real_t nu = (value - x.hi) - x.lo;
+        out->nu[i] = nu;
+        out->weighted[i] = nu * inv_s;
+        out->low[i] = r_fma(nu, inv_s, -out->weighted[i]);
+        x = two_sum(x.hi, r_fma(gains->g[from + i], nu, minus_beta * value) + x.lo);
+    }
+    return x;
+}
+
+/* What selfcal_kernel_run() does for a model without regressors. */
+static void run(selfcal_t *self, size_t j, const gains_t *gains) {
+    const size_t p = columns_of(self), axes = self->model->axes;
+    innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
+    selfcal_sum_t *a = &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)];
+    for (size_t k = 0; k <= p; k++) {
+        selfcal_sum_t *x = &self->columns->x[j * (p + 1U) + k];
+        *x = filter(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x, &column[k]);
+        for (size_t l = 0; l <= k; l++) {
+            add_products(a++, gains, &column[l], &column[k]);
+        }
+    }
+    for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
+        selfcal_sum_t x = {self->x[at], self->columns->low[at]};
+        x = filter(self, j, gains, waiting(self)->y[at - j * axes], x, &reading);
+        self->x[at] = x.hi;
+        self->columns->low[at] = x.lo;
+        add_products(&self->c[at], gains, &reading, &reading);
+        add_products(&self->b[at], gains, &column[0], &reading);
+        for (size_t k = 0; k < p; k++) {
+            add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
+        }
+    }
+}
+
+static selfcal_sum_t split(selfcal_wide_t value) {
+    selfcal_sum_t sum;
+    sum.hi = (selfcal_real_t)value;
+    sum.lo = (selfcal_real_t)(value - (selfcal_wide_t)sum.hi);
+    return sum;
+}
+
+static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
+    const size_t rows = columns_of(self) + 1U, axes = self->model->axes;
+    for (size_t k = j * rows; k < (j + 1U) * rows; k++) {
+        self->columns->x[k] = split(sum_value(self->columns->x[k]) * (1.0 - less));
+    }
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        const selfcal_sum_t x = {self->x[k], self->columns->low[k]};
+        const selfcal_sum_t left = split(sum_value(x) * (1.0 - less));
+        self->x[k] = left.hi;
+        self->columns->low[k] = left.lo;
+    }
+}
+
+/* -------------------------------------------------------------------------------------------------- normal equations */
+
+#define UNKNOWNS_MAX (1 + SELFCAL_REGRESSORS_MAX)
+
+/* Least squares at one node, relative to sigma_v, over the level (x0 at the first sample of every regressor, less the offset) and
+ * the coefficients of a subset of the regressors. Matrices are symmetric, the lower half is held. */
+typedef struct {
+    selfcal_node_view_t node;
+    uint8_t order;                   /* unknowns: the level and the coefficients */
+    uint8_t regressor[UNKNOWNS_MAX]; /* of each, from 1 on */
+    selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], b[UNKNOWNS_MAX]; /* sums A and B */
+    selfcal_wide_t sd[UNKNOWNS_MAX];       /* of the priors of x0 and of the coefficients */
+    selfcal_wide_t first[UNKNOWNS_MAX];    /* offset; first values of the regressors less their references */
+    selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
+    selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
+    selfcal_wide_t estimate[UNKNOWNS_MAX]; /* A^-1 B; 0 for what cannot be told from those before it */
+    selfcal_wide_t rest[UNKNOWNS_MAX];     /* B - A estimate */
+    selfcal_wide_t residual;               /* C - B' A^-1 B, that is (C - 2 B' t + t' A t) at the estimate t */
+} normal_t;
+
+/* What the priors add at sigma_v^2 = variance:
+ *   -2 ln p(Y | node, sigma_v) = n ln(2 pi sigma_v^2) + D + residual / sigma_v^2 + ln_det + miss. */
+typedef struct {
+    selfcal_wide_t ln_det;   /* ln det(1 + P0 A / sigma_v^2), P0 the covariance of all priors */
+    selfcal_wide_t miss;     /* square of what the estimate misses the priors' mean by, over the sum of their covariances */
+    selfcal_wide_t share;    /* of samples that went into the unknowns: tr((A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2), 0 to order */
+    selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
+    selfcal_now_t now;
+} fit_t;
+
+/* a = L D L' of the first `order` rows; D on the diagonal, L (unit) below it. A pivot at or below `least` of its diagonal becomes 0:
+ * solve() leaves that unknown at 0. */
+static void factorise(selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], uint8_t order, selfcal_wide_t least) {
+    for (uint8_t i = 0; i < order; i++) {
+        const selfcal_wide_t diagonal = a[i][i];
+        for (uint8_t j = 0; j < i; j++) {
+            for (uint8_t k = 0; k < j; k++) {
+                a[i][j] -= a[i][k] * a[j][k]; /* a[i][k]: L times D so far */
+            }
+        }
+        for (uint8_t j = 0; j < i; j++) {
+            const selfcal_wide_t with_pivot = a[i][j];
+            a[i][j] = a[j][j] > 0.0 ? with_pivot / a[j][j] : 0.0;
+            a[i][i] -= a[i][j] * with_pivot;
+        }
+        if (!(a[i][i] > least * diagonal)) {
+            a[i][i] = 0.0;
+        }
+    }
+}
+
+static void solve(selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], uint8_t order, selfcal_wide_t x[]) {
+    for (uint8_t i = 0; i < order; i++) {
+        for (uint8_t j = 0; j < i; j++) {
+            x[i] -= a[i][j] * x[j];
+        }
+    }
+    for (uint8_t i = order; i-- > 0U;) {
+        x[i] = a[i][i] > 0.0 ? x[i] / a[i][i] : 0.0;
+        for (uint8_t j = (uint8_t)(i + 1U); j < order; j++) {
+            x[i] -= a[i][i] > 0.0 ? a[j][i] * x[j] : 0.0;
+        }
+    }
+}
+
+uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis) {
+    uint8_t mask = 0;
+    for (size_t k = 0; model->regressors != NULL && k < model->regressors->count; k++) {
+        const bool has = model->regressors->coefficient_sd[(size_t)axis * model->regressors->count + k] > 0.0F;
+        mask = (uint8_t)(mask | (has ? 1U << k : 0U));
+    }
+    return mask;
+}
+
+/* From the sums as they are; axis, node and mask fit the bank. */
+static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uint8_t mask, normal_t *normal) {
+    memset(normal, 0, sizeof *normal);
+    selfcal_bank_view(self, axis, index, &normal->node);
+    normal->order = 1;
+    normal->a[0][0] = normal->node.a;
+    normal->b[0] = normal->node.b;
+    normal->last[0] = 1.0;
+    normal->left[0] = normal->node.bias_left;
+    normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
+    normal->first[0] = selfcal_offset(self, axis);
+    const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
+    const size_t p = mask != 0U ? columns_of(self) : 0U;
+    const selfcal_sum_t *a = p > 0U ? &self->columns->a[index * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
+    if (p > 0U) {
+        normal->a[0][0] = sum_value(a[0]); /* the same as node.a, to more digits */
+    }
+    for (size_t k = 0; k < p; k++) {
+        if (((unsigned)mask >> k & 1U) == 0U) {
+            continue;
+        }
+        const uint8_t row = normal->order++;
+        const selfcal_column_t *column = &self->columns->column[k];
+        normal->regressor[row] = (uint8_t)k;
+        for (uint8_t l = 0; l <= row; l++) {
+            const size_t of = l == 0U ? 0U : normal->regressor[l] + 1U;
+            normal->a[row][l] = sum_value(a[SELFCAL_REGRESSORS_ROWS(k + 1U) + of]);
+        }
+        const size_t at = (size_t)index * self->model->axes + axis;
+        normal->b[row] = sum_value(self->columns->b[at * p + k]);
+        normal->last[row] = (selfcal_wide_t)column->last;
+        normal->left[row] = normal->last[row] - sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
+        normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
+                             (selfcal_wide_t)self->model->regressors->reference[k];
+    }
+    selfcal_wide_t factor[UNKNOWNS_MAX][UNKNOWNS_MAX];
+    memcpy(factor, normal->a, sizeof factor);
+    factorise(factor, normal->order, COLLINEAR);
+    memcpy(normal->estimate, normal->b, sizeof normal->estimate);
+    solve(factor, normal->order, normal->estimate);
+    normal->residual = normal->node.c;
+    for (uint8_t i = 0; i < normal->order; i++) {
+        normal->rest[i] = normal->b[i];
+        for (uint8_t j = 0; j < normal->order; j++) {
+            normal->rest[i] -= (j <= i ? normal->a[i][j] : normal->a[j][i]) * normal->estimate[j];
+        }
+        normal->residual -= normal->estimate[i] * (normal->b[i] + normal->rest[i]);
+    }
+}
+
+/* Least squares about `estimate`, with the square completed: the residual does not feel the priors, what they pull at is the sum of
+ * two squares (and of what `rest` is worth, where columns could not be told apart). Unknowns inside: c, and the level x0 + c' first - offset of the readings about their first samples, so that the
+ * prior is (level + offset - c' first)^2 / P0 + sum c^2 / sd^2. */
+static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit) {
+    const uint8_t order = normal->order;
+    const selfcal_wide_t p0 = normal->sd[0] * normal->sd[0];
+    selfcal_wide_t precision[UNKNOWNS_MAX][UNKNOWNS_MAX], g[UNKNOWNS_MAX][UNKNOWNS_MAX];
+    fit->ln_det = 2.0 * log(normal->sd[0]);
+    for (uint8_t i = 0; i < order; i++) {
+        const selfcal_wide_t pull = i == 0U ? -1.0 : normal->first[i];
+        for (uint8_t j = 0; j <= i; j++) {
+            precision[i][j] = pull * (j == 0U ? -1.0 : normal->first[j]) / p0;
+        }
+        if (i > 0U) {
+            precision[i][i] += 1.0 / (normal->sd[i] * normal->sd[i]);
+            fit->ln_det += 2.0 * log(normal->sd[i]);
+        }
+        for (uint8_t j = 0; j <= i; j++) {
+            g[i][j] = normal->a[i][j] / variance + precision[i][j];
+        }
+    }
+    factorise(g, order, 0.0);
+    selfcal_wide_t from_prior[UNKNOWNS_MAX], shift[UNKNOWNS_MAX];
+    for (uint8_t i = 0; i < order; i++) {
+        fit->ln_det += log(g[i][i]);
+        from_prior[i] = normal->estimate[i] + (i == 0U ? normal->first[0] : 0.0);
+    }
+    for (uint8_t i = 0; i < order; i++) {
+        shift[i] = normal->rest[i] / variance;
+        for (uint8_t j = 0; j < order; j++) {
+            shift[i] -= (j <= i ? precision[i][j] : precision[j][i]) * from_prior[j];
+        }
+    }
+    solve(g, order, shift);
+    fit->miss = 0.0;
+    fit->now.mean = fit->now.drift = normal->node.drift;
+    selfcal_wide_t x0_off = 0.0;
+    for (uint8_t i = 0; i < order; i++) {
+        for (uint8_t j = 0; j <= i; j++) {
+            fit->miss += (j < i ? 2.0 : 1.0) * shift[i] * normal->a[i][j] * shift[j] / variance;
+        }
+        fit->miss -= 2.0 * shift[i] * normal->rest[i] / variance;
+        const selfcal_wide_t off = from_prior[i] + shift[i];
+        x0_off += i == 0U ? off : -off * normal->first[i];
+        fit->miss += i == 0U ? 0.0 : off * off / (normal->sd[i] * normal->sd[i]);
+        fit->mean[i] = normal->estimate[i] + shift[i];
+        fit->now.mean += fit->mean[i] * normal->left[i];
+        fit->now.drift += fit->mean[i] * (normal->left[i] - normal->last[i]);
+    }
+    fit->miss += x0_off * x0_off / p0;
+    /* Columns of G^-1. */
+    memset(fit->now.own, 0, sizeof fit->now.own);
+    fit->share = 0.0;
+    for (uint8_t i = 0; i < order; i++) {
+        selfcal_wide_t column[UNKNOWNS_MAX] = {0.0};
+        column[i] = 1.0;
+        solve(g, order, column);
+        fit->var[i] = column[i];
+        for (uint8_t j = 0; j < order; j++) {
+            const selfcal_wide_t lost[2] = {normal->last[i] - normal->left[i], normal->last[j] - normal->left[j]};
+            fit->now.own[0] += normal->left[i] * column[j] * normal->left[j] / variance;
+            fit->now.own[1] += normal->left[i] * column[j] * lost[1] / variance;
+            fit->now.own[2] += lost[0] * column[j] * lost[1] / variance;
+            fit->share += (j <= i ? normal->a[i][j] : normal->a[j][i]) * column[j] / variance;
+        }
+    }
+}
+
+selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, uint16_t node, uint8_t mask,
+                                               selfcal_wide_t sigma_v, selfcal_wide_t *ln_p) {
+    selfcal_node_view_t view;
+    if (ln_p == NULL || !(sigma_v > 0.0)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    const selfcal_status_t status = selfcal_node(self, axis, node, &view);
+    if (status != SELFCAL_OK) {
+        return status;
+    }
+    if (((unsigned)mask & ~(unsigned)selfcal_regressors_mask(self->model, axis)) != 0U) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    normal_t normal;
+    fit_t fit;
+    const selfcal_wide_t variance = sigma_v * sigma_v;
+    make_normal(self, axis, node, mask, &normal);
+    make_fit(&normal, variance, &fit);
+    *ln_p = -0.5 * ((selfcal_wide_t)self->n * (SELFCAL_LN_2PI + 2.0 * log(sigma_v)) + view.ln_s + normal.residual / variance +
+                    fit.ln_det + fit.miss);
+    return SELFCAL_OK;
+}
+
+/* ---------------------------------------------------------------------------------------------------------- report */
+
+static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_wide_t *ln_sigma,
+                  selfcal_wide_t *profile, selfcal_wide_t *share) {
+    normal_t normal;
+    fit_t fit;
+    make_normal(work->bank, work->axis, index, work->mask, &normal);
+    const selfcal_wide_t variance = fmax(normal.residual, least) / n_eff;
+    make_fit(&normal, variance, &fit);
+    *ln_sigma = 0.5 * log(variance);
+    *profile = -0.5 * ((selfcal_wide_t)work->bank->n * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff + fit.ln_det +
+                       fit.miss);
+    *share = fit.share;
+}
+
+/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances over
+ * sigma_v^2. */
+static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *result) {
+    normal_t normal;
+    fit_t fit;
+    make_normal(work->bank, work->axis, (uint16_t)(work->first_node + k), work->mask, &normal);
+    make_fit(&normal, variance, &fit);
+    *result = fit.now;
+    selfcal_coefficients_t *of = work->coefficients == NULL ? NULL : &work->coefficients[work->hypothesis];
+    for (uint8_t i = 1; of != NULL && i < normal.order; i++) {
+        const uint8_t r = normal.regressor[i];
+        if (k == 0U) {
+            of->mean[r] = (float)fit.mean[i];
+            of->first[r] = of->second[r] = of->own[r] = 0.0;
+        }
+        const selfcal_wide_t off = fit.mean[i] - (selfcal_wide_t)of->mean[r];
+        of->first[r] += (selfcal_wide_t)work->values[0][k] * off;
+        of->second[r] += (selfcal_wide_t)work->values[0][k] * off * off;
+        of->own[r] += (selfcal_wide_t)work->values[1][k] * fit.var[i] / variance;
+    }
+}
+
+static void finish(const selfcal_work_t *work) {
+    selfcal_coefficients_t *of = work->coefficients == NULL ? NULL : &work->coefficients[work->hypothesis];
+    for (uint8_t r = 0; of != NULL && r < SELFCAL_REGRESSORS_MAX; r++) {
+        if (((unsigned)work->mask >> r & 1U) != 0U) {
+            const selfcal_wide_t mean = of->first[r] / work->bias_weight;
+            const selfcal_wide_t scatter = of->second[r] / work->bias_weight - mean * mean;
+            of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->own[r] * work->bias_scale / work->mass, 0.0));
+            of->mean[r] = (float)((selfcal_wide_t)of->mean[r] + mean);
+        }
+    }
+}
+
+const selfcal_regressors_code_t selfcal_regressors_code = {
+    valid_regressors, init, usable, add, close_block, hand_over, run, gap, field, now, finish,
+};

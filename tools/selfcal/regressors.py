@@ -1,0 +1,171 @@
+"""Regressors: their values along a recording, as the firmware's application gives them to `selfcal_push_with()`, and
+what follows from the evidence of every subset of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import logsumexp, ndtr
+
+from selfcal.errors import UserError
+from selfcal.model import Model, Regressor
+from selfcal.recording import Recording
+from selfcal.result import AxisResult
+
+#: A subset of the regressors.
+Choice = tuple[Regressor, ...]
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """Posterior of one column's coefficient if it is in use, over all laws and all subsets with it."""
+
+    column: str
+    unit: str
+    mean: float
+    sd: float
+    q05: float
+    median: float
+    q95: float
+
+
+@dataclass(frozen=True)
+class Inclusion:
+    """Probability that a regressor is in use, and its coefficients."""
+
+    probability: float
+    coefficients: tuple[Coefficient, ...]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """All subsets of the regressors weighed together.
+
+    `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
+    subset. `probability` [subsets] of each choice; `best` is the most probable one.
+    """
+
+    result: AxisResult
+    inclusion: Mapping[str, Inclusion]
+    choices: tuple[Choice, ...]
+    probability: tuple[float, ...]
+    best: int
+
+
+def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
+    """float64[n, p]: every column of `regressors`, in the unit of each, at every row of the recording.
+
+    Time is that since the first row, s. A step is 1 from its time on. A rate is what the channel gained over the last
+    `window_s`, in the first window what it gained since the first row, over `window_s`: both need no later value, so
+    that a module can form them. Raises UserError for a column that is absent or of another kind.
+    """
+    found = [column for one in regressors for column in _columns(one, recording)]
+    return np.ascontiguousarray(np.column_stack(found)) if found else np.empty((recording.samples, 0))
+
+
+def _columns(one: Regressor, recording: Recording) -> list[NDArray[np.float64]]:
+    t = recording.time_s
+    if one.kind == "time":
+        return [t]
+    if one.kind == "step":
+        return [(t >= one.time_s).astype(np.float64)]
+    if one.kind == "periodic":
+        turns = np.mod(one.frequency_hz * t, 1.0)
+        return [np.sin(2.0 * math.pi * turns), np.cos(2.0 * math.pi * turns)]
+    if one.column not in recording.columns:
+        raise UserError(
+            f"{recording.path}: there is no column '{one.column}', which the model's regressor '{one.name}' needs "
+            f"(there are {', '.join(recording.columns)})"
+        )
+    values = recording.in_unit(one.column, one.unit.removesuffix("/s") if one.kind == "rate" else one.unit)
+    if one.kind == "column":
+        return [values]
+    return [(values - np.interp(t - one.window_s, t, values)) / one.window_s]
+
+
+def offered(model: Model, axis: str) -> Choice:
+    """The regressors that an axis has: those with a prior for its group. An axis is no regressor of itself."""
+    return tuple(one for one in model.regressors if model.group_of(axis).name in one.sd and one.column != axis)
+
+
+def choices_of(regressors: Choice) -> list[Choice]:
+    """Every subset, the empty one first."""
+    return [choice for count in range(len(regressors) + 1) for choice in itertools.combinations(regressors, count)]
+
+
+def mask_of(regressors: Choice, choice: Choice) -> int:
+    """A bit for every column in use, in the order of `regressors`."""
+    names = [column for one in regressors for column in one.columns]
+    return sum(1 << names.index(column) for one in choice for column in one.columns)
+
+
+def coefficient_unit(unit: str, regressor: str) -> str:
+    """Unit of a coefficient: `unit` of the axis per unit of the `regressor`; deg/s per degC/s is deg/s/degC*s."""
+    swap = str.maketrans("*/", "/*")
+    return unit if regressor == "1" else f"{unit}/{regressor.translate(swap)}"
+
+
+def combine(
+    choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
+) -> Scored:
+    """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
+    ln_prior = np.array([_ln_prior(choices[-1], choice) for choice in choices])
+    ln_law = np.log([hypotheses[law] for law in hypotheses])
+    evidence = np.array([[result.log_evidence[law] for law in hypotheses] for result in results])
+    joint = ln_prior[:, None] + ln_law[None, :] + evidence
+    weight = np.exp(joint - logsumexp(joint))  # [subsets, laws]
+    of_law, of_choice = weight.sum(axis=0), weight.sum(axis=1)
+    mean = np.array([result.bias_mean if math.isfinite(result.bias_mean) else 0.0 for result in results])
+    sd = np.array([result.bias_sd if math.isfinite(result.bias_sd) else 0.0 for result in results])
+    bias = float(of_choice @ mean)
+    combined = AxisResult(
+        results[0].n,
+        {law: float(logsumexp(ln_prior + evidence[:, k])) for k, law in enumerate(hypotheses)},
+        {law: float(of_law[k]) for k, law in enumerate(hypotheses)},
+        {law: results[int(np.argmax(joint[:, k]))].parameters[law] for k, law in enumerate(hypotheses)},
+        bias,
+        math.sqrt(float(of_choice @ (sd**2 + (mean - bias) ** 2))),
+    )
+    inclusion = {}
+    for one in choices[-1]:
+        having = [i for i, choice in enumerate(choices) if one in choice]
+        coefficients = []
+        for place, column in enumerate(one.columns):
+            parts = []
+            for i in having:
+                at = place + sum(len(other.columns) for other in choices[i][: choices[i].index(one)])
+                parts += [
+                    (weight[i, k], *results[i].coefficients[law][at])
+                    for k, law in enumerate(hypotheses)
+                    if weight[i, k] > 0.0
+                ]
+            coefficients.append(_coefficient(column, coefficient_unit(unit, one.unit), np.array(parts)))
+        inclusion[one.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
+    return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
+
+
+def _ln_prior(regressors: Choice, choice: Choice) -> float:
+    return sum(math.log(one.probability if one in choice else 1.0 - one.probability) for one in regressors)
+
+
+def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
+    """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
+    if parts.size == 0:
+        return Coefficient(column, unit, *([math.nan] * 5))
+    weight, mean, sd = parts[:, 0] / parts[:, 0].sum(), parts[:, 1], parts[:, 2]
+    middle = float(weight @ mean)
+    spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
+    low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
+
+    def beyond(x: float, share: float) -> float:
+        return float(weight @ ndtr((x - mean) / sd)) - share
+
+    xtol = 1e-6 * (high - low)
+    q05, median, q95 = (brentq(beyond, low, high, args=(share,), xtol=xtol) for share in (0.05, 0.5, 0.95))
+    return Coefficient(column, unit, middle, spread, q05, median, q95)
