@@ -13,7 +13,7 @@
 typedef struct {
     uint32_t vector; /* exception number: 3 HardFault, 16 + n interrupt n */
     uint32_t pc, lr; /* where; 0 if the stack was gone */
-    uint32_t cfsr;   /* SCB_CFSR, PM0214 4.4.14 */
+    uint32_t cfsr;   /* SCB_CFSR, PM0214 4.4 */
 } board_fault_t;
 
 /* The fault that ended the last run, once; false: there was none. */

@@ -31,7 +31,7 @@ static bool pll_start(uint32_t source_hz, uint32_t source)
 void clock_init(void)
 {
     RCC_APB1ENR |= RCC_APB1ENR_PWR | RCC_APB1ENR_TIM2;
-    (void)RCC_APB1ENR; /* section 7.2.14: a peripheral's clock needs two cycles */
+    (void)RCC_APB1ENR; /* errata sheet ES0182: a peripheral answers two cycles after its clock is on */
     PWR_CR |= PWR_CR_VOS;
     FLASH_ACR = FLASH_ACR_LATENCY_5WS | FLASH_ACR_PRFTEN | FLASH_ACR_ICEN | FLASH_ACR_DCEN;
 

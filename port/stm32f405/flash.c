@@ -4,7 +4,7 @@
  * is refused, and the other slot, which was not touched, is the newest. RM0090 3.6: erase sets every bit, programming
  * clears bits; both stall reads of the flash, so the processor stands still meanwhile.
  *
- * Wear: a sector bears 10 000 erases (data sheet, table 49); each save erases one of two, so 20 000 saves. */
+ * Wear: a sector bears 10 000 erases (data sheet); each save erases one of two, so 20 000 saves. */
 #include "board.h"
 #include "stm32f405.h"
 
@@ -89,7 +89,7 @@ const void *flash_newest(bool older, size_t *length)
     return header_of(slot) + 1;
 }
 
-/* Erasing takes 2 s at most, a word 100 us (data sheet, tables 47 and 48, x32). */
+/* Erasing takes 2 s at most, a word 100 us (data sheet, at x32). */
 static bool await_idle(void)
 {
     const uint32_t start = clock_us32();
