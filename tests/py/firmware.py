@@ -116,6 +116,18 @@ class Tap:
         made = {tuple(row) for row in readings([sample for _, _, sample in self.board.sensor.taken]).tolist()}
         return sum(sample not in made for _, sample in self.pushed)
 
+    def mistimed(self) -> int:
+        """Steps between pushed samples that are more than one sample, and a thousandth of the step, off the time between
+        the samples by the sensor's clock: for a sensor that was reset, whose count then stood still."""
+        period = self.board.sensor.period_us()
+        made = {tuple(readings([sample])[0].tolist()): us for _, us, sample in self.board.sensor.taken}
+        steps = zip(self.pushed, self.pushed[1:], strict=False)
+        off = 0
+        for (place, sample), (next_place, next_sample) in steps:
+            true = (made[next_sample] - made[sample]) / period
+            off += abs(next_place - place - true) > 1.0 + 1e-3 * true
+        return off
+
     def misplaced(self, slack: int) -> int:
         """Pushed samples whose place is more than `slack` off the sensor's own count, taken from the first one on."""
         index = {}
