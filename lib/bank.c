@@ -187,6 +187,9 @@ static void place_nodes(selfcal_t *self) {
     ln_range_t sigma[SELFCAL_AXES_MAX];
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         sigma[axis] = first_ln_sigma(self, axis);
+#ifdef SELFCAL_FIXED
+        selfcal_kernel_start(self, axis, sigma[axis].hi);
+#endif
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
@@ -269,7 +272,7 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         gains->inv_s[i] = inv_s;
         const selfcal_real_t u = node->u_inf + node->e;
         gains->u[i] = u * inv_s;
-        short_of += r_fma(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
+        short_of += r_fma_exact(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
         a = r_fma(u, gains->u[i], a);
         node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
         node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
@@ -332,7 +335,8 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     }
     gains_t gains;
     gains.span = span;
-    for (size_t j = from; j < to; j++) {
+    for (size_t i = from; i < to; i++) {
+        const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         if (whole && node->level) {
             node->steady += span.to - span.from;
@@ -346,6 +350,9 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
                 node->e = R(0.0);
                 node->level = true;
                 node->level_from = node->steady;
+#ifdef SELFCAL_FIXED
+                selfcal_kernel_settle(node);
+#endif
             }
         } else {
             leave_level(node);
@@ -361,7 +368,8 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
 /* Predicts nodes over `count` intervals without a sample: exact, whatever the count. */
 static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
-    for (size_t j = from; j < to; j++) {
+    for (size_t i = from; i < to; i++) {
+        const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
@@ -381,11 +389,11 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     }
 }
 
-/* The nodes `from` to `to` - 1 over the batch that waits. */
+/* The nodes `from` to `to` - 1, in the kernel's order, over the batch that waits. */
 static void run_batch(selfcal_t *self, uint16_t from, uint16_t to) {
     const selfcal_batch_t *batch = waiting(self);
-    for (uint16_t j = from; self->n == 0U && j < to; j++) {
-        init_node(self, j);
+    for (uint16_t i = from; self->n == 0U && i < to; i++) {
+        init_node(self, (uint16_t)kernel_node(self, i));
     }
     span_t span = {0, 0};
     while (span.from < batch->count) {
@@ -434,6 +442,9 @@ bool selfcal_bank_hand_over(selfcal_t *self) {
     if (self->n == 0U) {
         place_nodes(self);
     }
+#ifdef SELFCAL_FIXED
+    selfcal_kernel_load(self);
+#endif
     return true;
 }
 

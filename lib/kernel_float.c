@@ -2,6 +2,8 @@
  * go into the long ones scaled in full. */
 #include "kernel.h"
 
+#ifndef SELFCAL_FIXED
+
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     const span_t span = gains->span;
     const selfcal_batch_t *batch = waiting(self);
@@ -31,7 +33,7 @@ static inline void run_level(selfcal_t *self, span_t span, size_t j) {
     const selfcal_real_t u = node->u_inf;
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t product = inv_s.hi * u;
-    const selfcal_sum_t u_inv_s = {product, r_fma(inv_s.lo, u, r_fma(inv_s.hi, u, -product))};
+    const selfcal_sum_t u_inv_s = {product, r_fma_exact(inv_s.lo, u, r_fma_exact(inv_s.hi, u, -product))};
     const selfcal_real_t minus_beta = -node->beta;
     const selfcal_real_t g = steady_g(node);
     const size_t count = span.to - span.from;
@@ -86,3 +88,5 @@ void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, sel
     *c = sum_value(self->c[k]);
     *x = (selfcal_wide_t)self->x[k];
 }
+
+#endif

@@ -64,6 +64,8 @@ MACHINES = {
     "cortex-m4f": Machine("netduinoplus2", (), 168_000_000),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
     "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000),
+    # ... and by 32-bit products instead of 16-bit ones.
+    "cortex-m0-32bit": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000),
 }
 
 
