@@ -327,7 +327,7 @@ static void leave_level(selfcal_node_t *node) {
 static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
-    for (uint32_t i = span.from; i < span.to; i++) {
+    for (uint32_t i = span.from; i < span.to && batch->part; i++) {
         whole = whole && batch->r[i] == R(1.0);
     }
     if (whole) {
@@ -424,6 +424,7 @@ bool selfcal_bank_run(selfcal_t *self, uint16_t nodes) {
     if (to == all) {
         self->n += batch->count;
         batch->count = 0;
+        batch->part = false;
         batch->gap_after = 0;
         self->ran = 0;
     }
@@ -461,6 +462,7 @@ void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real
         batch->y[axis][batch->count] = y[axis];
     }
     batch->r[batch->count] = r;
+    batch->part = batch->part || r != R(1.0);
     batch->gap[batch->count] = self->pending_gap;
     self->pending_gap = 0;
     batch->count++;

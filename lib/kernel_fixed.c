@@ -226,7 +226,11 @@ size_t kernel_node(const selfcal_t *self, size_t i) {
         hypothesis++;
     }
     const size_t rows = grid_rows(hypothesis);
-    return first + (i - first) % rows * grid_columns(hypothesis) + (i - first) / rows;
+    size_t row = i - first, column = 0;
+    for (; row >= rows; row -= rows) {
+        column++; /* shorter than a division in software */
+    }
+    return first + row * grid_columns(hypothesis) + column;
 }
 
 /* What a span adds: the sum of nu in 2^SUM_BITS steps, the sum of nu^2 in 2^16 steps^2. */

@@ -293,6 +293,7 @@ typedef struct {
     uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
     uint32_t gap_after;
     uint32_t count;
+    bool part; /* some r is not 1 */
 } selfcal_batch_t;
 
 /* Private; declared here so that the caller can place it. */
