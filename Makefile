@@ -139,6 +139,7 @@ BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
 MAP_cortex-m0-32bit := $(MAP_cortex-m0)
 
 bench: setup bench-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
@@ -151,7 +152,7 @@ bench-counts: bench-images
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1:-32bit=)
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
 $(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1)/selfcal_model.c
 	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
 	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
@@ -160,6 +161,8 @@ $(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1
 	    $$(@D)/objects/*.o -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
+# The same without the assembly, and by 32-bit products instead of 16-bit ones.
+$(eval $(call BENCH_IMAGE,cortex-m4f-portable))
 $(eval $(call BENCH_IMAGE,cortex-m0))
 $(eval $(call BENCH_IMAGE,cortex-m0-32bit))
 
@@ -197,6 +200,7 @@ EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
 check-arm: $(MODEL)/selfcal_model.c
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES) -DQEMU_MICROBIT -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m0))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 
 check-c++:

@@ -314,11 +314,12 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
 }
 
 /* A level node is no longer so. What its constant u added to A comes due. */
-static void leave_level(selfcal_node_t *node) {
+static void leave_level(selfcal_t *self, size_t j) {
+    selfcal_node_t *node = &self->node[j];
     if (node->level) {
-        const selfcal_wide_t a = level_a(node);
-        const selfcal_real_t hi = (selfcal_real_t)a;
-        sum_add(&node->a, hi, (selfcal_real_t)(a - (selfcal_wide_t)hi));
+        selfcal_kernel_unsettle(self, j);
+        const selfcal_sum_t a = make_sum(level_a(node));
+        sum_add(&node->a, a.hi, a.lo);
         node->level = false;
         node->level_from = 0;
     }
@@ -350,12 +351,10 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
                 node->e = R(0.0);
                 node->level = true;
                 node->level_from = node->steady;
-#ifdef SELFCAL_FIXED
-                selfcal_kernel_settle(node);
-#endif
+                selfcal_kernel_settle(self, j);
             }
         } else {
-            leave_level(node);
+            leave_level(self, j);
             gains_varying(batch, node, &gains);
             selfcal_kernel_run(self, j, &gains);
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
@@ -374,7 +373,7 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
-        leave_level(node);
+        leave_level(self, j);
         const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)node->d, e = (selfcal_wide_t)node->e;
         if (node->beta == R(0.0)) {
             node->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);

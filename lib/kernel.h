@@ -59,9 +59,11 @@ void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma
 /* A batch begins. */
 void selfcal_kernel_load(selfcal_t *self);
 
-/* A node has become level. */
-void selfcal_kernel_settle(selfcal_node_t *node);
 #endif
+
+/* Node `j` has become level, is about to be no longer so. */
+void selfcal_kernel_settle(selfcal_t *self, size_t j);
+void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
 
 /* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
@@ -77,6 +79,15 @@ static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t
     sum->lo = error - (sum->hi - total);
 }
 
+/* Adds a single number: no lo to add. */
+static inline void sum_add_value(selfcal_sum_t *sum, selfcal_real_t value) {
+    const selfcal_real_t total = sum->hi + value;
+    const selfcal_real_t part = total - sum->hi;
+    const selfcal_real_t error = ((sum->hi - (total - part)) + (value - part)) + sum->lo;
+    sum->hi = total + error;
+    sum->lo = error - (sum->hi - total);
+}
+
 /* Adds scale * value, the product in full. */
 static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
     const selfcal_real_t product = scale.hi * value;
@@ -85,6 +96,12 @@ static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfc
 
 static inline selfcal_wide_t sum_value(selfcal_sum_t sum) {
     return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
+}
+
+static inline selfcal_sum_t make_sum(selfcal_wide_t value) {
+    const selfcal_real_t hi = (selfcal_real_t)value;
+    const selfcal_sum_t sum = {hi, (selfcal_real_t)(value - (selfcal_wide_t)hi)};
+    return sum;
 }
 
 /* ------------------------------------------------------------------------------------------------- converged nodes */

@@ -319,7 +319,8 @@ static uint32_t gain_shift(float gain) {
     return shift < 31 ? (uint32_t)shift : 31U;
 }
 
-void selfcal_kernel_settle(selfcal_node_t *node) {
+void selfcal_kernel_settle(selfcal_t *self, size_t j) {
+    selfcal_node_t *node = &self->node[j];
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t g = steady_g(node), u = inv_s.hi * node->u_inf;
     const selfcal_real_t u_lo = r_fma_exact(inv_s.hi, node->u_inf, -u) + inv_s.lo * node->u_inf;
@@ -330,6 +331,11 @@ void selfcal_kernel_settle(selfcal_node_t *node) {
     node->u_shift = (uint8_t)(u_shift - SUM_BITS - 6 - b_bits(node));
     node->w_shift = (uint8_t)mantissa_shift(inv_s.hi, 30);
     node->w_mantissa = to_fixed(inv_s.hi, node->w_shift) + to_fixed(inv_s.lo, node->w_shift);
+}
+
+void selfcal_kernel_unsettle(selfcal_t *self, size_t j) {
+    (void)self;
+    (void)j;
 }
 
 /* `floored`: the nodes round g nu down. */

@@ -148,6 +148,8 @@ typedef struct {
 #endif
 #endif
 
+/* -DSELFCAL_KERNEL_M4F: run a settled bank by assembly for the Cortex-M4F and its like, a quarter fewer instructions, the same bits. */
+
 /* What a kernel keeps for each (node, axis): its predicted drift, and its sums. */
 #ifdef SELFCAL_FIXED
 typedef int32_t selfcal_drift_t;
