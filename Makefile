@@ -73,6 +73,8 @@ TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
+# The integer kernels: the formats by a test of their own, the rest as the bank in float.
+TESTS_FIXED := $(foreach test,fixed bank snapshot,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -83,12 +85,15 @@ soak: setup
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
 
-c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED)
+c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 
 # One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
 # The sanitizers' own code draws warnings, so those are left to the plain variant.
 $(BUILD)/c/plain/%: C := -O2 $(WARNINGS)
-$(BUILD)/c/sanitized/%: C := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+SANITIZED := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+$(BUILD)/c/sanitized/%: C := $(SANITIZED)
+$(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
+$(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
@@ -97,9 +102,13 @@ $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
 $(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a
 	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
+$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))
+$(eval $(call C_TESTS,fixed16))
+$(eval $(call C_TESTS,fixed32))
 
 # --------------------------------------------------------------------------------------------------------------- fuzz
 
@@ -130,6 +139,8 @@ BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
+MAP_cortex-m0-32bit := $(MAP_cortex-m0)
 
 bench: setup bench-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
@@ -141,7 +152,7 @@ bench-counts: bench-images
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1)
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
 $(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1)/selfcal_model.c
 	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
 	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
@@ -150,7 +161,10 @@ $(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1
 	    $$(@D)/objects/*.o -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
+# The same without the assembly, and by 32-bit products instead of 16-bit ones.
+$(eval $(call BENCH_IMAGE,cortex-m4f-portable))
 $(eval $(call BENCH_IMAGE,cortex-m0))
+$(eval $(call BENCH_IMAGE,cortex-m0-32bit))
 
 $(BENCH)/host/O2/bench: HOST := -O2
 $(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma
@@ -186,6 +200,8 @@ EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
 check-arm: $(MODEL)/selfcal_model.c
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES) -DQEMU_MICROBIT -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m0))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 
 check-c++:
 	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
@@ -197,6 +213,7 @@ TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 check-tidy: $(MODEL)/selfcal_model.c
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
+	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
 

@@ -3,7 +3,11 @@
 
 /* The prices that selfcal.h states. */
 #ifndef SELFCAL_REAL_DOUBLE
+#ifdef SELFCAL_FIXED
+SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 72);
+#else
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
+#endif
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
 #endif
 
@@ -17,6 +21,16 @@ static bool within(selfcal_real_t value, selfcal_real_t lo, selfcal_real_t hi) {
 
 static bool finite_sum(selfcal_sum_t sum) {
     return isfinite(sum.hi) && isfinite(sum.lo);
+}
+
+/* What a kernel keeps for a node and axis. */
+static bool cell_is_sound(const selfcal_t *self, size_t k) {
+#ifdef SELFCAL_FIXED
+    const int32_t bound = (int32_t)SELFCAL_FIXED_LIMIT + (1L << 24); /* kernel_fixed.c, HEAD-ROOM */
+    return self->c[k] >= 0 && self->x[k] <= bound && self->x[k] >= -bound;
+#else
+    return finite_sum(self->b[k]) && finite_sum(self->c[k]) && self->c[k].hi >= R(0.0) && isfinite(self->x[k]);
+#endif
 }
 
 static bool memory_is_laid_out(const selfcal_t *self) {
@@ -102,7 +116,7 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
     }
     const size_t axes = self->model->axes;
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
+        if (!cell_is_sound(self, k)) {
             return false;
         }
     }

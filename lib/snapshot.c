@@ -4,7 +4,7 @@
  *        0  4  "SFCL"
  *        4  4  bytes of the whole, checksum included
  *        8  2  format version
- *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t)
+ *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 16 or 32 fixed point (SELFCAL_FIXED)
  *       11  1  axes of the model
  *       12  2  nodes of the model
  *       14  2  0
@@ -25,6 +25,12 @@
 enum { HEADER = 24, TRAILER = 4 };
 static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 
+#ifdef SELFCAL_FIXED
+#define ARITHMETIC SELFCAL_FIXED
+#else
+#define ARITHMETIC sizeof(selfcal_real_t)
+#endif
+
 /* ------------------------------------------------------------------------------------------------------------ fields */
 
 typedef enum { KIND_BOOL, KIND_U8, KIND_U16, KIND_U32, KIND_U64, KIND_FLOAT, KIND_REAL, KIND_WIDE, KINDS } kind_t;
@@ -43,6 +49,34 @@ static const uint8_t kind_size[KINDS] = {
     sizeof(TYPE_U64),  sizeof(TYPE_FLOAT), sizeof(TYPE_REAL), sizeof(TYPE_WIDE),
 };
 
+/* What only the integer kernels have; signed numbers go as their bits. */
+#ifdef SELFCAL_FIXED
+#define BANK_FIXED_FIELDS(F, PART)            \
+    PART(selfcal_t, scale, selfcal_scale_t)   \
+    F(selfcal_t, y_fixed, U32)                \
+    F(selfcal_t, step, U32)                   \
+    F(selfcal_t, step_from, U32)              \
+    F(selfcal_t, step_to, U32)                \
+    F(selfcal_t, step_beta, FLOAT)            \
+    F(selfcal_t, step_floored, BOOL)
+#define NODE_FIXED_FIELDS(F)             \
+    F(selfcal_node_t, g_mantissa, U32)   \
+    F(selfcal_node_t, u_mantissa, U32)   \
+    F(selfcal_node_t, w_mantissa, U32)   \
+    F(selfcal_node_t, g_shift, U8)       \
+    F(selfcal_node_t, u_shift, U8)       \
+    F(selfcal_node_t, w_shift, U8)
+#define SCALE_FIELDS(F)                  \
+    F(selfcal_scale_t, exponent, U16)    \
+    F(selfcal_scale_t, coarser, U16)     \
+    F(selfcal_scale_t, finer, U16)       \
+    F(selfcal_scale_t, most_y, U32)      \
+    F(selfcal_scale_t, most_c, U32)
+#else
+#define BANK_FIXED_FIELDS(F, PART)
+#define NODE_FIXED_FIELDS(F)
+#endif
+
 /* In the order of the structs. F: every member but the pointers, which selfcal_init() sets; PART: structs with a list of
  * their own. A selfcal_sum_t is two reals. */
 #define BANK_FIELDS(F, PART)                      \
@@ -57,6 +91,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, push_nodes, U16)                 \
     F(selfcal_t, pending_gap, U32)                \
     F(selfcal_t, batches, U32)                    \
+    BANK_FIXED_FIELDS(F, PART)                    \
     F(selfcal_t, started, BOOL)                   \
     F(selfcal_t, origin, FLOAT)                   \
     F(selfcal_t, offset, REAL)                    \
@@ -84,7 +119,8 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_batch_t, r, REAL)        \
     F(selfcal_batch_t, gap, U32)       \
     F(selfcal_batch_t, gap_after, U32) \
-    F(selfcal_batch_t, count, U32)
+    F(selfcal_batch_t, count, U32)     \
+    F(selfcal_batch_t, part, BOOL)
 
 #define COUNTER_FIELDS(F)                     \
     F(selfcal_counters_t, samples, U64)       \
@@ -110,7 +146,8 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, steady, U32)     \
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
-    F(selfcal_node_t, ln_s, REAL)
+    F(selfcal_node_t, ln_s, REAL)      \
+    NODE_FIXED_FIELDS(F)
 
 #define COLUMN_FIELDS(F)              \
     F(selfcal_column_t, z, REAL)      \
@@ -138,7 +175,12 @@ static const field_t counter_fields[] = {COUNTER_FIELDS(ROW)};
 static const field_t node_fields[] = {NODE_FIELDS(ROW)};
 static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
 static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
+#ifdef SELFCAL_FIXED
+static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
+static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
+#else
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
+#endif
 
 /* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
  * bool that slips into padding; a test compares the bytes.) */
@@ -160,6 +202,11 @@ typedef struct {
 typedef struct {
     COLUMN_FIELDS(MIRROR)
 } selfcal_column_t_mirror;
+#ifdef SELFCAL_FIXED
+typedef struct {
+    SCALE_FIELDS(MIRROR)
+} selfcal_scale_t_mirror;
+#endif
 /* NOLINTEND(bugprone-sizeof-expression) */
 
 #define IN_PLACE(struct_t, member, kind) \
@@ -176,8 +223,15 @@ SELFCAL_STATIC_ASSERT(all_of_a_node, sizeof(selfcal_node_t) == sizeof(selfcal_no
 SELFCAL_STATIC_ASSERT(all_of_a_column, sizeof(selfcal_column_t) == sizeof(selfcal_column_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeof(void *));
 SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
+#ifdef SELFCAL_FIXED
+SCALE_FIELDS(IN_PLACE)
+SELFCAL_STATIC_ASSERT(all_of_a_scale, sizeof(selfcal_scale_t) == sizeof(selfcal_scale_t_mirror));
+SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 8);
+SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == 4);
+#else
 SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 2 * sizeof(selfcal_real_t));
 SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == sizeof(selfcal_real_t));
+#endif
 SELFCAL_STATIC_ASSERT(float_is_ieee_single, sizeof(float) == 4 && FLT_MANT_DIG == 24 && FLT_MAX_EXP == 128);
 SELFCAL_STATIC_ASSERT(wide_is_ieee_double, sizeof(selfcal_wide_t) == 8 && DBL_MANT_DIG == 53 && DBL_MAX_EXP == 1024);
 SELFCAL_STATIC_ASSERT(bool_is_a_byte, sizeof(bool) == 1);
@@ -190,7 +244,11 @@ typedef struct {
     size_t records, stride;
 } part_t;
 
+#ifdef SELFCAL_FIXED
+enum { PARTS = 13 };
+#else
 enum { PARTS = 12 };
+#endif
 
 /* The parts of a bank of `model`; without `self`, their sizes alone. */
 static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t part[PARTS]) {
@@ -203,6 +261,9 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {bank_fields, LENGTH(bank_fields), self, 1, sizeof *self},
         {batch_fields, LENGTH(batch_fields), there ? self->batch : NULL, LENGTH(self->batch), sizeof self->batch[0]},
         {counter_fields, LENGTH(counter_fields), there ? &self->counters : NULL, 1, sizeof self->counters},
+#ifdef SELFCAL_FIXED
+        {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
+#endif
         {node_fields, LENGTH(node_fields), there ? self->node : NULL, nodes, sizeof *self->node},
         {total_fields, LENGTH(total_fields), there ? self->b : NULL, cells, sizeof *self->b},
         {total_fields, LENGTH(total_fields), there ? self->c : NULL, cells, sizeof *self->c},
@@ -335,7 +396,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     }
     put_number(&sink, 4, (uint32_t)size_of(model));
     put_number(&sink, 2, VERSION);
-    put_number(&sink, 1, sizeof(selfcal_real_t));
+    put_number(&sink, 1, ARITHMETIC);
     put_number(&sink, 1, model->axes);
     put_number(&sink, 2, model->nodes);
     put_number(&sink, 2, 0);
@@ -375,7 +436,7 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     if (number_at(bytes + 8, 2) != VERSION) {
         return SELFCAL_SNAPSHOT_VERSION;
     }
-    if (bytes[10] != sizeof(selfcal_real_t) || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
+    if (bytes[10] != ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
         number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id || number_at(bytes + 20, 4) != layout_of(part) ||
         length != size_of(model)) {
         return SELFCAL_SNAPSHOT_FOREIGN;

@@ -58,7 +58,9 @@ def part(folder: Path, seconds: float, axes: Sequence[str] = SIX, hole: slice | 
 def same_math(program: Path, target: str, folder: Path, core: str) -> Path:
     """The firmware made anew from a program's model with tests/c/same_math.c in it."""
     make = TARGETS[target].make
-    flags = "tests/c/same_math.c -Wno-double-promotion" + (" -DSAME_FMAF" if core == "cortex-m0" else "")
+    flags = "tests/c/same_math.c -Wno-double-promotion"
+    if core == "cortex-m0":
+        flags += " -DSAME_FMAF -DSELFCAL_FIXED=16"
     settings = [
         f"MODEL_DIR={program.parent}",
         f"OUT={folder / target}",
