@@ -65,6 +65,11 @@ void selfcal_kernel_load(selfcal_t *self);
 void selfcal_kernel_settle(selfcal_t *self, size_t j);
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
 
+#ifdef SELFCAL_FIXED
+/* g, u/s and 1/s of a level node as the integer kernels take them. */
+void selfcal_kernel_mantissas(selfcal_node_t *node);
+#endif
+
 /* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
 

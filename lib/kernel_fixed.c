@@ -325,7 +325,10 @@ static uint32_t gain_shift(float gain) {
 }
 
 void selfcal_kernel_settle(selfcal_t *self, size_t j) {
-    selfcal_node_t *node = &self->node[j];
+    selfcal_kernel_mantissas(&self->node[j]);
+}
+
+void selfcal_kernel_mantissas(selfcal_node_t *node) {
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t g = steady_g(node), u = inv_s.hi * node->u_inf;
     const selfcal_real_t u_lo = r_fma_exact(inv_s.hi, node->u_inf, -u) + inv_s.lo * node->u_inf;

@@ -4,14 +4,15 @@
  *        0  4  "SFCL"
  *        4  4  bytes of the whole, checksum included
  *        8  2  format version
- *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 16 or 32 fixed point (SELFCAL_FIXED)
+ *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 16 or 32 integers (SELFCAL_FIXED)
  *       11  1  axes of the model
  *       12  2  nodes of the model
  *       14  2  0
  *       16  4  id of the model
  *       20  4  layout: CRC-32 over kind (1 byte) and count (2 bytes) of every field below, so that a build with other fields or
  *              other maxima of the configuration is told apart without anyone counting up the version
- *       24     selfcal_t, its batches, its counters, every node, b, c, x, what the regressors have: the fields below, in their order
+ *       24     selfcal_t, its batches, its counters, every node, b, c, x, number formats, what the
+ *              regressors have: the fields below, in their order
  *     last  4  CRC-32 of all before (IEEE 802.3: reflected polynomial 0xEDB88320, start and final inversion 0xFFFFFFFF)
  * The first 8 bytes and the checksum are where they are in every version.
  *
@@ -22,14 +23,13 @@
 #include "internal.h"
 
 #define VERSION 1U
-enum { HEADER = 24, TRAILER = 4 };
-static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
-
 #ifdef SELFCAL_FIXED
 #define ARITHMETIC SELFCAL_FIXED
 #else
 #define ARITHMETIC sizeof(selfcal_real_t)
 #endif
+enum { HEADER = 24, TRAILER = 4 };
+static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
 
@@ -49,36 +49,38 @@ static const uint8_t kind_size[KINDS] = {
     sizeof(TYPE_U64),  sizeof(TYPE_FLOAT), sizeof(TYPE_REAL), sizeof(TYPE_WIDE),
 };
 
-/* What only the integer kernels have; signed numbers go as their bits. */
+/* In the order of the structs. F: every member but the pointers, which selfcal_init() sets; PART: structs with a list of
+ * their own. A selfcal_sum_t is two reals; signed numbers are the bits of unsigned ones. */
 #ifdef SELFCAL_FIXED
-#define BANK_FIXED_FIELDS(F, PART)            \
-    PART(selfcal_t, scale, selfcal_scale_t)   \
-    F(selfcal_t, y_fixed, U32)                \
-    F(selfcal_t, step, U32)                   \
-    F(selfcal_t, step_from, U32)              \
-    F(selfcal_t, step_to, U32)                \
-    F(selfcal_t, step_beta, FLOAT)            \
+#define FIXED_BANK_FIELDS(F, PART)          \
+    PART(selfcal_t, scale, selfcal_scale_t) \
+    F(selfcal_t, y_fixed, U32)              \
+    F(selfcal_t, step, U32)                 \
+    F(selfcal_t, step_from, U32)            \
+    F(selfcal_t, step_to, U32)              \
+    F(selfcal_t, step_beta, FLOAT)          \
     F(selfcal_t, step_floored, BOOL)
-#define NODE_FIXED_FIELDS(F)             \
-    F(selfcal_node_t, g_mantissa, U32)   \
-    F(selfcal_node_t, u_mantissa, U32)   \
-    F(selfcal_node_t, w_mantissa, U32)   \
-    F(selfcal_node_t, g_shift, U8)       \
-    F(selfcal_node_t, u_shift, U8)       \
+
+#define FIXED_NODE_FIELDS(F)           \
+    F(selfcal_node_t, g_mantissa, U32) \
+    F(selfcal_node_t, u_mantissa, U32) \
+    F(selfcal_node_t, w_mantissa, U32) \
+    F(selfcal_node_t, g_shift, U8)     \
+    F(selfcal_node_t, u_shift, U8)     \
     F(selfcal_node_t, w_shift, U8)
-#define SCALE_FIELDS(F)                  \
-    F(selfcal_scale_t, exponent, U16)    \
-    F(selfcal_scale_t, coarser, U16)     \
-    F(selfcal_scale_t, finer, U16)       \
-    F(selfcal_scale_t, most_y, U32)      \
+
+#define SCALE_FIELDS(F)               \
+    F(selfcal_scale_t, exponent, U16) \
+    F(selfcal_scale_t, coarser, U16)  \
+    F(selfcal_scale_t, finer, U16)    \
+    F(selfcal_scale_t, most_y, U32)   \
     F(selfcal_scale_t, most_c, U32)
 #else
-#define BANK_FIXED_FIELDS(F, PART)
-#define NODE_FIXED_FIELDS(F)
+#define FIXED_BANK_FIELDS(F, PART)
+#define FIXED_NODE_FIELDS(F)
+#define SCALE_FIELDS(F)
 #endif
 
-/* In the order of the structs. F: every member but the pointers, which selfcal_init() sets; PART: structs with a list of
- * their own. A selfcal_sum_t is two reals. */
 #define BANK_FIELDS(F, PART)                      \
     F(selfcal_t, n, U32)                          \
     F(selfcal_t, rho_lo, REAL)                    \
@@ -91,7 +93,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, push_nodes, U16)                 \
     F(selfcal_t, pending_gap, U32)                \
     F(selfcal_t, batches, U32)                    \
-    BANK_FIXED_FIELDS(F, PART)                    \
+    FIXED_BANK_FIELDS(F, PART)                    \
     F(selfcal_t, started, BOOL)                   \
     F(selfcal_t, origin, FLOAT)                   \
     F(selfcal_t, offset, REAL)                    \
@@ -147,7 +149,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
     F(selfcal_node_t, ln_s, REAL)      \
-    NODE_FIXED_FIELDS(F)
+    FIXED_NODE_FIELDS(F)
 
 #define COLUMN_FIELDS(F)              \
     F(selfcal_column_t, z, REAL)      \
@@ -261,13 +263,13 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {bank_fields, LENGTH(bank_fields), self, 1, sizeof *self},
         {batch_fields, LENGTH(batch_fields), there ? self->batch : NULL, LENGTH(self->batch), sizeof self->batch[0]},
         {counter_fields, LENGTH(counter_fields), there ? &self->counters : NULL, 1, sizeof self->counters},
-#ifdef SELFCAL_FIXED
-        {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
-#endif
         {node_fields, LENGTH(node_fields), there ? self->node : NULL, nodes, sizeof *self->node},
         {total_fields, LENGTH(total_fields), there ? self->b : NULL, cells, sizeof *self->b},
         {total_fields, LENGTH(total_fields), there ? self->c : NULL, cells, sizeof *self->c},
         {drift_fields, LENGTH(drift_fields), there ? self->x : NULL, cells, sizeof *self->x},
+#ifdef SELFCAL_FIXED
+        {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
+#endif
         {column_fields, LENGTH(column_fields), more ? columns->column : NULL, p, sizeof *columns->column},
         {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
         {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
