@@ -103,6 +103,12 @@ static bool averager_is_sound(const selfcal_t *self) {
     return true;
 }
 
+/* Both or neither: the model's regressors and their sums. */
+static bool regressors_are_sound(const selfcal_t *self) {
+    const selfcal_regressors_t *regressors = self->model->regressors;
+    return (self->columns == NULL) == (regressors == NULL) && (regressors == NULL || regressors->code->sound(self));
+}
+
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
@@ -140,7 +146,7 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self)) {
+    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !regressors_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     if (self->n > 0U && !grid_is_sound(self)) {
