@@ -159,6 +159,12 @@ static bool kernel_is_sound(const selfcal_t *self, size_t j) {
 
 #endif
 
+/* Both or neither: the model's regressors and their sums. */
+static bool regressors_are_sound(const selfcal_t *self) {
+    const selfcal_regressors_t *regressors = self->model->regressors;
+    return (self->columns == NULL) == (regressors == NULL) && (regressors == NULL || regressors->code->sound(self));
+}
+
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
@@ -190,7 +196,8 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self)) {
+    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
+        !regressors_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     if (self->n > 0U && !grid_is_sound(self)) {

@@ -87,6 +87,8 @@ struct selfcal_regressors_code {
     bool (*valid)(const selfcal_model_t *model);
     /* In the memory that follows the bank's. */
     void (*init)(selfcal_t *self, unsigned char *memory);
+    /* selfcal_check() of its part. */
+    bool (*sound)(const selfcal_t *self);
     /* A sample's values: whether all are finite (else counted); into the block; the block's means into the batch. */
     bool (*usable)(selfcal_t *self, const float values[]);
     void (*add)(selfcal_t *self, const float values[]);

@@ -59,9 +59,37 @@ static void init(selfcal_t *self, unsigned char *memory) {
     self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
 }
 
+static bool sound(const selfcal_t *self) {
+    const size_t p = columns_of(self), nodes = self->model->nodes, cells = nodes * self->model->axes;
+    const selfcal_columns_t *columns = self->columns;
+    if (columns->column != (const void *)(columns + 1) || columns->a != (const void *)(columns->column + p) ||
+        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p ||
+        columns->low != (const void *)(columns->x + nodes * (p + 1U))) {
+        return false;
+    }
+    for (const selfcal_sum_t *sum = columns->a; sum < columns->x + nodes * (p + 1U); sum++) {
+        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < cells; k++) {
+        if (!isfinite(columns->low[k])) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < p; k++) {
+        const selfcal_column_t *column = &columns->column[k];
+        if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) || !isfinite(column->offset) ||
+            !isfinite(column->sum)) {
+            return false;
+        }
+    }
+    return true;
+}
+
 static bool usable(selfcal_t *self, const float values[]) {
     for (size_t k = 0; k < columns_of(self); k++) {
-        if (!isfinite(values[k])) {
+        if (!(fabsf(values[k]) < SELFCAL_SAMPLE_MAX)) { /* the bound of averager.c holds for A as well */
             self->counters.regressor_not_finite++;
             return false;
         }
@@ -473,5 +501,5 @@ static void finish(const selfcal_work_t *work) {
 }
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
-    valid_regressors, init, usable, add, close_block, hand_over, run, gap, field, now, finish,
+    valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, field, now, finish,
 };

@@ -11,6 +11,10 @@
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
+#if SELFCAL_MODEL_REGRESSORS > 0
+#error "this application gives its bank no regressors"
+#endif
+
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */
 typedef struct {
     const port_t *port;
