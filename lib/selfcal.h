@@ -427,9 +427,9 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
- * Nothing happens at the start of an interval. For selfcal_gate_push(): call this before the window's last sample goes to
- * selfcal_push(), and selfcal_skip() while the gate says moving. No window then reaches back into an interval that is already
- * closed, provided that the block is a multiple of the window and that both began together. */
+ * Nothing happens at the start of an interval. With the gate, every sample goes to selfcal_gate_push() first; if it said resting
+ * before this sample and says so with it, the sample goes to selfcal_push(), else selfcal_moving() and selfcal_skip(1). So no
+ * window of motion reaches back into an interval that is already closed, provided that the block is a multiple of the window. */
 selfcal_status_t selfcal_moving(selfcal_t *self);
 
 /* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
