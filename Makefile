@@ -3,6 +3,7 @@
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
 #   make emulate                20 minutes of six axes through the emulated firmware
+#   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n]   random calls of the library under sanitizers, 10^7 executions
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
@@ -84,6 +85,9 @@ soak: setup
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
+
+campaigns: setup
+	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 
@@ -226,11 +230,12 @@ check-tokens:
 	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
 
 check-ruff: $(PACKAGE)
-	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests
+	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests host_sim
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:
 	rm -rf $(BUILD)

@@ -1,9 +1,9 @@
 """ADIS16405 at its pins: SPI frames, registers, data-ready, self-test, and what can go wrong with it.
 
-Data sheet of the ADIS16400/ADIS16405: serial interface, tables 8 to 22. Reads are pipelined: the answer to a frame comes in
-the next one. A burst is the frame 0x3E00 and then 12 words with chip select low throughout. ND is set in an output register
-when a sample is written to it and cleared when it is read; EA is set in all while DIAG_STAT has a bit set.
-"""
+Data sheet of the ADIS16400/ADIS16405: serial interface, tables 8 to 22. Reads are pipelined: the answer to a frame
+comes in the next one. A burst is the frame 0x3E00 and then 12 words with chip select low throughout. ND is set in an
+output register when a sample is written to it and cleared when it is read; EA is set in all while DIAG_STAT has a bit
+set."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class Adis16405:
         self.clock_error = 0.0  # of its own sample clock, relative
         self.supply = 2068  # LSB of 2.418 mV: 5.0 V
         self.taken: list[tuple[int, float, Sample]] = []  # every sample it made: index, time in us, readings
+        self.read_twice: list[int] = []  # indices of the samples that two whole bursts have read
         # what can be wrong
         self.connected = True
         self.floating_high = True  # its output's line, when it is not there
@@ -41,13 +42,15 @@ class Adis16405:
         self.lose_sign: Callable[[int], bool] = lambda k: False  # the known anomaly, for sample k
         self.stale: Callable[[int], bool] = lambda k: False  # data-ready without new data
         self.product = PRODUCT
+        self._read_once = -1
         # statistics
         self.frames = self.bursts = self.resets = 0
         self.index = 0
         self._event: Event | None = None
         self.power_on()
 
-    # -------------------------------------------------------------------------------------------------------------- life
+    # --------------------------------------------------------------------------------------------------------------
+    # life
 
     def power_on(self) -> None:
         """Registers as delivered; ready after 220 ms."""
@@ -116,7 +119,8 @@ class Adis16405:
             self.on_ready(active)
             self.machine.at(200.0, lambda: self.on_ready(not active))
 
-    # --------------------------------------------------------------------------------------------------------------- SPI
+    # ---------------------------------------------------------------------------------------------------------------
+    # SPI
 
     def select(self, low: bool) -> None:
         """Chip select. Its rise ends a burst."""
@@ -159,6 +163,10 @@ class Adis16405:
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz in a burst")
         position = self.burst_at or 0
         self.burst_at = position + 1
+        if position == len(OUTPUTS) - 1 and self.taken:
+            if self._read_once == self.taken[-1][0]:
+                self.read_twice.append(self._read_once)
+            self._read_once = self.taken[-1][0]
         if position >= len(OUTPUTS):
             self.machine.violations.append("ADIS16405: a burst of more than 12 words")
             return 0

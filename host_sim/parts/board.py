@@ -7,11 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+from unicorn import arm_const as arm
 
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
 from .flash import Flash
-from .machine import Machine, SystemControl
+from .machine import SRAM, SRAM_BYTES, Machine, SystemControl
 from .spi import Dma2, Spi
 from .symbols import place
 from .system import Exti, Gpio, Iwdg, Pwr, Rcc, Tim2
@@ -19,8 +20,8 @@ from .usart import Usart
 
 
 def resting(seed: int) -> Callable[[int], Sample]:
-    """Readings of a sensor at rest, LSB: noise of 0.9 deg/s and 0.09 m/s^2 (the data sheet's), gravity on z. The same sample
-    for the same seed and index, in whatever order they are asked for."""
+    """Readings of a sensor at rest, LSB: noise of 0.9 deg/s and 0.09 m/s^2 (the data sheet's), gravity on z. The same
+    sample for the same seed and index, in whatever order they are asked for."""
 
     def sample(index: int) -> Sample:
         rng = random.Random(seed * 1_000_003 + index)
@@ -32,8 +33,9 @@ def resting(seed: int) -> Callable[[int], Sample]:
 
 
 class Board:
-    """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is given.
-    `text`: what the USART said. `retained`: content of the flash's two last sectors to start with."""
+    """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is
+    given. `text`: what the USART said. `retained`: content of the flash's two last sectors to start with.
+    `clock_broken`: "crystal" or "pll"."""
 
     def __init__(
         self,
@@ -43,10 +45,13 @@ class Board:
         seed: int = 0,
         channel: str | None = None,
         retained: bytes | None = None,
+        clock_broken: str = "",
     ) -> None:
         self.elf = elf
         self.machine = machine = Machine(elf, seed)
         self.rcc = Rcc(machine)
+        self.rcc.crystal = clock_broken != "crystal"
+        self.rcc.pll_works = clock_broken != "pll"
         self.system = SystemControl(machine)
         self.pwr = Pwr(machine)
         self.tim2 = Tim2(machine, self.rcc)
@@ -56,9 +61,7 @@ class Board:
         self.exti = Exti(machine)
         self.spi = Spi(machine, self.rcc)
         self.dma2 = Dma2(machine, self.spi)
-        self.can = Bxcan(
-            machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9
-        )
+        self.can = Bxcan(machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9)
         self.usart = Usart(machine, self.rcc)
         self.flash = Flash(machine)
         self.sensor = Adis16405(machine, source or resting(seed))
@@ -99,6 +102,17 @@ class Board:
         """Let time go by."""
         self.machine.run(self.machine.now_us + seconds * 1e6)
 
+    def power_cycle(self, retained: bytes | None = None) -> None:
+        """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
+        machine = self.machine
+        machine.uc.mem_write(SRAM, machine.random.randbytes(SRAM_BYTES))
+        if retained is not None:
+            machine.uc.mem_write(0x080C0000, retained)
+        self.flash.cut_at = -1
+        self.rcc.csr = self.rcc.FLAG["power"]
+        machine.power_cycle()
+        self.sensor.power_on()
+
     def retained(self) -> bytes:
         """Content of the flash's two last sectors."""
         self.flash.settle()
@@ -113,3 +127,6 @@ class Board:
         """Leave the python-can channel."""
         if self.bus is not None:
             self.bus.shutdown()
+
+
+__all__ = ["Adis16405", "Board", "arm", "place", "resting"]

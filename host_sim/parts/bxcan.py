@@ -36,7 +36,8 @@ class Bxcan(Part):
     `fault(frame)`: whether a bit error hits this attempt. `on_frame(frame)`: a frame that was sent and acknowledged."""
 
     base = 0x40006400
-    size = 0x400
+    event: Event | None = None  # end of the frame on the bus
+    sync: Event | None = None  # end of initialisation or of bus-off
 
     def __init__(self, machine: Machine, rcc: Rcc, pins_connected: Callable[[], bool]) -> None:
         super().__init__(machine)
@@ -60,11 +61,10 @@ class Bxcan(Part):
         self.requests: list[int] = []  # mailboxes in order of request
         self.abort: set[int] = set()
         self.sending: int | None = None
-        for name in ("event", "sync"):
-            if getattr(self, name, None) is not None:
-                getattr(self, name).cancel()
-        self.event: Event | None = None
-        self.sync: Event | None = None
+        for event in (self.event, self.sync):
+            if event is not None:
+                event.cancel()
+        self.event = self.sync = None
 
     @property
     def bit_us(self) -> float:
@@ -72,7 +72,8 @@ class Bxcan(Part):
         quanta = 3 + (self.btr >> 16 & 15) + (self.btr >> 20 & 7)
         return 1e6 * ((self.btr & 0x3FF) + 1) * quanta / self.rcc.pclk1_hz
 
-    # --------------------------------------------------------------------------------------------------------- registers
+    # ---------------------------------------------------------------------------------------------------------
+    # registers
 
     def read(self, offset: int) -> int:
         """Control, status, mailboxes."""
@@ -160,7 +161,8 @@ class Bxcan(Part):
         else:
             self._complete(i, 0)
 
-    # --------------------------------------------------------------------------------------------------------------- bus
+    # ---------------------------------------------------------------------------------------------------------------
+    # bus
 
     def _complete(self, i: int, flags: int) -> None:
         self.requests.remove(i)
@@ -174,10 +176,8 @@ class Bxcan(Part):
         """Start the next attempt: the oldest request (TXFP), or the lowest identifier (32.7.1)."""
         if self.sending is not None or not self.requests or self.boff or self.msr & 3:
             return
-        if self.mcr >> 2 & 1:
-            i = self.requests[0]
-        else:
-            i = min(self.requests, key=lambda box: (self.box[box][0] >> 21, box))
+        first, lowest = self.requests[0], min(self.requests, key=lambda box: (self.box[box][0] >> 21, box))
+        i = first if self.mcr >> 2 & 1 else lowest
         self.sending = i
         tir, tdtr, low, high = self.box[i]
         frame = (tir >> 21, (low | high << 32).to_bytes(8, "little")[: tdtr & 15])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from unicorn import UC_HOOK_MEM_WRITE, Uc
+import random
 
-from .machine import FLASH, FLASH_BYTES, Machine, Part
+from unicorn.unicorn_const import UC_HOOK_MEM_WRITE
+
+from .machine import FLASH, FLASH_BYTES, Machine, Part, Uc
 
 #: Start and size of every sector, RM0090 table 5.
 SECTORS = [(FLASH + 0x4000 * i, 0x4000) for i in range(4)]
@@ -15,9 +17,21 @@ LOCKED, BUSY = 1 << 31, 1 << 16
 PGSERR, PGPERR, WRPERR = 1 << 7, 1 << 6, 1 << 4
 
 
+def half_programmed(old: bytes, new: bytes, rng: random.Random) -> bytes:
+    """Each bit that was to be cleared has been or not."""
+    return bytes(n | o & rng.getrandbits(8) for o, n in zip(old, new, strict=True))
+
+
+def half_erased(old: bytes, rng: random.Random) -> bytes:
+    """Cells in between: some pages erased, some as they were, some of any content."""
+    return b"".join(
+        rng.choice((b"\xff" * 256, old[at : at + 256], rng.randbytes(256))) for at in range(0, len(old), 256)
+    )
+
+
 class Flash(Part):
-    """RM0090 3.9. `operations` counts erases and words; `cut_at` cuts the power within that operation, whose cells are then
-    left in between: each bit that was to change has done so or not."""
+    """RM0090 3.9. `operations` counts erases and words; `cut_at` cuts the power within that operation, whose cells are
+    then left in between: each bit that was to change has done so or not."""
 
     base = 0x40023C00
 
@@ -27,7 +41,7 @@ class Flash(Part):
         self.erases = [0] * len(SECTORS)
         self.cut_at = -1
         self.fail_at = -1  # the operation that the flash refuses
-        self.history: list[tuple[str, int, bytes]] = []  # kind, address, content before, if `keep_history`
+        self.history: list[tuple[int, bytes, bytes]] = []  # address, content before and after, if `keep_history`
         self.keep_history = False
         machine.uc.hook_add(UC_HOOK_MEM_WRITE, self._store, None, FLASH, FLASH + FLASH_BYTES - 1)
 
@@ -50,20 +64,16 @@ class Flash(Part):
             self.operations += 1
             self._put = (address, old)
             return
-        self._before("program", address, old)
         result = bytes(a & b for a, b in zip(old, new, strict=True))
         if self.operations == self.cut_at:
-            keep = self.machine.random.randbytes(4)
-            result = bytes(r | o & k for r, o, k in zip(result, old, keep, strict=True))
+            result = half_programmed(old, result, self.machine.random)
             self._put = (address, result)
             self.machine.stop("power cut")
         self._put = (address, result)
+        if self.keep_history:
+            self.history.append((address, old, result))
         self.operations += 1
         self.machine.stall(PROGRAM_US)
-
-    def _before(self, kind: str, address: int, old: bytes) -> None:
-        if self.keep_history:
-            self.history.append((kind, address, old))
 
     def settle(self) -> None:
         """The cells as the last operation left them."""
@@ -111,17 +121,13 @@ class Flash(Part):
             self.sr |= WRPERR
             return
         old = bytes(uc.mem_read(start, size))
-        self._before("erase", start, old)
+        if self.keep_history:
+            self.history.append((start, old, b"\xff" * size))
         self.erases[sector] += 1
         if start < self.machine.symbols["link_data_load"]:
             self.machine.violations.append("the code's own sector erased")
         if self.operations == self.cut_at:
-            # cells in between: some pages erased, some as they were, some of any content
-            rng = self.machine.random
-            content = b"".join(
-                rng.choice((b"\xff" * 256, old[at : at + 256], rng.randbytes(256))) for at in range(0, size, 256)
-            )
-            uc.mem_write(start, content)
+            uc.mem_write(start, half_erased(old, self.machine.random))
             self.machine.stop("power cut")
             return
         self.operations += 1

@@ -12,10 +12,11 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
+import unicorn.arm_const as arm
 from elftools.elf.elffile import ELFFile
-from unicorn import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_INTR, UC_MODE_MCLASS, UC_MODE_THUMB, Uc, UcError
-from unicorn import arm_const as arm
-from unicorn import unicorn_const as const
+from elftools.elf.sections import SymbolTableSection
+from unicorn import Uc, UcError  # type: ignore[attr-defined]
+from unicorn.unicorn_const import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_INTR, UC_MODE_MCLASS, UC_MODE_THUMB
 
 FLASH, FLASH_BYTES = 0x08000000, 0x100000
 SRAM, SRAM_BYTES = 0x20000000, 0x20000
@@ -27,7 +28,7 @@ HANDLER_MOST = 400_000  # instructions a handler may take: 2.4 ms
 ACCESS_US = 0.03  # a peripheral access, about 5 cycles
 WFI = b"\x30\xbf"
 
-EXC_NMI, EXC_HARD_FAULT, EXC_SYSTICK, EXC_IRQ0 = 2, 3, 15, 16
+EXC_HARD_FAULT, EXC_SYSTICK, EXC_IRQ0 = 3, 15, 16
 
 
 class Part:
@@ -83,7 +84,6 @@ class Machine:
         self._asleep = False
         self._reset_wanted: str | None = None
         self._exception_return = False
-        self._tick: Event | None = None
         self._in_handler = False
         self._slice = SLICE
         self._spent = 0.0  # us of peripheral accesses within the slice
@@ -107,7 +107,9 @@ class Machine:
             for segment in elf.iter_segments("PT_LOAD"):
                 if segment["p_filesz"]:
                     self.uc.mem_write(segment["p_paddr"], segment.data())
-            for symbol in elf.get_section_by_name(".symtab").iter_symbols():
+            table = elf.get_section_by_name(".symtab")
+            assert isinstance(table, SymbolTableSection), "the image is stripped"
+            for symbol in table.iter_symbols():
                 self.symbols[symbol.name] = symbol["st_value"]
 
     def start(self) -> None:
@@ -117,6 +119,13 @@ class Machine:
                 self._pages.setdefault(page, []).append(part)
         for page in self._pages:
             self.uc.mmio_map(page, 0x1000, self._mmio_read, page, self._mmio_write, page)
+        self._restart()
+
+    def power_cycle(self) -> None:
+        """Every event that was to come is void."""
+        self._events.clear()
+        self._spent = 0.0
+        self.stopped = None
         self._restart()
 
     # ------------------------------------------------------------------------------------------------------ peripherals
@@ -182,7 +191,8 @@ class Machine:
         self.stopped = why
         self.uc.emu_stop()
 
-    # --------------------------------------------------------------------------------------------------------- exceptions
+    # ---------------------------------------------------------------------------------------------------------
+    # exceptions
 
     def _interrupt_hook(self, uc: Uc, number: int, data: object) -> None:
         if uc.reg_read(arm.UC_ARM_REG_PC) >= 0xFFFFFF00:
@@ -198,7 +208,8 @@ class Machine:
         return int.from_bytes(self.uc.mem_read(FLASH + 4 * exception, 4), "little")
 
     def _take(self, exception: int) -> None:
-        """Run a handler to its end. Registers are put back whole; the frame's room on the stack is taken (PM0214 2.3.7)."""
+        """Run a handler to its end. Registers are put back whole; the frame's room on the stack is taken (PM0214
+        2.3.7)."""
         uc = self.uc
         context = uc.context_save()
         uc.reg_write(arm.UC_ARM_REG_SP, (uc.reg_read(arm.UC_ARM_REG_SP) - 104) & ~7)
@@ -215,7 +226,9 @@ class Machine:
             self._spent += FINE / self.hclk_mhz
             address = uc.reg_read(arm.UC_ARM_REG_PC)
         else:
-            self.violations.append(f"handler of exception {exception} did not return within {HANDLER_MOST} instructions")
+            self.violations.append(
+                f"handler of exception {exception} did not return within {HANDLER_MOST} instructions"
+            )
         self._in_handler = False
         uc.context_restore(context)
         self._spent += 0.3  # entry and exit
@@ -257,7 +270,8 @@ class Machine:
         uc.reg_write(arm.UC_ARM_REG_LR, 0xFFFFFFFF)
         uc.reg_write(arm.UC_ARM_REG_PC, self._vector(1) | 1)
 
-    # --------------------------------------------------------------------------------------------------------------- time
+    # ---------------------------------------------------------------------------------------------------------------
+    # time
 
     def _events_due(self) -> None:
         while self._events and self._events[0][0] <= self.now_us:
@@ -317,14 +331,15 @@ class SystemControl(Part):
     """SysTick (PM0214 4.5), NVIC (4.3), SCB (4.4) and the FPU's access register (4.6.1)."""
 
     base, size = 0xE000E000, 0x1000
+    tick: Event | None = None
 
     def reset(self) -> None:
         """Off."""
         self.csr = self.rvr = 0
         self.start_us = 0.0
-        if getattr(self, "tick", None) is not None:
+        if self.tick is not None:
             self.tick.cancel()
-        self.tick: Event | None = None
+        self.tick = None
 
     def _period_us(self) -> float:
         return (self.rvr + 1) / self.machine.hclk_mhz
@@ -380,4 +395,4 @@ class SystemControl(Part):
             raise KeyError(offset)
 
 
-__all__ = ["EXC_IRQ0", "EXC_NMI", "FLASH", "SRAM", "Event", "Machine", "Part", "SystemControl", "const"]
+__all__ = ["EXC_IRQ0", "FLASH", "FLASH_BYTES", "SRAM", "SRAM_BYTES", "Event", "Machine", "Part", "SystemControl", "Uc"]

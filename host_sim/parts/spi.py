@@ -9,7 +9,8 @@ from .system import Rcc
 
 
 class Spi(Part):
-    """RM0090 28.5. `device(word, mode, sck_hz, end_us)` answers a frame that ends then; `flip` is the chance that a bit of one is turned over."""
+    """RM0090 28.5. `device(word, mode, sck_hz, end_us)` answers a frame that ends then; `flip` is the chance that a bit
+    of one is turned over."""
 
     base = 0x40013000
 
@@ -31,7 +32,7 @@ class Spi(Part):
     @property
     def sck_hz(self) -> float:
         """28.5.1, BR."""
-        return self.rcc.pclk2_hz / 2 ** ((self.cr1 >> 3 & 7) + 1)
+        return float(self.rcc.pclk2_hz / (2 << (self.cr1 >> 3 & 7)))
 
     def _noisy(self, word: int) -> int:
         if self.flip > 0.0:
@@ -79,6 +80,7 @@ class Dma2(Part):
     """RM0090 10.5, as far as SPI1 needs it: stream 0 channel 3 receives, stream 3 channel 3 sends (table 43)."""
 
     base = 0x40026400
+    end: Event | None = None
     RX, TX = 0, 3
 
     def __init__(self, machine: Machine, spi: Spi) -> None:
@@ -91,9 +93,9 @@ class Dma2(Part):
         """Off."""
         self.lisr = 0
         self.streams = [dict.fromkeys((0x00, 0x04, 0x08, 0x0C, 0x10), 0) | {0x14: 0x21} for _ in range(8)]
-        if getattr(self, "end", None) is not None:
+        if self.end is not None:
             self.end.cancel()
-        self.end: Event | None = None
+        self.end = None
 
     def read(self, offset: int) -> int:
         """LISR, SxCR and so on."""
@@ -124,7 +126,13 @@ class Dma2(Part):
             return
         for stream, direction in ((rx, 0), (tx, 1)):
             cr = stream[0x00]
-            if cr >> 25 & 7 != 3 or cr >> 6 & 3 != direction or cr >> 11 & 3 != 1 or cr >> 13 & 3 != 1 or not cr >> 10 & 1:
+            if (
+                cr >> 25 & 7 != 3
+                or cr >> 6 & 3 != direction
+                or cr >> 11 & 3 != 1
+                or cr >> 13 & 3 != 1
+                or not cr >> 10 & 1
+            ):
                 self.machine.violations.append("DMA2: channel, direction, widths or increment wrong for SPI1")
         if self.hang > 0:
             self.hang -= 1

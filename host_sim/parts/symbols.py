@@ -19,14 +19,15 @@ def _strip(die: Any) -> Any:
 def _variables(path: Path) -> dict[str, tuple[int, Any]]:
     found: dict[str, tuple[int, Any]] = {}
     with path.open("rb") as file:
-        for unit in ELFFile(file).get_dwarf_info().iter_CUs():
+        for unit in ELFFile(file).get_dwarf_info(relocate_dwarf_sections=False).iter_CUs():
             for die in unit.get_top_DIE().iter_children():
                 location = die.attributes.get("DW_AT_location")
-                if die.tag == "DW_TAG_variable" and location is not None and "DW_AT_name" in die.attributes:
-                    if isinstance(location.value, list) and location.value and location.value[0] == 3:  # DW_OP_addr
-                        name = die.attributes["DW_AT_name"].value.decode()
-                        address = int.from_bytes(bytes(location.value[1:5]), "little")
-                        found[name] = (address, _layout(_strip(die.get_DIE_from_attribute("DW_AT_type"))))
+                if die.tag != "DW_TAG_variable" or location is None or "DW_AT_name" not in die.attributes:
+                    continue
+                if isinstance(location.value, list) and location.value[:1] == [3]:  # DW_OP_addr
+                    name = die.attributes["DW_AT_name"].value.decode()
+                    address = int.from_bytes(bytes(location.value[1:5]), "little")
+                    found[name] = (address, _layout(_strip(die.get_DIE_from_attribute("DW_AT_type"))))
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 from .machine import EXC_IRQ0, Event, Machine, Part
 
@@ -13,7 +14,7 @@ class Rcc(Part):
     """RM0090 7.3. HSE starts within 2 ms and the PLL locks within 0.2 ms, or never (`crystal`, `pll_works`)."""
 
     base = 0x40023800
-    FLAG = {"power": 0x0E000000, "pin": 0x04000000, "software": 0x14000000, "watchdog": 0x24000000}
+    FLAG: ClassVar = {"power": 0x0E000000, "pin": 0x04000000, "software": 0x14000000, "watchdog": 0x24000000}
 
     def __init__(self, machine: Machine) -> None:
         super().__init__(machine)
@@ -161,6 +162,7 @@ class Iwdg(Part):
     """RM0090 21.4. `lsi_hz` may be 17 to 47 kHz (data sheet)."""
 
     base = 0x40003000
+    end: Event | None = None
 
     def __init__(self, machine: Machine) -> None:
         super().__init__(machine)
@@ -171,9 +173,9 @@ class Iwdg(Part):
         self.pr, self.rlr = 0, 0xFFF
         self.unlocked = False
         self.busy_until = 0.0
-        if getattr(self, "end", None) is not None:
+        if self.end is not None:
             self.end.cancel()
-        self.end: Event | None = None
+        self.end = None
 
     def _reload(self) -> None:
         if self.end is not None:

@@ -12,6 +12,7 @@ class Usart(Part):
     """RM0090 30.6. `say(bytes)` is the host's side; what the firmware sends goes to `on_byte`."""
 
     base = 0x40011000
+    departure: Event | None = None
 
     def __init__(self, machine: Machine, rcc: Rcc) -> None:
         super().__init__(machine)
@@ -28,9 +29,9 @@ class Usart(Part):
         self.tx_shift_until = 0.0
         self.tx_full = self.rx_full = self.overrun = False
         self.rdr = 0
-        if getattr(self, "departure", None) is not None:
+        if self.departure is not None:
             self.departure.cancel()
-        self.departure: Event | None = None
+        self.departure = None
 
     @property
     def baud(self) -> float:

@@ -60,10 +60,11 @@ typedef enum {
     ADIS16405_STATUS = 7     /* DIAG_STAT: supply out of range, flash checksum, self-test */
 } adis16405_fault_t;
 
-/* Since start. */
+/* Since start. Each has one writer, an interrupt handler or the main loop. */
 typedef struct {
-    uint32_t samples;   /* delivered to the queue */
+    uint32_t samples;   /* delivered to the application */
     uint32_t stale;     /* ND not set */
+    uint32_t repeated;  /* all channels as before, once too often */
     uint32_t alarms;    /* EA set */
     uint32_t damaged;   /* the two readings differ, or a burst failed */
     uint32_t anomalies; /* lost sign bit of XGYRO_OUT */
@@ -84,18 +85,18 @@ typedef struct {
     uint32_t nominal_q8, period_q8; /* sample period, us / 256 */
     float scale[ADIS16405_AXES];
     adis16405_state_t state;
-    adis16405_fault_t fault;
+    adis16405_fault_t fault; /* the last one */
     uint8_t step;
     uint64_t step_us;      /* when the step of the start was entered, or the fault state */
     uint32_t backoff_us;
     uint16_t diagnosis;    /* every bit of DIAG_STAT seen so far */
-    bool diagnosis_wanted;
+    volatile bool diagnosis_wanted;
     uint64_t diagnosis_us; /* when it was read last */
     /* main loop, of the samples */
     uint64_t last_us;      /* stamp of the last sample delivered */
     bool anchored;
     int16_t last[ADIS16405_AXES];
-    uint32_t equal;
+    uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
     uint64_t progress_us;  /* when a sample was delivered last, or the run began */
     uint32_t ready_seen;

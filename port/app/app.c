@@ -20,9 +20,6 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
     return selfcal_telemetry_init(&app->telemetry, &selfcal_model, selfcal_model_axis_name);
 }
 
-/* The library's snapshot, where the build has it. */
-#ifdef SELFCAL_SNAPSHOT_MAX
-
 static void restore(app_t *app)
 {
     const port_module_t *module = app->module;
@@ -43,37 +40,6 @@ static void restore(app_t *app)
         app->told.state_found = 3U;
     }
 }
-
-static bool check(const app_t *app)
-{
-    return selfcal_check(&app->bank) == SELFCAL_OK;
-}
-
-static bool write_state(const app_t *app)
-{
-    return selfcal_save(&app->bank, app->module->save_put, app->module->context) == SELFCAL_OK;
-}
-
-#else
-
-static void restore(app_t *app)
-{
-    (void)app;
-}
-
-static bool check(const app_t *app)
-{
-    (void)app;
-    return true;
-}
-
-static bool write_state(const app_t *app)
-{
-    (void)app;
-    return false;
-}
-
-#endif
 
 void app_module(app_t *app, const port_module_t *module)
 {
@@ -97,7 +63,8 @@ static void save_when_due(app_t *app, uint32_t now)
         return;
     }
     app->saved_ms = now;
-    if (module->save_begin(module->context) && write_state(app) && module->save_end(module->context)) {
+    if (module->save_begin(module->context) &&
+        selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK && module->save_end(module->context)) {
         app->told.state_saves++;
     } else {
         app->told.state_save_failures++;
@@ -144,7 +111,7 @@ static bool advance(app_t *app)
     if (app->stage == STAGE_NONE) {
         const bool due = (int32_t)(now - app->due_ms) >= 0;
         save_when_due(app, now);
-        app->corrupt = app->corrupt || (due && !check(app));
+        app->corrupt = app->corrupt || (due && selfcal_check(&app->bank) != SELFCAL_OK);
         if (app->corrupt) {
             return false;
         }

@@ -13,7 +13,7 @@
 typedef struct {
     uint32_t vector; /* exception number: 3 HardFault, 16 + n interrupt n */
     uint32_t pc, lr; /* where; 0 if the stack was gone */
-    uint32_t cfsr;   /* SCB_CFSR, PM0214 4.4.14 */
+    uint32_t cfsr;   /* SCB_CFSR, PM0214 4.4 */
 } board_fault_t;
 
 /* The fault that ended the last run, once; false: there was none. */
@@ -35,10 +35,13 @@ extern board_clock_t board_clock;
  * longer than about 20 ms. */
 void clock_init(void);
 
-/* Time since start. The second is for interrupt handlers, modulo 2^32. */
+/* Time since start: for the main loop; the last for interrupt handlers too, modulo 2^32. */
 uint32_t clock_ms(void);
 uint64_t clock_us(void);
 uint32_t clock_us32(void);
+
+/* Goes up each millisecond that interrupts are served. */
+uint32_t clock_ticks(void);
 
 /* At least this long, at most twice. */
 void clock_spin_us(uint32_t us);
@@ -114,8 +117,9 @@ void watchdog_feed(void);
 /* Largest state a slot keeps, bytes. */
 #define FLASH_SLOT_BYTES (128U * 1024U - 32U)
 
-/* The newest whole state, or NULL; `older`: the one before it, if that is whole too. */
-const void *flash_newest(bool older, size_t *length, uint32_t *sequence);
+/* The newest state whose save reached its end, or NULL; `older`: the one before it. Whether it is still what was written its own
+ * checksum tells. */
+const void *flash_newest(bool older, size_t *length);
 
 /* A save: begin erases the slot that is not the newest (1 s, 2 s at most, during which the processor stands still), put
  * appends, end writes the header. Until the header's last word is written the newest state stays what it was. False: the

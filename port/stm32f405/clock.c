@@ -1,14 +1,15 @@
-/* Clocks: 168 MHz by the PLL; SysTick counts milliseconds, TIM2 microseconds. RM0090 7.2 and 7.3, figure 21. */
+/* Clocks: 168 MHz by the PLL; TIM2 counts microseconds, SysTick wakes the main loop each millisecond. RM0090 7.2 and 7.3,
+ * figure 21. */
 #include "board.h"
 #include "stm32f405.h"
 
 enum { HSE_HZ = 8000000, HSI_HZ = 16000000, PLL_HZ = 168000000 };
 
 board_clock_t board_clock;
-static volatile uint32_t milliseconds;
+static volatile uint32_t ticks;
 
 /* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16 MHz. */
-static bool await(volatile uint32_t *reg, uint32_t mask, uint32_t value)
+static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
 {
     for (uint32_t turn = 0; turn < 60000U; turn++) {
         if ((*reg & mask) == value) {
@@ -30,7 +31,7 @@ static bool pll_start(uint32_t source_hz, uint32_t source)
 void clock_init(void)
 {
     RCC_APB1ENR |= RCC_APB1ENR_PWR | RCC_APB1ENR_TIM2;
-    (void)RCC_APB1ENR; /* section 7.2.14: a peripheral's clock needs two cycles */
+    (void)RCC_APB1ENR; /* errata sheet ES0182: a peripheral answers two cycles after its clock is on */
     PWR_CR |= PWR_CR_VOS;
     FLASH_ACR = FLASH_ACR_LATENCY_5WS | FLASH_ACR_PRFTEN | FLASH_ACR_ICEN | FLASH_ACR_DCEN;
 
@@ -65,12 +66,18 @@ void clock_init(void)
 
 void systick_handler(void)
 {
-    milliseconds++;
+    ticks++;
 }
 
+uint32_t clock_ticks(void)
+{
+    return ticks;
+}
+
+/* Not from the ticks, which an erase of the flash keeps from being counted. */
 uint32_t clock_ms(void)
 {
-    return milliseconds;
+    return (uint32_t)(clock_us() / 1000U);
 }
 
 uint32_t clock_us32(void)

@@ -4,7 +4,7 @@
  * is refused, and the other slot, which was not touched, is the newest. RM0090 3.6: erase sets every bit, programming
  * clears bits; both stall reads of the flash, so the processor stands still meanwhile.
  *
- * Wear: a sector bears 10 000 erases (data sheet, table 49); each save erases one of two, so 20 000 saves. */
+ * Wear: a sector bears 10 000 erases (data sheet); each save erases one of two, so 20 000 saves. */
 #include "board.h"
 #include "stm32f405.h"
 
@@ -51,17 +51,23 @@ static const header_t *header_of(uint32_t slot)
     return (const header_t *)(uintptr_t)slot_address(slot);
 }
 
-static bool whole(uint32_t slot)
+/* A save that reached its end wrote this header. */
+static bool headed(uint32_t slot)
 {
     const header_t *header = header_of(slot);
     return header->magic == MAGIC && header->header_crc == crc_of(header, offsetof(header_t, header_crc)) &&
-           header->length <= FLASH_SLOT_BYTES && header->payload_crc == crc_of(header + 1, header->length);
+           header->length <= FLASH_SLOT_BYTES;
+}
+
+static bool whole(uint32_t slot)
+{
+    return headed(slot) && header_of(slot)->payload_crc == crc_of(header_of(slot) + 1, header_of(slot)->length);
 }
 
 /* The slot with the newest state, or the one before it; NONE. */
 static uint32_t find(bool older)
 {
-    const bool good[SLOTS] = {whole(0), whole(1)};
+    const bool good[SLOTS] = {headed(0), headed(1)};
     if (good[0] && good[1]) {
         /* modulo 2^32 */
         const uint32_t newest = (int32_t)(header_of(1)->sequence - header_of(0)->sequence) > 0 ? 1U : 0U;
@@ -73,18 +79,17 @@ static uint32_t find(bool older)
     return good[0] ? 0U : good[1] ? 1U : NONE;
 }
 
-const void *flash_newest(bool older, size_t *length, uint32_t *sequence)
+const void *flash_newest(bool older, size_t *length)
 {
     const uint32_t slot = find(older);
     if (slot == NONE) {
         return NULL;
     }
     *length = header_of(slot)->length;
-    *sequence = header_of(slot)->sequence;
     return header_of(slot) + 1;
 }
 
-/* Erasing takes 2 s at most, a word 100 us (data sheet, tables 47 and 48, x32). */
+/* Erasing takes 2 s at most, a word 100 us (data sheet, at x32). */
 static bool await_idle(void)
 {
     const uint32_t start = clock_us32();
@@ -124,9 +129,11 @@ static bool program(uint32_t address, uint32_t word)
 
 bool flash_begin(void)
 {
-    const uint32_t newest = find(false);
+    /* The newest state stays; but if its payload has been damaged since, the one before it does. */
+    const uint32_t newest = find(false), older = find(true);
+    const uint32_t kept = newest != NONE && !whole(newest) && older != NONE ? older : newest;
     memset(&save, 0, sizeof save);
-    save.slot = newest == 0U ? 1U : 0U;
+    save.slot = kept == 0U ? 1U : 0U;
     save.sequence = newest == NONE ? 1U : header_of(newest)->sequence + 1U;
     save.crc = UINT32_MAX;
     save.address = slot_address(save.slot) + HEADER_BYTES;

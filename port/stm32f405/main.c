@@ -115,7 +115,7 @@ static void module_tell(void *context, selfcal_module_t *told)
     told->sensor_fault = (uint32_t)sensor.fault;
     told->sensor_fault_count = sensor.counters.faults;
     told->sensor_diagnosis = sensor.diagnosis;
-    told->sensor_stale_count = sensor.counters.stale;
+    told->sensor_stale_count = sensor.counters.stale + sensor.counters.repeated;
     told->sensor_alarm_count = sensor.counters.alarms;
     told->sensor_damaged_count = sensor.counters.damaged;
     told->sensor_anomaly_count = sensor.counters.anomalies;
@@ -133,8 +133,7 @@ static void module_tell(void *context, selfcal_module_t *told)
 static const void *module_stored(void *context, bool older, size_t *length)
 {
     (void)context;
-    uint32_t sequence;
-    return flash_newest(older, length, &sequence);
+    return flash_newest(older, length);
 }
 
 static bool module_save_begin(void *context)
@@ -155,14 +154,14 @@ static const port_module_t module = {
     (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 
-/* Fed once in 100 ms at most, and only if the millisecond clock goes on (a main loop that turns without its interrupts is not
- * healthy) and the application is well. */
+/* Fed once in 100 ms at most, and only if the ticks go on (a main loop that turns without its interrupts is not healthy) and the
+ * application is well. */
 static void feed(void)
 {
-    static uint32_t fed_ms;
-    const uint32_t now = clock_ms();
-    if (now - fed_ms >= 100U && app_healthy(&app)) {
-        fed_ms = now;
+    static uint32_t fed;
+    const uint32_t now = clock_ticks();
+    if (now - fed >= 100U && app_healthy(&app)) {
+        fed = now;
         watchdog_feed();
     }
 }

@@ -63,9 +63,24 @@ static bool await_status(uint32_t mask, uint32_t value)
     return true;
 }
 
+static void stop_dma(void)
+{
+    SPI1_CR2 = 0U;
+    DMA_SCR(RX_STREAM) = 0U;
+    DMA_SCR(TX_STREAM) = 0U;
+    for (uint32_t turn = 0; turn < 100U && ((DMA_SCR(RX_STREAM) | DMA_SCR(TX_STREAM)) & DMA_SCR_EN) != 0U; turn++) {
+    } /* section 10.3.17: a stream ends its transfer under way first */
+    DMA_LIFCR = DMA_LISR_STREAM0 | DMA_LISR_STREAM3;
+}
+
 bool spi_word(void *context, uint16_t out, uint16_t *in)
 {
     (void)context;
+    if (((DMA_SCR(RX_STREAM) | DMA_SCR(TX_STREAM)) & DMA_SCR_EN) != 0U) { /* a burst that never ended */
+        stop_dma();
+        select_sensor(false);
+        clock_spin_us(STALL_US);
+    }
     SPI1_CR2 = 0U;
     (void)SPI1_DR;
     select_sensor(true);
@@ -75,16 +90,6 @@ bool spi_word(void *context, uint16_t out, uint16_t *in)
     select_sensor(false);
     clock_spin_us(STALL_US);
     return done;
-}
-
-static void stop_dma(void)
-{
-    SPI1_CR2 = 0U;
-    DMA_SCR(RX_STREAM) = 0U;
-    DMA_SCR(TX_STREAM) = 0U;
-    for (uint32_t turn = 0; turn < 100U && ((DMA_SCR(RX_STREAM) | DMA_SCR(TX_STREAM)) & DMA_SCR_EN) != 0U; turn++) {
-    } /* section 10.3.17: a stream ends its transfer under way first */
-    DMA_LIFCR = DMA_LISR_STREAM0 | DMA_LISR_STREAM3;
 }
 
 bool spi_burst(void *context)

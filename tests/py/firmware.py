@@ -1,0 +1,125 @@
+"""The STM32F405 image for the tests: built as `make firmware` builds it, run on the board of host_sim/parts."""
+
+from __future__ import annotations
+
+import fcntl
+import subprocess
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from selfcal.model import Model
+from selfcal.verbs.codegen import codegen
+from selfcal.wire import AxisReport, Decoder
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "host_sim"))
+
+parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup")
+Board = parts.Board
+from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is there
+from unicorn import arm_const as arm  # noqa: E402
+
+AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+#: A model whose bank takes no sample within a test, so that no report is made and time goes by fast.
+QUIET_RATE_HZ = 102.4
+QUIET_BANK_HZ = 0.01
+
+
+@lru_cache
+def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIET_BANK_HZ) -> Path:
+    """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at
+    `bank_hz`."""
+    folder = ROOT / "build" / "firmware" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        model = Model.load()
+        if quiet:
+            document = yaml.safe_load(Path(model.path).read_text())
+            document["bank_rate_hz"] = bank_hz
+            (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+            codegen(folder / "model.yaml", folder / "new", target="cortex-m4f", rate=QUIET_RATE_HZ)
+        else:
+            codegen(None, folder / "new", target="cortex-m4f")
+        for file in (folder / "new").iterdir():
+            old = folder / file.name
+            if not old.exists() or old.read_bytes() != file.read_bytes():
+                old.write_bytes(file.read_bytes())
+        makefile = "port/stm32f405/stm32f405.mk"
+        command = ["make", "-s", "-f", makefile, "stm32f405", f"MODEL_DIR={folder}", f"OUT={folder}"]
+        stamp = folder / "flags"
+        if not stamp.exists() or stamp.read_text() != flags:
+            (folder / "selfcal.elf").unlink(missing_ok=True)
+            stamp.write_text(flags)
+        subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
+    return folder / "selfcal.elf"
+
+
+def reports(frames: list[can.Message]) -> tuple[Decoder, list[AxisReport]]:
+    """What the host's decoder makes of frames that were watched from the start."""
+    decoder = Decoder(from_start=True)
+    found = [report for frame in frames for report in decoder.feed(frame)]
+    return decoder, found
+
+
+def messages(board: parts.Board) -> list[can.Message]:
+    """The frames heard on the CAN bus so far."""
+    return [
+        can.Message(timestamp=us / 1e6, arbitration_id=frame[0], data=frame[1], is_extended_id=False)
+        for us, frame in board.frames
+    ]
+
+
+def status(board: parts.Board) -> dict[str, float]:
+    """The last status heard."""
+    return reports(messages(board))[0].status
+
+
+def readings(samples: list[tuple[int, ...]]) -> NDArray[np.float32]:
+    """LSB to deg/s and m/s^2 as the data sheet scales them, in the driver's float arithmetic [n, 6]."""
+    scale = np.array([0.05] * 3 + [0.032656145] * 3, dtype=np.float32)
+    return np.array(samples, dtype=np.float32) * scale
+
+
+class Tap:
+    """What the application gives to the library: every selfcal_push() with its place on the sensor's count of samples,
+    found by what selfcal_push() and selfcal_skip() have been given before. Watches only."""
+
+    def __init__(self, board: parts.Board) -> None:
+        self.board = board
+        self.place = -1
+        self.pushed: list[tuple[int, tuple[float, ...]]] = []
+        self.skips: list[int] = []
+        for name, call in (("selfcal_push", self._push), ("selfcal_skip", self._skip)):
+            address = board.machine.symbols[name] & ~1
+            board.machine.uc.hook_add(UC_HOOK_CODE, call, None, address, address)
+
+    def _push(self, uc: Uc, address: int, size: int, data: object) -> None:
+        self.place += 1
+        sample = np.frombuffer(bytes(uc.mem_read(uc.reg_read(arm.UC_ARM_REG_R1), 24)), dtype="<f4")
+        self.pushed.append((self.place, tuple(sample.tolist())))
+
+    def _skip(self, uc: Uc, address: int, size: int, data: object) -> None:
+        count = uc.reg_read(arm.UC_ARM_REG_R2) | uc.reg_read(arm.UC_ARM_REG_R3) << 32  # AAPCS: a 64-bit argument
+        self.place += count
+        self.skips.append(count)
+
+    def wrong(self) -> int:
+        """Pushed samples that are none of those the sensor made."""
+        made = {tuple(row) for row in readings([sample for _, _, sample in self.board.sensor.taken]).tolist()}
+        return sum(sample not in made for _, sample in self.pushed)
+
+    def misplaced(self, slack: int) -> int:
+        """Pushed samples whose place is more than `slack` off the sensor's own count, taken from the first one on."""
+        index = {}
+        for number, _, sample in self.board.sensor.taken:
+            index.setdefault(tuple(readings([sample])[0].tolist()), number)
+        first = index[self.pushed[0][1]]
+        return sum(abs(index[sample] - first - place) > slack for place, sample in self.pushed if sample in index)

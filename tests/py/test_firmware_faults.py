@@ -1,0 +1,479 @@
+"""Fault campaigns on the unmodified STM32F405 image: trials, and how many were survived. Each prints a line with both.
+
+A trial is survived when the image does not reset, hang or fault, breaks no rule of a part, gives the library no sample
+that the sensor did not make (wrong = 0) and puts every sample where it belongs in time (misplaced = 0).
+SELFCAL_CAMPAIGN=N runs N times as many trials (`make campaigns`)."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+
+import pytest
+from firmware import Board, Tap, image, messages, parts, reports, status
+from parts.flash import half_erased, half_programmed
+
+MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
+#: Reports every 500 ms, no bank sample: see firmware.py.
+QUIET = ("quiet", "-DBOARD_REPORT_MS=500", True)
+SERIAL = ("serial", "-DBOARD_REPORT_MS=500 -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD=1000000", True)
+#: codes of `sensor_fault` in selfcal.dbc
+ABSENT, SELF_TEST, SILENT, NO_DATA, STUCK, STATUS = 1, 3, 4, 5, 6, 7
+STARTING, RUNNING, FAILED = 1, 2, 3
+
+
+def tell(name: str, trials: int, survived: int, more: str = "") -> None:
+    print(f"\n{name}: {trials} trials, {survived} survived{'; ' + more if more else ''}")
+
+
+def sound(board: parts.Board, tap: Tap | None, slack: int) -> bool:
+    """Whether the trial was survived."""
+    machine = board.machine
+    well = not (machine.violations or machine.faults or machine.resets)
+    if not well:
+        print(machine.violations[:3], machine.faults[:3], machine.resets[:3])
+    if tap is not None:
+        wrong, misplaced = tap.wrong(), tap.misplaced(slack)
+        if wrong or misplaced or not tap.pushed:
+            print(f"wrong {wrong}, misplaced {misplaced} of {len(tap.pushed)}")
+            return False
+    return well
+
+
+def test_sensor_unplugged_and_back() -> None:
+    """The time away is counted by the module's clock: within a sample a gap."""
+    trials, survived = 4 * MANY, 0
+    for trial in range(trials):
+        rng = random.Random(trial)
+        board = Board(image(*QUIET), seed=trial)
+        tap = Tap(board)
+        board.sensor.floating_high = bool(trial & 1)
+        board.sensor.clock_error = rng.uniform(-0.002, 0.002)
+        board.run(1.5 + rng.random())
+        before = len(tap.pushed)
+        board.sensor.plug(False)
+        board.run(0.9 + rng.random())
+        told = status(board)
+        assert told["sensor_state"] in (STARTING, FAILED)
+        assert told["sensor_fault"] in (SILENT, ABSENT)
+        while_away = len(tap.pushed)
+        board.sensor.plug(True)
+        board.run(4.0)
+        assert while_away - before <= 1, "samples came from a sensor that is not there"
+        assert len(tap.pushed) > while_away + 100, "it did not come back"
+        assert status(board)["sensor_state"] == RUNNING
+        # the sensor's count stops while it has no supply: from the gap on by time
+        survived += sound(board, None, 0) and tap.wrong() == 0
+        board.close()
+    tell("sensor unplugged and back", trials, survived)
+    assert survived == trials
+
+
+FAULTS: dict[str, tuple[int, Callable[[parts.Adis16405, bool], None]]] = {
+    "silent": (SILENT, lambda sensor, on: setattr(sensor, "silent", on)),
+    "dead": (ABSENT, lambda sensor, on: setattr(sensor, "dead", on)),
+    "stuck": (STUCK, lambda sensor, on: setattr(sensor, "frozen", on)),
+    "no new data": (
+        NO_DATA,
+        lambda sensor, on: setattr(sensor, "stale", (lambda k: True) if on else (lambda k: False)),
+    ),
+    "supply low": (STATUS, lambda sensor, on: setattr(sensor, "trouble", 1 if on else 0)),
+    "flash checksum": (STATUS, lambda sensor, on: setattr(sensor, "trouble", 0x40 if on else 0)),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_sensor_fails_and_heals(name: str) -> None:
+    """Each fault is told by its code, gives no sample, and ends when it ends; the gap has the right length."""
+    code, inflict = FAULTS[name]
+    board = Board(image(*QUIET), seed=11)
+    tap = Tap(board)
+    board.run(1.5)
+    first = len(tap.pushed)
+    assert first > 50
+    inflict(board.sensor, True)
+    seen: set[int] = set()
+    for _ in range(4):
+        board.run(1.0)
+        seen.add(int(status(board)["sensor_fault"]))
+    assert code in seen, f"{name}: told {seen}"
+    assert status(board)["sensor_fault_count"] >= 1
+    during = len(tap.pushed)
+    assert during - first <= 3
+    inflict(board.sensor, False)
+    board.run(5.0)
+    assert len(tap.pushed) > during + 50
+    assert status(board)["sensor_state"] == RUNNING
+    assert sound(board, None, 0)
+    assert tap.wrong() == 0
+    tell(f"sensor {name}", 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "code"), [("wrong product", ABSENT), ("self-test fails", SELF_TEST), ("absent", ABSENT)]
+)
+def test_sensor_bad_from_the_start(name: str, code: int) -> None:
+    """A fault is told before the first sample, there is none, and tries come at growing intervals."""
+    board = Board(image(*QUIET), seed=5)
+    tap = Tap(board)
+    if name == "wrong product":
+        board.sensor.product = 16400
+        board.sensor.power_on()
+    elif name == "self-test fails":
+        board.sensor.fail_self_test = 0x0400
+    else:
+        board.sensor.plug(False)
+    board.run(4.0)
+    told = status(board)
+    assert told["sensor_fault"] == code
+    assert 3 <= told["sensor_fault_count"] <= 8  # 0.33 s a start, then 0.1, 0.2, 0.4, 0.8 s
+    assert told["samples"] == 0
+    assert tap.pushed == []
+    assert sound(board, None, 0)
+
+
+@pytest.mark.parametrize("chance", [1e-5, 1e-4, 1e-3])
+def test_spi_bit_flips(chance: float) -> None:
+    """Bits turned over on either wire: no wrong sample is taken. A sample has 2 x 13 words of 16 bits both ways, so
+    that at 1e-3 more than half are lost."""
+    seconds = 8.0 * MANY
+    board = Board(image(*QUIET), seed=int(1 / chance))
+    tap = Tap(board)
+    board.run(1.0)
+    board.spi.flip = chance
+    board.run(seconds)
+    board.spi.flip = 0.0
+    board.run(2.0)
+    told = status(board)
+    lost = told["sensor_damaged_count"] + told["sensor_stale_count"] + told["sensor_alarm_count"]
+    wrong = tap.wrong()
+    tell(
+        f"SPI bit flips at {chance:g}",
+        board.spi.flipped,
+        board.spi.flipped - wrong,
+        f"{len(tap.pushed)} samples taken, {lost:.0f} refused, {wrong} wrong",
+    )
+    assert board.spi.flipped > 0
+    assert wrong == 0
+    # a MOSI bit may make the burst a write or another register: rates and ranges are set anew at the next start
+    assert not board.machine.faults
+    assert not board.machine.resets
+    assert told["sensor_state"] == RUNNING
+
+
+def test_lost_sign_bit() -> None:
+    """The known anomaly at one sample in ten with a negative x rate: none is taken."""
+    board = Board(image(*QUIET), seed=2)
+    tap = Tap(board)
+    board.sensor.lose_sign = lambda k: k % 10 == 0
+    board.run(6.0)
+    struck = sum(
+        index % 10 == 0 and sample[0] < 0 for index, _, sample in board.sensor.taken if index in board.sensor.read_twice
+    )
+    told = status(board)
+    tell("lost sign bit", struck, struck - tap.wrong(), f"{told['sensor_anomaly_count']:.0f} counted")
+    assert struck > 20
+    assert abs(told["sensor_anomaly_count"] - struck) <= 5  # those since the last status
+    assert sound(board, tap, 0)
+
+
+def test_missed_and_stale_samples_become_gaps_in_place() -> None:
+    """Data-ready without new data, and samples whose data-ready is missed, at random: every sample stays in its
+    place."""
+    rng = random.Random(4)
+    board = Board(image(*QUIET), seed=4)
+    tap = Tap(board)
+    stale = {k for k in range(5000) if rng.random() < 0.05}
+    board.sensor.stale = lambda k: k in stale
+    board.dma2.hang = 3
+    board.run(8.0)
+    told = status(board)
+    assert told["sensor_stale_count"] > 20
+    assert told["missing"] > 20
+    assert sound(board, tap, 0)
+    assert sum(tap.skips) == tap.place + 1 - len(tap.pushed)
+
+
+def test_bursts_that_never_end() -> None:
+    """DMA that stops in mid-burst, with chip select low: for a moment, and for long enough to be a fault. The sensor is
+    reached again, and whatever was under way is no sample."""
+    board = Board(image(*QUIET), seed=15)
+    tap = Tap(board)
+    board.run(1.5)
+    board.dma2.hang = 1
+    board.run(0.5)
+    assert status(board)["sensor_fault_count"] == 0
+    board.dma2.hang = 20
+    board.run(5.0)
+    told = status(board)
+    assert board.dma2.hang == 0
+    assert told["sensor_fault"] == NO_DATA
+    assert told["sensor_state"] == RUNNING
+    assert sound(board, None, 0)
+    assert tap.wrong() == 0
+
+
+def test_gap_of_a_minute_and_clock_error() -> None:
+    """60 s without data-ready, from a sensor whose clock is 2 % fast: the gap is counted in its samples, whose period
+    the driver has tracked, to one part in a thousand."""
+    board = Board(image(*QUIET), seed=6)
+    tap = Tap(board)
+    board.sensor.clock_error = -0.02
+    board.run(4.0)
+    board.sensor.silent = True
+    board.run(60.0)
+    board.sensor.silent = False
+    board.run(12.0)
+    gap = max(tap.skips)
+    true = 60.0 * 102.4 / 0.98
+    tell("60 s gap", 1, 1, f"{gap} samples counted, {true:.0f} and the retry's delay true")
+    assert sound(board, None, 0)
+    assert true * 0.999 < gap < (true + 11.0 * 102.4 / 0.98) * 1.001  # a retry may be 10 s away
+
+
+def test_saturation() -> None:
+    """Beyond the range readings are kept out by the library, counted, and time goes on."""
+    board = Board(image(*QUIET), seed=8)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0], 6100, *rest(k)[2:]) if 250 <= k < 300 else rest(k)
+    tap = Tap(board)
+    board.run(6.0)
+    told = status(board)
+    assert told["saturated_count"] == 50
+    assert sound(board, tap, 0)
+
+
+def test_bus_off_and_back() -> None:
+    """A bus with errors on every frame: bus-off, recovery by itself, frames again, samples never touched."""
+    trials, survived = 3 * MANY, 0
+    for trial in range(trials):
+        board = Board(image(*QUIET), seed=trial)
+        tap = Tap(board)
+        board.run(1.6)
+        board.can.fault = lambda frame: True
+        board.run(0.5 + 0.3 * random.Random(trial).random())
+        offs = board.can.bus_offs
+        board.can.fault = lambda frame: False
+        heard = len(board.frames)
+        board.run(2.0)
+        told = status(board)
+        assert offs > 0
+        assert len(board.frames) > heard + 60
+        assert told["bus_off_count"] == board.can.bus_offs
+        decoder, _ = reports(messages(board))
+        assert decoder.statistics.damaged == decoder.statistics.refused == 0
+        survived += sound(board, tap, 0) and told["missing"] == 0
+    tell("bus-off", trials, survived)
+    assert survived == trials
+
+
+def test_nobody_on_the_bus() -> None:
+    """Without acknowledgement the frames are dropped and counted, nothing waits; when somebody comes they arrive."""
+    board = Board(image(*QUIET), seed=9)
+    board.can.bus_bit_s = 0.0
+    tap = Tap(board)
+    board.run(4.0)
+    assert board.frames == []
+    board.can.bus_bit_s = 500_000.0
+    board.run(3.0)
+    told = status(board)
+    assert told["frames_dropped"] > 30
+    assert told["missing"] == 0
+    assert sound(board, tap, 0)
+    decoder, _ = reports(messages(board))
+    assert decoder.statistics.damaged == 0
+
+
+def test_random_serial_lines() -> None:
+    """Random, truncated and overlong SLCAN lines: each is answered or ignored, the channel still opens, frames are
+    whole."""
+    lines = 1000 * MANY
+    rng = random.Random(12)
+    board = Board(image(*SERIAL), seed=12)
+    board.usart.host_baud = 1e6
+    tap = Tap(board)
+    sent = 0
+    while sent < lines:
+        junk = bytearray()
+        for _ in range(100):
+            kind = rng.randrange(4)
+            if kind == 0:
+                junk += rng.randbytes(rng.randrange(12)) + b"\r"
+            elif kind == 1:
+                junk += bytes(rng.choice(b"CLOSVNvtTrRmMWF0123456789abcdef") for _ in range(rng.randrange(40))) + b"\r"
+            elif kind == 2:
+                junk += b"t2018" + bytes(rng.choice(b"0123456789ABCDEF") for _ in range(rng.randrange(16)))  # cut short
+            else:
+                junk += rng.choice((b"\r", b"C\r", b"S6\r", b"O\r", b"V\r", b"t1230\r", b"T000001230\r"))
+            sent += 1
+        board.usart.say(bytes(junk))
+        board.run(len(junk) * 1e-5 + 0.01)
+    board.usart.say(b"\rC\rS6\r\rO\r")
+    board.run(0.3)
+    board.text.clear()
+    board.run(1.2)
+    frames = [line for line in bytes(board.text).split(b"\r") if line.startswith(b"t200")]
+    assert len(frames) >= 34
+    assert all(len(line) == 21 for line in frames[1:-1])
+    survived = sound(board, tap, 0)
+    tell("random serial lines", sent, sent if survived else 0)
+    assert survived
+
+
+def test_watchdog_and_faults_are_told() -> None:
+    """A main loop that is not healthy is reset by the watchdog within 9 s; a jump into nothing by the fault handler,
+    with its address; either is told as the reset cause."""
+    board = Board(image(*QUIET), seed=13)
+    board.run(1.0)
+    address, _ = parts.place(board.elf, "app.corrupt")
+    board.machine.uc.mem_write(address, b"\x01")
+    board.run(9.5)
+    assert [cause for _, cause in board.machine.resets] == ["watchdog"]
+    assert status(board)["reset_cause"] == 4
+    board.run(0.2)
+    board.machine.uc.reg_write(parts.arm.UC_ARM_REG_PC, 0x60000001)
+    board.machine._asleep = False
+    board.run(1.5)
+    told = status(board)
+    assert [cause for _, cause in board.machine.resets] == ["watchdog", "software"]
+    assert told["reset_cause"] == 5
+    assert told["fault_address"] == 0x60000000
+    assert told["samples"] > 0
+    tell("watchdog, fault", 2, 2)
+
+
+@pytest.mark.parametrize("broken", ["crystal", "pll"])
+def test_clock_falls_back(broken: str) -> None:
+    """Without the crystal the internal oscillator serves, without the PLL at 16 MHz; telemetry still has the right bit
+    rate."""
+    board = Board(image(*QUIET), seed=14, clock_broken=broken)
+    tap = Tap(board)
+    board.run(2.5)
+    assert status(board)["clock"] == 2
+    assert board.machine.hclk_mhz == (168.0 if broken == "crystal" else 16.0)
+    assert sound(board, tap, 0)
+
+
+# ---------------------------------------------------------------------------------------------------------- saved state
+
+SAVING = ("saving", "-DBOARD_REPORT_MS=500 -DBOARD_SAVE_PERIOD_S=2U", True)
+NEWEST, OLDER, REFUSED = 1, 2, 3
+SLOTS = 0x080C0000
+
+
+def found(board: parts.Board) -> tuple[int, int, int]:
+    """After a start: what was found, why one was refused, samples in the bank."""
+    board.run(0.05)
+    return (
+        board.value("app.told.state_found"),
+        board.value("app.told.state_refused"),
+        board.value("app.bank.counters.samples"),
+    )
+
+
+def two_saves() -> tuple[parts.Board, bytes, int, int, int]:
+    """A board after two saves; what the flash held after the first, with the samples of either, and the first operation
+    of the second."""
+    board = Board(image(*SAVING), seed=21)
+    board.run(2.5)
+    while board.value("app.told.state_saves") < 1:
+        board.run(0.1)
+    first = board.retained()
+    samples = [board.value("app.bank.counters.samples")]
+    operations = board.flash.operations
+    board.flash.keep_history = True
+    while board.value("app.told.state_saves") < 2:
+        before = board.value("app.bank.counters.samples")
+        board.run(0.005)
+    samples.append(before)
+    return board, first, samples[0], samples[1], operations
+
+
+def test_power_cut_at_every_flash_operation_of_a_save() -> None:
+    """A start after a cut anywhere in a save finds the state before it whole, or, once the header is complete, the new
+    one. Short run: the erase, the header, both ends of the payload and some between; SELFCAL_CAMPAIGN=2 or more: every
+    operation."""
+    board, flash, _, _, start = two_saves()
+    history = board.flash.history
+    total = len(history)
+    assert total > 5000
+    after = flash
+    truth: list[tuple[int, int, int]] = []
+    for content in (flash, board.retained()):
+        board.power_cycle(content)
+        truth.append(found(board))
+        assert truth[-1][:2] == (NEWEST, 0)
+    assert truth[0][2] < truth[1][2]
+    rng = random.Random(7)
+    some = {0, 1, 2, 3, *range(total - 12, total), *(rng.randrange(total) for _ in range(20))}
+    chosen = range(total) if MANY > 1 else sorted(some)
+    content = bytearray(after)
+    done = trials = survived = 0
+    for k in chosen:
+        for address, _, new in history[done:k]:
+            content[address - SLOTS : address - SLOTS + len(new)] = new
+        done = k
+        address, old, new = history[k]
+        cut = half_erased(old, rng) if k == 0 else half_programmed(old, new, rng)
+        broken = bytearray(content)
+        broken[address - SLOTS : address - SLOTS + len(new)] = cut
+        board.power_cycle(bytes(broken))
+        got = found(board)
+        trials += 1
+        survived += got == truth[0] or (got == truth[1] and k == total - 1 and cut == new)
+    tell("power cut in a save", trials, survived, f"{total} operations in a save, the first being number {start}")
+    assert survived == trials
+
+
+def test_power_cut_while_running() -> None:
+    """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves
+    again."""
+    for k in (0, 3, 500):
+        board, _, _, _, _ = two_saves()
+        third = board.flash.operations + k
+        board.flash.cut_at = third
+        board.run(4.0)
+        assert board.machine.stopped == "power cut"
+        board.power_cycle()
+        outcome, refused, samples = found(board)
+        assert (outcome, refused) == (NEWEST, 0)
+        assert samples > 0
+        board.run(4.5)
+        assert board.value("app.told.state_saves") >= 1
+        assert board.machine.violations == board.machine.faults == []
+
+
+def test_damaged_and_foreign_states_are_refused_and_told() -> None:
+    """A flipped bit in the newest: the older one is taken, and the next save overwrites the damaged one. In both: none
+    is taken. Of another model: refused as foreign."""
+    board, first, _, _, _ = two_saves()
+    flash = bytearray(board.retained())
+    newest = 0x20000 if first[0x20000] == 0xFF else 0
+    flash[newest + 5000] ^= 4
+    board.power_cycle(bytes(flash))
+    outcome, refused, _ = found(board)
+    assert (outcome, refused) == (OLDER, 7)
+    erased = list(board.flash.erases)
+    board.run(4.0)
+    assert board.flash.erases[10 + newest // 0x20000] == erased[10 + newest // 0x20000] + 1
+    flash[0x20000 - newest + 5000] ^= 4
+    board.power_cycle(bytes(flash))
+    assert found(board) == (REFUSED, 7, 0)
+    board.run(1.0)
+    assert status(board)["state_found"] == REFUSED
+    other = Board(image("other", SAVING[1], True, 0.02), seed=22, retained=first)
+    assert found(other) == (REFUSED, 8, 0)
+
+
+def test_flash_that_refuses_is_told_and_loses_nothing() -> None:
+    """An operation that the flash refuses voids the save: counted, and what was saved before stands."""
+    board, _, _, _, _ = two_saves()
+    board.flash.fail_at = board.flash.operations + 100
+    board.run(5.0)
+    assert board.value("app.told.state_save_failures") == 1
+    assert board.value("sensor.state") == 1
+    assert not board.machine.resets
+    kept = board.retained()
+    board.power_cycle(kept)
+    assert found(board)[:2] == (NEWEST, 0)
