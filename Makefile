@@ -6,6 +6,8 @@
 #   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n]   random calls of the library under sanitizers, 10^7 executions
+#   make firmware [ACCEPT=1]    build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above a target's budget
+#   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
@@ -135,34 +137,63 @@ $(FUZZ)/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
 	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all \
 	    $(filter %.c,$^) -lm -o $@
 
+# ----------------------------------------------------------------------------------------------------------- firmware
+
+.PHONY: firmware firmware-images flash
+FIRMWARE := stm32f405 cortex-m0
+CORE_stm32f405 := cortex-m4f
+CORE_cortex-m0 := cortex-m0
+
+firmware: setup firmware-images $(if $(ACCEPT),bench-images)
+	@$(BIN)/python tests/bench/image_sizes.py $(FIRMWARE)
+	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
+
+define FIRMWARE_IMAGE
+.PHONY: image-$(1)
+firmware-images: image-$(1)
+image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
+	@$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
+$(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
+endef
+$(foreach target,$(FIRMWARE),$(eval $(call FIRMWARE_IMAGE,$(target))))
+
+flash: setup
+	@tools/setup/flash.sh "$(TARGET)" $(FIRMWARE)
+
 # -------------------------------------------------------------------------------------------------------------- bench
 
 .PHONY: bench bench-counts bench-images
 BENCH := $(BUILD)/bench
-BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
-BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
+BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
+BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
 MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
 MAP_cortex-m0-32bit := $(MAP_cortex-m0)
 
-bench: setup bench-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
+bench: setup bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
 
 # What is exact, alone.
-bench-counts: bench-images
+bench-counts: bench-images firmware-images
 	@$(BIN)/python tests/bench/bench.py
 
 define BENCH_IMAGE
-bench-images: $(BENCH)/$(1)/image.elf
+bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
-$(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1)/selfcal_model.c
+$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c
 	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
 	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
-	    -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
-	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@D)/image.map,--defsym=$(MAP_$(1)) \
-	    $$(@D)/objects/*.o -lm -o $$@
+	    -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
+	@touch $$@
+# Either main: the library's in bench.c, the application's in module.c.
+$(BENCH)/$(1)/image.elf: LEFT_OUT := module app
+$(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float
+$(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
+	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
+	    $$(addprefix $$(@D)/objects/,$$(addsuffix .o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model))) -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
 # The same without the assembly, and by 32-bit products instead of 16-bit ones.
@@ -234,7 +265,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

@@ -194,7 +194,9 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
     if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    (void)selfcal_bank_run(self, self->push_nodes);
+    if ((self->position & self->push_mask) == 0U) {
+        (void)selfcal_bank_run(self, self->push_nodes);
+    }
     const uint8_t axes = self->model->axes;
     const uint32_t live = ((1U << axes) - 1U) & ~self->retired;
     const uint32_t bad = faults(self, sample) & live;

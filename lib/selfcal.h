@@ -80,6 +80,15 @@ extern "C" {
 #error "SELFCAL_PUSH_NODES must be 1 to 65535"
 #endif
 
+/* Pushes from one such step to the next at most; fewer if the batches would come faster than that. For cores on which a node's batch
+ * takes longer than a sample. */
+#ifndef SELFCAL_PUSH_EVERY
+#define SELFCAL_PUSH_EVERY 1
+#endif
+#if SELFCAL_PUSH_EVERY < 1 || SELFCAL_PUSH_EVERY > 256 || (SELFCAL_PUSH_EVERY & (SELFCAL_PUSH_EVERY - 1)) != 0
+#error "SELFCAL_PUSH_EVERY must be a power of two up to 256"
+#endif
+
 /* Cells a dimension that a report integrates over. */
 #ifndef SELFCAL_REPORT_CELLS
 #define SELFCAL_REPORT_CELLS 48
@@ -363,6 +372,7 @@ typedef struct {
     uint8_t gathering;    /* which of them is gathered */
     uint16_t ran;         /* nodes that have run over the other */
     uint16_t push_nodes;  /* to run at a push */
+    uint16_t push_mask;   /* ... whose number within the block has none of these bits */
     uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
     uint32_t batches;     /* that the nodes have begun with */
 #ifdef SELFCAL_FIXED
