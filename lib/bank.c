@@ -225,8 +225,6 @@ void selfcal_bank_pace(selfcal_t *self, uint32_t block) {
     const uint64_t needed = (2U * (uint64_t)self->model->nodes + pushes - 1U) / pushes;
     self->block = block;
     self->push_nodes = (uint16_t)(needed > SELFCAL_PUSH_NODES ? needed : SELFCAL_PUSH_NODES);
-    const bool slow = pushes >= 2U * SELFCAL_PUSH_EVERY * (uint64_t)self->model->nodes && block >= SELFCAL_PUSH_EVERY;
-    self->push_mask = slow ? SELFCAL_PUSH_EVERY - 1U : 0U;
 }
 
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size) {

@@ -372,7 +372,6 @@ typedef struct {
     uint8_t gathering;    /* which of them is gathered */
     uint16_t ran;         /* nodes that have run over the other */
     uint16_t push_nodes;  /* to run at a push */
-    uint16_t push_mask;   /* ... whose number within the block has none of these bits */
     uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
     uint32_t batches;     /* that the nodes have begun with */
 #ifdef SELFCAL_FIXED
