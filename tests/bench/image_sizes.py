@@ -154,7 +154,9 @@ class Image:
             file = ELFFile(stream)
             self.sections = {s.name: s["sh_size"] for s in file.iter_sections() if s["sh_flags"] & 2}
             tables = [section for section in file.iter_sections() if isinstance(section, SymbolTableSection)]
-            self.symbols = {s.name: (s["st_value"], s["st_size"]) for table in tables for s in table.iter_symbols()}
+            symbols = [symbol for table in tables for symbol in table.iter_symbols()]
+            self.symbols = {s.name: (s["st_value"], s["st_size"]) for s in symbols}
+            self.objects = {s.name for s in symbols if s["st_info"]["type"] == "STT_OBJECT"}
             self._bytes = [(s["p_paddr"], s.data()) for s in file.iter_segments() if s["p_type"] == "PT_LOAD"]
             for unit in file.get_dwarf_info().iter_CUs():
                 source = Path(unit.get_top_DIE().attributes["DW_AT_name"].value.decode()).name
@@ -178,8 +180,9 @@ class Image:
 
     def functions_in(self, name: str) -> set[int]:
         """Addresses of the functions that a const object points to, or that of a function itself."""
-        here = {address for address, function in self.functions.items() if function.name == name}
-        return here or {word & ~1 for word in self.words(name) if word & 1 and word & ~1 in self.functions}
+        if name not in self.objects:
+            return {address for address, function in self.functions.items() if function.name == name}
+        return {word & ~1 for word in self.words(name) if word & 1 and word & ~1 in self.functions}
 
     def flash(self) -> int:
         """Bytes of flash: code, constants, first values of variables."""
