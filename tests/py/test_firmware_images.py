@@ -68,6 +68,19 @@ def test_a_stack_counted_by_hand(core: str, tmp_path: Path) -> None:
     assert [step.split()[0] for step in path.split(" > ")] == ["start", "deep", "leaf"]
 
 
+def test_a_call_through_a_table(tmp_path: Path) -> None:
+    """The deepest function of the table that the caller's file is said to use."""
+    source = (
+        "void low(void); void low(void) { sink = 1; }\n"
+        "void deep(void); void deep(void) { volatile int room[100]; room[0] = 1; sink = room[0]; }\n"
+        "extern void (*const table[2])(void); void (*const table[2])(void) = {low, deep};\n"
+        "void start(void) { table[sink & 1](); sink = 2; }\n"
+    )
+    size, path = link(tmp_path, START + source + VECTORS).stack({"small.c": ["table"]})
+    assert 408 <= size <= 432
+    assert [step.split()[0] for step in path.split(" > ")] == ["start", "deep"]
+
+
 @pytest.mark.parametrize(
     ("source", "complaint"),
     [
