@@ -6,6 +6,8 @@
 #   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n]   random calls of the library under sanitizers, 10^7 executions
+#   make firmware [ACCEPT=1]    build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above a target's budget
+#   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
@@ -74,6 +76,8 @@ TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
+# The integer kernels: the formats by a test of their own, the rest as the bank in float.
+TESTS_FIXED := $(foreach test,fixed bank snapshot,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -87,12 +91,15 @@ emulate: setup
 campaigns: setup
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py
 
-c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED)
+c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 
 # One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
 # The sanitizers' own code draws warnings, so those are left to the plain variant.
 $(BUILD)/c/plain/%: C := -O2 $(WARNINGS)
-$(BUILD)/c/sanitized/%: C := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+SANITIZED := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+$(BUILD)/c/sanitized/%: C := $(SANITIZED)
+$(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
+$(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
@@ -101,9 +108,13 @@ $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
 $(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a
 	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
+$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))
+$(eval $(call C_TESTS,fixed16))
+$(eval $(call C_TESTS,fixed32))
 
 # --------------------------------------------------------------------------------------------------------------- fuzz
 
@@ -126,35 +137,69 @@ $(FUZZ)/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
 	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all \
 	    $(filter %.c,$^) -lm -o $@
 
+# ----------------------------------------------------------------------------------------------------------- firmware
+
+.PHONY: firmware firmware-images flash
+FIRMWARE := stm32f405 cortex-m0
+CORE_stm32f405 := cortex-m4f
+CORE_cortex-m0 := cortex-m0
+
+firmware: setup firmware-images $(if $(ACCEPT),bench-images)
+	@$(BIN)/python tests/bench/image_sizes.py $(FIRMWARE)
+	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
+
+define FIRMWARE_IMAGE
+.PHONY: image-$(1)
+firmware-images: image-$(1)
+image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
+	@$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
+$(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
+endef
+$(foreach target,$(FIRMWARE),$(eval $(call FIRMWARE_IMAGE,$(target))))
+
+flash: setup
+	@tools/setup/flash.sh "$(TARGET)" $(FIRMWARE)
+
 # -------------------------------------------------------------------------------------------------------------- bench
 
 .PHONY: bench bench-counts bench-images
 BENCH := $(BUILD)/bench
-BENCH_C := $(wildcard lib/*.c tests/bench/*.c)
-BENCH_H := $(wildcard lib/*.h tests/bench/*.h)
+BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
+BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
+MAP_cortex-m0-32bit := $(MAP_cortex-m0)
 
-bench: setup bench-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
+bench: setup bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
 
 # What is exact, alone.
-bench-counts: bench-images
+bench-counts: bench-images firmware-images
 	@$(BIN)/python tests/bench/bench.py
 
 define BENCH_IMAGE
-bench-images: $(BENCH)/$(1)/image.elf
+bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1)
-$(BENCH)/$(1)/image.elf: $(BENCH_C) $(BENCH_H) tests/bench/image.ld $(BENCH)/$(1)/selfcal_model.c
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
+$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c
 	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
 	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
-	    -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
-	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@D)/image.map,--defsym=$(MAP_$(1)) \
-	    $$(@D)/objects/*.o -lm -o $$@
+	    -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
+	@touch $$@
+# Either main: the library's in bench.c, the application's in module.c.
+$(BENCH)/$(1)/image.elf: LEFT_OUT := module app
+$(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float
+$(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
+	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
+	    $$(addprefix $$(@D)/objects/,$$(addsuffix .o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model))) -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
+# The same without the assembly, and by 32-bit products instead of 16-bit ones.
+$(eval $(call BENCH_IMAGE,cortex-m4f-portable))
 $(eval $(call BENCH_IMAGE,cortex-m0))
+$(eval $(call BENCH_IMAGE,cortex-m0-32bit))
 
 $(BENCH)/host/O2/bench: HOST := -O2
 $(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma
@@ -190,6 +235,8 @@ EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
 check-arm: $(MODEL)/selfcal_model.c
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES) -DQEMU_MICROBIT -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m0))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 
 check-c++:
 	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
@@ -201,6 +248,7 @@ TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 check-tidy: $(MODEL)/selfcal_model.c
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
+	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
 
@@ -217,7 +265,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

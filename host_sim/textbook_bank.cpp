@@ -11,45 +11,87 @@ namespace {
 
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr double ln_2pi = 1.8378770664093454836;
+constexpr double pi = 3.14159265358979323846;
+
+// x_i as a linear system: state' = transition state + noise of covariance `step`, `start` that of the state at the instant
+// before the first sample, `output` what of it is read, `level` what of that is drift.
+struct Drift {
+    Eigen::MatrixXd transition, step, start;
+    Eigen::RowVectorXd output, level;
+    double white; // variance of the white noise beside it
+};
+
+Drift drift_of(const Node &node, double dt_s) {
+    const auto n = static_cast<Eigen::Index>(order(node.law));
+    Drift drift;
+    drift.transition = Eigen::MatrixXd::Identity(n, n);
+    drift.step = drift.start = Eigen::MatrixXd::Zero(n, n);
+    drift.output = drift.level = Eigen::RowVectorXd::Ones(n);
+    drift.white = node.sigma_v * node.sigma_v;
+    const auto random_walk = [&](Eigen::Index i, double density) { drift.step(i, i) = density * density * dt_s; }; // (23), x_0 = 0
+    const auto gauss_markov = [&](Eigen::Index i, double deviation, double alpha) { // stationary from the start
+        drift.transition(i, i) = std::exp(-alpha * dt_s);
+        drift.start(i, i) = deviation * deviation;
+        drift.step(i, i) = -deviation * deviation * std::expm1(-2.0 * alpha * dt_s);
+    };
+    switch (node.law) {
+    case Law::constant:
+        break;
+    case Law::random_walk:
+        random_walk(0, node.drift);
+        break;
+    case Law::gauss_markov:
+        gauss_markov(0, node.drift, node.alpha);
+        break;
+    case Law::flicker:
+        for (Eigen::Index i = 0; i < n; ++i) {
+            gauss_markov(i, node.drift * std::sqrt(std::log(10.0) / pi), node.alpha * std::pow(10.0, static_cast<double>(i - 1)));
+        }
+        break;
+    case Law::moving_average:
+        drift.transition << 0.0, 0.0, 1.0, 0.0;
+        drift.step(0, 0) = drift.start(0, 0) = drift.white;
+        drift.output << 1.0, node.drift;
+        drift.level.setZero();
+        drift.white = 0.0;
+        break;
+    case Law::walk_and_markov:
+        gauss_markov(0, node.drift, node.alpha);
+        random_walk(1, node.walk);
+        break;
+    }
+    return drift;
+}
 
 // Model (1), (2) at one node, and the Kalman filter over it. `size` is that of the state [drift; x0; c].
 template <int size> class Filter {
-    static constexpr int most = size == Eigen::Dynamic ? static_cast<int>(2 + regressors_max) : size;
+    static constexpr int most = size == Eigen::Dynamic ? static_cast<int>(order_max + 1 + regressors_max) : size;
     using Vector = Eigen::Matrix<double, size, 1, 0, most, 1>;
     using Row = Eigen::Matrix<double, 1, size, Eigen::RowMajor, 1, most>;
     using Square = Eigen::Matrix<double, size, size, 0, most, most>;
 
   public:
-    Filter(const Record &record, const Node &node) : record_(record), r_(node.sigma_v * node.sigma_v) {
-        double phi = 1.0;
-        double drift_variance = 0.0; // at the instant before the first sample
-        double step_variance = 0.0;
-        switch (node.law) {
-        case Law::constant:
-            break;
-        case Law::random_walk: // (23), x_0 = 0
-            step_variance = node.drift * node.drift * record.dt_s;
-            break;
-        case Law::gauss_markov: // stationary from the start
-            phi = std::exp(-node.alpha * record.dt_s);
-            drift_variance = node.drift * node.drift;
-            step_variance = -drift_variance * std::expm1(-2.0 * node.alpha * record.dt_s);
-            break;
-        }
-        const auto n = static_cast<Eigen::Index>(2 + record.regressors);
+    Filter(const Record &record, const Node &node) : record_(record) {
+        const Drift drift = drift_of(node, record.dt_s);
+        const Eigen::Index bias = drift.output.size();
+        const Eigen::Index n = bias + 1 + static_cast<Eigen::Index>(record.regressors);
+        r_ = drift.white;
         transition_ = Square::Identity(n, n);
-        transition_(0, 0) = phi;
+        transition_.topLeftCorner(bias, bias) = drift.transition;
         step_ = Square::Zero(n, n);
-        step_(0, 0) = step_variance;
+        step_.topLeftCorner(bias, bias) = drift.step;
         mean_ = Vector::Zero(n);
-        mean_(1) = record.bias_mean;
+        mean_(bias) = record.bias_mean;
         covariance_ = Square::Zero(n, n);
-        covariance_(0, 0) = drift_variance;
-        covariance_(1, 1) = record.bias_sd * record.bias_sd;
+        covariance_.topLeftCorner(bias, bias) = drift.start;
+        covariance_(bias, bias) = record.bias_sd * record.bias_sd;
         h_ = Row::Zero(n);
-        h_(0) = h_(1) = 1.0;
+        h_.head(bias) = drift.output;
+        h_(bias) = 1.0;
+        now_ = h_;
+        now_.head(bias) = drift.level;
         for (std::size_t k = 0; k < record.regressors; ++k) {
-            const auto at = static_cast<Eigen::Index>(2 + k);
+            const Eigen::Index at = bias + 1 + static_cast<Eigen::Index>(k);
             covariance_(at, at) = record.coefficient_sd[k] * record.coefficient_sd[k];
         }
     }
@@ -60,13 +102,15 @@ template <int size> class Filter {
         if (std::isnan(record_.y[i])) {
             return nan;
         }
+        const Eigen::Index first = h_.size() - static_cast<Eigen::Index>(record_.regressors);
         for (std::size_t k = 0; k < record_.regressors; ++k) {
-            h_(static_cast<Eigen::Index>(2 + k)) = record_.z[i * record_.regressors + k];
+            const Eigen::Index at = first + static_cast<Eigen::Index>(k);
+            h_(at) = now_(at) = record_.z[i * record_.regressors + k];
         }
         return update(record_.y[i], record_.r == nullptr ? 1.0 : record_.r[i]);
     }
 
-    Filtered state() const { return {ln_p_, mean_, covariance_, h_ * mean_, h_ * covariance_ * h_.transpose()}; }
+    Filtered state() const { return {ln_p_, mean_, covariance_, now_ * mean_, now_ * covariance_ * now_.transpose()}; }
 
   private:
     void predict() {
@@ -92,12 +136,12 @@ template <int size> class Filter {
     double ln_p_ = 0.0;
     Square transition_, step_, covariance_;
     Vector mean_;
-    Row h_; // of the last sample
+    Row h_, now_; // of the last sample: what is read, and the part of it that is not noise
 };
 
 // Calls use(filter), with the state's size known to the compiler where nothing is added to the paper's.
 template <typename Use> void with_filter(const Record &record, const Node &node, const Use &use) {
-    if (record.regressors == 0) {
+    if (record.regressors == 0 && order(node.law) == 1) {
         Filter<2> filter(record, node);
         use(filter);
     } else {
@@ -155,6 +199,18 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
 }
 
 } // namespace
+
+std::size_t order(Law law) {
+    switch (law) {
+    case Law::flicker:
+        return 3;
+    case Law::moving_average:
+    case Law::walk_and_markov:
+        return 2;
+    default:
+        return 1;
+    }
+}
 
 Filtered run_filter(const Record &record, const Node &node, double *standardized) {
     Filtered out;

@@ -19,17 +19,28 @@
 
 namespace selfcal_reference {
 
-enum class Law { constant = 0, random_walk = 1, gauss_markov = 2 };
-constexpr std::size_t laws = 3;
+// The last three are not the paper's, whose filter takes any linear law: x_i then has more than one state.
+//   flicker: three Gauss-Markov terms of one deviation, bandwidths alpha/10, alpha and 10 alpha. With the deviation
+//     B sqrt(ln 10 / pi) their two-sided spectrum is B^2 / (2 pi f) within 12 % for f from alpha/10 to 10 alpha over 2 pi,
+//     2.3 % above it in the middle; the Allan deviation of such noise is 0.664 B (sqrt(2 ln 2 / pi)).
+//   moving_average: white noise e_i + theta e_(i-1), e_i ~ N(0, sigma_v^2), instead of v_i; x_i = 0. Takes no factors r.
+//   walk_and_markov: the sum of the laws 1 and 2.
+enum class Law { constant = 0, random_walk = 1, gauss_markov = 2, flicker = 3, moving_average = 4, walk_and_markov = 5 };
+constexpr std::size_t laws = 6;
+constexpr std::size_t order_max = 3; // states of x_i
 constexpr std::size_t regressors_max = 6;
 
 // One value theta^kj of the parameters of hypothesis k.
 struct Node {
     Law law;
-    double drift;   // random walk: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; constant: not used
-    double alpha;   // Gauss-Markov only, 1/s
+    double drift;   // random walk: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; flicker: B, unit; moving average: theta
+    double alpha;   // Gauss-Markov and flicker, 1/s
     double sigma_v; // unit, per sample
+    double walk = 0.0; // K beside Gauss-Markov, unit/s/sqrt(Hz)
 };
+
+// States of x_i: 1 but for flicker (3), moving average (2: e_i, e_(i-1)) and walk and Markov (2).
+std::size_t order(Law law);
 
 // One axis of a recording. A sample that is NaN is missing: the filter predicts over it.
 struct Record {
@@ -44,11 +55,12 @@ struct Record {
 };
 
 // What a filter knows after its last sample: ln p(Y | h_k, theta_kj), and the state [drift; x0; c] given them.
+// `drift` has order(law) elements.
 struct Filtered {
     double ln_p;
     Eigen::VectorXd mean;
     Eigen::MatrixXd covariance;
-    double now_mean, now_var; // of x0 + x_i + c' z_i, with z of the last sample that is not missing
+    double now_mean, now_var; // of x0 + x_i + c' z_i (a moving average is no part of x_i), with z of the last sample that is not missing
 };
 
 // One filter over the whole record. If `standardized` is not null it receives nu_i / sqrt(s_i) [n], NaN where missing.

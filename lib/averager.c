@@ -186,6 +186,12 @@ static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
     self->watched = 0;
 }
 
+/* Whether this push runs some nodes: every one, or every SELFCAL_PUSH_EVERY-th if that is in time twice over. */
+static bool nodes_are_due(const selfcal_t *self) {
+    return (self->position & (SELFCAL_PUSH_EVERY - 1U)) == 0U || self->block < SELFCAL_PUSH_EVERY ||
+           (uint64_t)self->block * SELFCAL_BATCH < 2U * SELFCAL_PUSH_EVERY * (uint64_t)self->model->nodes;
+}
+
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
     return selfcal_push_with(self, sample, NULL);
 }
@@ -194,7 +200,9 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
     if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    (void)selfcal_bank_run(self, self->push_nodes);
+    if (nodes_are_due(self)) {
+        (void)selfcal_bank_run(self, self->push_nodes);
+    }
     const uint8_t axes = self->model->axes;
     const uint32_t live = ((1U << axes) - 1U) & ~self->retired;
     const uint32_t bad = faults(self, sample) & live;

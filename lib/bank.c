@@ -188,6 +188,9 @@ static void place_nodes(selfcal_t *self) {
     ln_range_t sigma[SELFCAL_AXES_MAX];
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         sigma[axis] = first_ln_sigma(self, axis);
+#ifdef SELFCAL_FIXED
+        selfcal_kernel_start(self, axis, sigma[axis].hi);
+#endif
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
@@ -276,7 +279,7 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         gains->inv_s[i] = inv_s;
         const selfcal_real_t u = node->u_inf + node->e;
         gains->u[i] = u * inv_s;
-        short_of += r_fma(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
+        short_of += r_fma_exact(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
         a = r_fma(u, gains->u[i], a);
         node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
         node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
@@ -318,11 +321,12 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
 }
 
 /* A level node is no longer so. What its constant u added to A comes due. */
-static void leave_level(selfcal_node_t *node) {
+static void leave_level(selfcal_t *self, size_t j) {
+    selfcal_node_t *node = &self->node[j];
     if (node->level) {
-        const selfcal_wide_t a = level_a(node);
-        const selfcal_real_t hi = (selfcal_real_t)a;
-        sum_add(&node->a, hi, (selfcal_real_t)(a - (selfcal_wide_t)hi));
+        selfcal_kernel_unsettle(self, j);
+        const selfcal_sum_t a = make_sum(level_a(node));
+        sum_add(&node->a, a.hi, a.lo);
         node->level = false;
         node->level_from = 0;
     }
@@ -334,7 +338,7 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     void (*const run)(selfcal_t *, size_t, const gains_t *) = regressors != NULL ? regressors->code->run : selfcal_kernel_run;
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
-    for (uint32_t i = span.from; i < span.to; i++) {
+    for (uint32_t i = span.from; i < span.to && batch->part; i++) {
         whole = whole && batch->r[i] == R(1.0);
     }
     if (whole) {
@@ -342,7 +346,8 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     }
     gains_t gains;
     gains.span = span;
-    for (size_t j = from; j < to; j++) {
+    for (size_t i = from; i < to; i++) {
+        const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         if (whole && node->level) {
             node->steady += span.to - span.from;
@@ -355,10 +360,13 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
             if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
                 node->e = R(0.0);
                 node->level = self->columns == NULL;
-                node->level_from = node->level ? node->steady : 0U;
+                if (node->level) {
+                    node->level_from = node->steady;
+                    selfcal_kernel_settle(self, j);
+                }
             }
         } else {
-            leave_level(node);
+            leave_level(self, j);
             gains_varying(batch, node, &gains);
             run(self, j, &gains);
             if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
@@ -371,12 +379,13 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
 /* Predicts nodes over `count` intervals without a sample: exact, whatever the count. */
 static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
-    for (size_t j = from; j < to; j++) {
+    for (size_t i = from; i < to; i++) {
+        const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
-        leave_level(node);
+        leave_level(self, j);
         const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)node->d, e = (selfcal_wide_t)node->e;
         if (node->beta == R(0.0)) {
             node->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);
@@ -395,11 +404,11 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     }
 }
 
-/* The nodes `from` to `to` - 1 over the batch that waits. */
+/* The nodes `from` to `to` - 1, in the kernel's order, over the batch that waits. */
 static void run_batch(selfcal_t *self, uint16_t from, uint16_t to) {
     const selfcal_batch_t *batch = waiting(self);
-    for (uint16_t j = from; self->n == 0U && j < to; j++) {
-        init_node(self, j);
+    for (uint16_t i = from; self->n == 0U && i < to; i++) {
+        init_node(self, (uint16_t)kernel_node(self, i));
     }
     span_t span = {0, 0};
     while (span.from < batch->count) {
@@ -430,6 +439,7 @@ bool selfcal_bank_run(selfcal_t *self, uint16_t nodes) {
     if (to == all) {
         self->n += batch->count;
         batch->count = 0;
+        batch->part = false;
         batch->gap_after = 0;
         self->ran = 0;
     }
@@ -451,6 +461,9 @@ bool selfcal_bank_hand_over(selfcal_t *self) {
     if (self->n == 0U) {
         place_nodes(self);
     }
+#ifdef SELFCAL_FIXED
+    selfcal_kernel_load(self);
+#endif
     return true;
 }
 
@@ -467,6 +480,7 @@ void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real
         batch->y[axis][batch->count] = y[axis];
     }
     batch->r[batch->count] = r;
+    batch->part = batch->part || r != R(1.0);
     batch->gap[batch->count] = self->pending_gap;
     self->pending_gap = 0;
     batch->count++;

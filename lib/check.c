@@ -1,9 +1,13 @@
 /* Invariants of a bank: what every push, skip and report leaves true, whatever came in. */
-#include "internal.h"
+#include "kernel.h"
 
 /* The prices that selfcal.h states. */
-#ifndef SELFCAL_REAL_DOUBLE
+#ifdef SELFCAL_FIXED
+SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 72);
+#elif !defined(SELFCAL_REAL_DOUBLE)
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
+#endif
+#ifndef SELFCAL_REAL_DOUBLE
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
 #endif
 
@@ -89,6 +93,78 @@ static bool averager_is_sound(const selfcal_t *self) {
     return true;
 }
 
+/* What the kernel keeps, see kernel_float.c and kernel_fixed.c. */
+#ifdef SELFCAL_FIXED
+
+#define ROOM ((int64_t)1 << 62)
+
+static bool scales_are_sound(const selfcal_t *self) {
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        const selfcal_scale_t *scale = &self->scale[axis];
+        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_c < 0) {
+            return false;
+        }
+        for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
+            if (self->y_fixed[axis][i] > SELFCAL_FIXED_LIMIT || self->y_fixed[axis][i] < -SELFCAL_FIXED_LIMIT) {
+                return false;
+            }
+        }
+        for (uint32_t i = 0; i <= SELFCAL_BATCH; i++) {
+            if (self->step[axis][i] > 3 * SELFCAL_FIXED_LIMIT || self->step[axis][i] < -3 * SELFCAL_FIXED_LIMIT) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+/* A level node's numbers follow from its gains. */
+static bool kernel_is_sound(const selfcal_t *self, size_t j) {
+    const selfcal_node_t *node = &self->node[j];
+    if (node->level) {
+        selfcal_node_t settled = *node;
+        selfcal_kernel_mantissas(&settled);
+        if (settled.g_mantissa != node->g_mantissa || settled.u_mantissa != node->u_mantissa ||
+            settled.w_mantissa != node->w_mantissa || settled.g_shift != node->g_shift || settled.u_shift != node->u_shift ||
+            settled.w_shift != node->w_shift) {
+            return false;
+        }
+    }
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        if (self->b[k] > ROOM || self->b[k] < -ROOM || self->c[k] < 0 || self->c[k] > ROOM ||
+            self->x[k] > 2 * SELFCAL_FIXED_LIMIT || self->x[k] < -2 * SELFCAL_FIXED_LIMIT) {
+            return false;
+        }
+    }
+    return true;
+}
+
+#else
+
+static bool scales_are_sound(const selfcal_t *self) {
+    (void)self;
+    return true;
+}
+
+static bool kernel_is_sound(const selfcal_t *self, size_t j) {
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+#endif
+
+/* Both or neither: the model's regressors and their sums. */
+static bool regressors_are_sound(const selfcal_t *self) {
+    const selfcal_regressors_t *regressors = self->model->regressors;
+    return (self->columns == NULL) == (regressors == NULL) && (regressors == NULL || regressors->code->sound(self));
+}
+
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
@@ -100,13 +176,7 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
         return false;
     }
-    const size_t axes = self->model->axes;
-    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
-            return false;
-        }
-    }
-    return true;
+    return kernel_is_sound(self, j);
 }
 
 /* The nodes have a place once the first batch has run. */
@@ -126,7 +196,8 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self)) {
+    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
+        !regressors_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     if (self->n > 0U && !grid_is_sound(self)) {

@@ -10,7 +10,7 @@
 /* Arithmetic in selfcal_real_t. The fused multiply-add is written out, so that a host and a target round alike. */
 #ifdef SELFCAL_REAL_DOUBLE
 #define R(x) (x)
-#define r_fma fma
+#define r_fma_exact fma
 #define r_exp exp
 #define r_expm1 expm1
 #define r_log log
@@ -19,13 +19,23 @@
 #define r_fabs fabs
 #else
 #define R(x) (x##F)
-#define r_fma fmaf
+#define r_fma_exact fmaf
 #define r_exp expf
 #define r_expm1 expm1f
 #define r_log logf
 #define r_log1p log1pf
 #define r_sqrt sqrtf
 #define r_fabs fabsf
+#endif
+
+/* r_fma() where one rounding less is welcome, r_fma_exact() where the product's error is the point. In software a fused
+ * multiply-add is ten times a product and a sum. */
+#ifdef SELFCAL_FIXED
+static inline selfcal_real_t r_fma(selfcal_real_t a, selfcal_real_t b, selfcal_real_t c) {
+    return a * b + c;
+}
+#else
+#define r_fma r_fma_exact
 #endif
 
 /* Written out: fminf() and fmaxf() are calls in newlib and were a third of a report. Neither argument may be NaN. */
@@ -77,6 +87,8 @@ struct selfcal_regressors_code {
     bool (*valid)(const selfcal_model_t *model);
     /* In the memory that follows the bank's. */
     void (*init)(selfcal_t *self, unsigned char *memory);
+    /* selfcal_check() of its part. */
+    bool (*sound)(const selfcal_t *self);
     /* A sample's values: whether all are finite (else counted); into the block; the block's means into the batch. */
     bool (*usable)(selfcal_t *self, const float values[]);
     void (*add)(selfcal_t *self, const float values[]);

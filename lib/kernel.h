@@ -19,23 +19,6 @@ struct gains {
     selfcal_sum_t scale;                 /* what the span's sums of nu and nu^2 are still to be multiplied by */
 };
 
-/* The batch that the nodes run over. */
-static inline selfcal_batch_t *waiting(selfcal_t *self) {
-    return &self->batch[1U - self->gathering];
-}
-
-/* Every axis of node `j` through the span. */
-void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains);
-
-/* The same for the level ones of the nodes `from` to `to` - 1: g, u and 1/s are constant. */
-void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
-
-/* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
-void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
-
-/* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
-void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
-
 /* Nodes of a hypothesis: `rows` of rho times `columns` of alpha, which changes fastest. */
 static inline uint16_t grid_rows(const selfcal_hypothesis_t *hypothesis) {
     return hypothesis->rho != NULL ? hypothesis->rho->nodes : 1U;
@@ -44,6 +27,51 @@ static inline uint16_t grid_rows(const selfcal_hypothesis_t *hypothesis) {
 static inline uint16_t grid_columns(const selfcal_hypothesis_t *hypothesis) {
     return hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
 }
+
+/* The order in which a kernel takes the nodes: this is the index of the `i`-th. */
+#ifdef SELFCAL_FIXED
+size_t kernel_node(const selfcal_t *self, size_t i);
+#else
+static inline size_t kernel_node(const selfcal_t *self, size_t i) {
+    (void)self;
+    return i;
+}
+#endif
+
+/* The batch that the nodes run over. */
+static inline selfcal_batch_t *waiting(selfcal_t *self) {
+    return &self->batch[1U - self->gathering];
+}
+
+/* Every axis of node `j` through the span. */
+void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains);
+
+/* The same for the level ones of the nodes `from` to `to` - 1 in the kernel's order: g, u and 1/s are constant. */
+void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
+
+/* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
+void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
+
+#ifdef SELFCAL_FIXED
+/* The nodes have been placed: chooses an axis's step by ln of its white noise per bank sample. */
+void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma);
+
+/* A batch begins. */
+void selfcal_kernel_load(selfcal_t *self);
+
+#endif
+
+/* Node `j` has become level, is about to be no longer so. */
+void selfcal_kernel_settle(selfcal_t *self, size_t j);
+void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
+
+#ifdef SELFCAL_FIXED
+/* g, u/s and 1/s of a level node as the integer kernels take them. */
+void selfcal_kernel_mantissas(selfcal_node_t *node);
+#endif
+
+/* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
+void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
 
 /* ------------------------------------------------------------------------------------------------------- long sums */
 
@@ -56,14 +84,29 @@ static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t
     sum->lo = error - (sum->hi - total);
 }
 
+/* Adds a single number: no lo to add. */
+static inline void sum_add_value(selfcal_sum_t *sum, selfcal_real_t value) {
+    const selfcal_real_t total = sum->hi + value;
+    const selfcal_real_t part = total - sum->hi;
+    const selfcal_real_t error = ((sum->hi - (total - part)) + (value - part)) + sum->lo;
+    sum->hi = total + error;
+    sum->lo = error - (sum->hi - total);
+}
+
 /* Adds scale * value, the product in full. */
 static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfcal_real_t value) {
     const selfcal_real_t product = scale.hi * value;
-    sum_add(sum, product, r_fma(scale.lo, value, r_fma(scale.hi, value, -product)));
+    sum_add(sum, product, r_fma_exact(scale.lo, value, r_fma_exact(scale.hi, value, -product)));
 }
 
 static inline selfcal_wide_t sum_value(selfcal_sum_t sum) {
     return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
+}
+
+static inline selfcal_sum_t make_sum(selfcal_wide_t value) {
+    const selfcal_real_t hi = (selfcal_real_t)value;
+    const selfcal_sum_t sum = {hi, (selfcal_real_t)(value - (selfcal_wide_t)hi)};
+    return sum;
 }
 
 /* ------------------------------------------------------------------------------------------------- converged nodes */
@@ -73,7 +116,7 @@ static inline selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
     const selfcal_real_t s = R(1.0) + node->p_inf;
     const selfcal_real_t s_lo = node->p_inf >= R(1.0) ? R(1.0) - (s - node->p_inf) : node->p_inf - (s - R(1.0));
     const selfcal_real_t inv = R(1.0) / s;
-    const selfcal_sum_t result = {inv, inv * r_fma(-inv, s_lo, r_fma(-inv, s, R(1.0)))};
+    const selfcal_sum_t result = {inv, inv * r_fma_exact(-inv, s_lo, r_fma_exact(-inv, s, R(1.0)))};
     return result;
 }
 

@@ -24,8 +24,13 @@ static size_t columns_of(const selfcal_t *self) {
 /* ------------------------------------------------------------------------------------------------------------ bank */
 
 static bool valid_regressors(const selfcal_model_t *model) {
+#ifdef SELFCAL_FIXED
+    const bool columns = false;
+#else
+    const bool columns = true;
+#endif
     const selfcal_regressors_t *regressors = model->regressors;
-    if (regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
+    if (!columns || regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
         regressors->coefficient_sd == NULL) {
         return false;
     }
@@ -54,9 +59,37 @@ static void init(selfcal_t *self, unsigned char *memory) {
     self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
 }
 
+static bool sound(const selfcal_t *self) {
+    const size_t p = columns_of(self), nodes = self->model->nodes, cells = nodes * self->model->axes;
+    const selfcal_columns_t *columns = self->columns;
+    if (columns->column != (const void *)(columns + 1) || columns->a != (const void *)(columns->column + p) ||
+        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p ||
+        columns->low != (const void *)(columns->x + nodes * (p + 1U))) {
+        return false;
+    }
+    for (const selfcal_sum_t *sum = columns->a; sum < columns->x + nodes * (p + 1U); sum++) {
+        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < cells; k++) {
+        if (!isfinite(columns->low[k])) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < p; k++) {
+        const selfcal_column_t *column = &columns->column[k];
+        if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) || !isfinite(column->offset) ||
+            !isfinite(column->sum)) {
+            return false;
+        }
+    }
+    return true;
+}
+
 static bool usable(selfcal_t *self, const float values[]) {
     for (size_t k = 0; k < columns_of(self); k++) {
-        if (!isfinite(values[k])) {
+        if (!(fabsf(values[k]) < SELFCAL_SAMPLE_MAX)) { /* the bound of averager.c holds for A as well */
             self->counters.regressor_not_finite++;
             return false;
         }
@@ -103,6 +136,18 @@ typedef struct {
     selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
 } innovations_t;
 
+#ifdef SELFCAL_FIXED
+/* The integer kernels know no columns: valid_regressors() lets none in. */
+static void run(selfcal_t *self, size_t j, const gains_t *gains) {
+    (void)self, (void)j, (void)gains;
+    SELFCAL_ASSERT(false);
+}
+
+static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
+    (void)self, (void)j, (void)less;
+    SELFCAL_ASSERT(false);
+}
+#else
 /* a + b = sum + error (Knuth). */
 static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
     const selfcal_real_t sum = a + b, part = sum - a;
@@ -119,11 +164,11 @@ static void add_products(selfcal_sum_t *sum, const gains_t *gains, const innovat
         const selfcal_real_t product = one->weighted[i] * other->nu[i];
         const selfcal_sum_t total = two_sum(value.hi, product);
         value.hi = total.hi;
-        value.lo += r_fma(one->low[i], other->nu[i], r_fma(one->weighted[i], other->nu[i], -product)) + total.lo;
+        value.lo += r_fma_exact(one->low[i], other->nu[i], r_fma_exact(one->weighted[i], other->nu[i], -product)) + total.lo;
     }
     const selfcal_sum_t scale = gains->scale;
     const selfcal_real_t product = scale.hi * value.hi;
-    const selfcal_real_t rest = r_fma(scale.hi, value.lo, r_fma(scale.lo, value.hi, r_fma(scale.hi, value.hi, -product)));
+    const selfcal_real_t rest = r_fma_exact(scale.hi, value.lo, r_fma_exact(scale.lo, value.hi, r_fma_exact(scale.hi, value.hi, -product)));
     sum_add(sum, product, rest);
 }
 
@@ -138,8 +183,8 @@ static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gain
         const selfcal_real_t nu = (value - x.hi) - x.lo;
         out->nu[i] = nu;
         out->weighted[i] = nu * inv_s;
-        out->low[i] = r_fma(nu, inv_s, -out->weighted[i]);
-        x = two_sum(x.hi, r_fma(gains->g[from + i], nu, minus_beta * value) + x.lo);
+        out->low[i] = r_fma_exact(nu, inv_s, -out->weighted[i]);
+        x = two_sum(x.hi, r_fma_exact(gains->g[from + i], nu, minus_beta * value) + x.lo);
     }
     return x;
 }
@@ -188,6 +233,7 @@ static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
         self->columns->low[k] = left.lo;
     }
 }
+#endif
 
 /* -------------------------------------------------------------------------------------------------- normal equations */
 
@@ -455,5 +501,5 @@ static void finish(const selfcal_work_t *work) {
 }
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
-    valid_regressors, init, usable, add, close_block, hand_over, run, gap, field, now, finish,
+    valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, field, now, finish,
 };

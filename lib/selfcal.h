@@ -80,6 +80,15 @@ extern "C" {
 #error "SELFCAL_PUSH_NODES must be 1 to 65535"
 #endif
 
+/* Pushes from one such step to the next at most; fewer if the batches would come faster than that. For cores on which a node's batch
+ * takes longer than a sample. */
+#ifndef SELFCAL_PUSH_EVERY
+#define SELFCAL_PUSH_EVERY 1
+#endif
+#if SELFCAL_PUSH_EVERY < 1 || SELFCAL_PUSH_EVERY > 256 || (SELFCAL_PUSH_EVERY & (SELFCAL_PUSH_EVERY - 1)) != 0
+#error "SELFCAL_PUSH_EVERY must be a power of two up to 256"
+#endif
+
 /* Cells a dimension that a report integrates over. */
 #ifndef SELFCAL_REPORT_CELLS
 #define SELFCAL_REPORT_CELLS 48
@@ -141,9 +150,31 @@ typedef struct {
     selfcal_real_t hi, lo;
 } selfcal_sum_t;
 
+/* The kernels, which do the work of each sample. Left alone: in selfcal_real_t. -DSELFCAL_FIXED=16 or =32 for parts without an
+ * FPU: in integers, by 16-bit products (tested to 10^5 bank samples: probabilities within 5e-3, means within 0.05 posterior sd) or
+ * by 32-bit ones (likewise to 10^6). Gains, tables and reports are the same. Formats and head-room: kernel_fixed.c. */
+#ifdef SELFCAL_FIXED
+#if SELFCAL_FIXED != 16 && SELFCAL_FIXED != 32
+#error "SELFCAL_FIXED must be 16 or 32"
+#endif
+#if SELFCAL_BATCH > 16
+#error "SELFCAL_FIXED has head-room for a SELFCAL_BATCH of 16"
+#endif
+#ifdef SELFCAL_REAL_DOUBLE
+#error "SELFCAL_FIXED takes its gains from float"
+#endif
+#endif
+
+/* -DSELFCAL_KERNEL_M4F: run a settled bank by assembly for the Cortex-M4F and its like, a quarter fewer instructions, the same bits. */
+
 /* What a kernel keeps for each (node, axis): its predicted drift, and its sums. */
+#ifdef SELFCAL_FIXED
+typedef int32_t selfcal_drift_t;
+typedef int64_t selfcal_total_t;
+#else
 typedef selfcal_real_t selfcal_drift_t;
 typedef selfcal_sum_t selfcal_total_t;
+#endif
 
 /* Reports and ln-likelihoods. Deliberately double, in software where the FPU has none; never touched per sample. */
 typedef double selfcal_wide_t;
@@ -196,7 +227,7 @@ extern const selfcal_regressors_code_t selfcal_regressors_code;
 
 /* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step): each adds a constant
  * coefficient times its value to every reading, and every subset of them is a hypothesis of its own. The values come with
- * the samples, selfcal_push_with(); their unit is the application's. */
+ * the samples, selfcal_push_with(); their unit is the application's. Not with SELFCAL_FIXED: SELFCAL_BAD_MODEL. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code: only a model with regressors links what they take */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
@@ -247,7 +278,7 @@ typedef struct {
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
-    uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite */
+    uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite or SELFCAL_SAMPLE_MAX */
 } selfcal_counters_t;
 
 /* One filter: the gain side, shared by all axes because covariances do not depend on the data. Relative to sigma_v.
@@ -265,9 +296,27 @@ typedef struct {
     uint32_t level_from;  /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;      /* sum u^2 / s */
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
+#ifdef SELFCAL_FIXED
+    /* Of a level node g, u/s and 1/s, each mantissa * 2^-shift. */
+    int32_t g_mantissa, u_mantissa, w_mantissa;
+    uint8_t g_shift, u_shift, w_shift;
+#endif
 } selfcal_node_t;
 
-/* Bytes of memory selfcal_init() needs: for each node in the float build, 56 and 20 more per axis (check.c holds it to that). */
+#ifdef SELFCAL_FIXED
+/* Number format of one axis and how far it has been filled. Nothing ever saturates: the step grows instead. */
+typedef struct {
+    int16_t exponent;        /* step of y and drift now: 2^exponent unit */
+    uint16_t coarser, finer; /* times the exponent has grown and shrunk */
+    int32_t most_y;          /* greatest |y| at this exponent; beyond SELFCAL_FIXED_LIMIT the step grows */
+    int32_t most_c;          /* greatest sum C at this exponent, over 2^32; from 2^29 the step grows */
+} selfcal_scale_t;
+
+#define SELFCAL_FIXED_LIMIT (3 * (1L << 25))
+#endif
+
+/* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 72 in the fixed-point one, and 20
+ * more per axis (check.c holds it to that). */
 #define SELFCAL_SIZE(nodes, axes) \
     ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
 
@@ -278,6 +327,7 @@ typedef struct {
     uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
     uint32_t gap_after;
     uint32_t count;
+    bool part; /* some r is not 1 */
 } selfcal_batch_t;
 /* One regressor's front end. Private, as selfcal_columns_t; here for the caller's sizing. */
 typedef struct {
@@ -324,6 +374,15 @@ typedef struct {
     uint16_t push_nodes;  /* to run at a push */
     uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
     uint32_t batches;     /* that the nodes have begun with */
+#ifdef SELFCAL_FIXED
+    selfcal_scale_t scale[SELFCAL_AXES_MAX];
+    /* Of the batch that the nodes run over: y, and what nu grows by before each sample and after the last, for one pole. */
+    int32_t y_fixed[SELFCAL_AXES_MAX][SELFCAL_BATCH];
+    int32_t step[SELFCAL_AXES_MAX][SELFCAL_BATCH + 1];
+    uint32_t step_from, step_to; /* samples the steps are of; from == to: none */
+    float step_beta;             /* ... and the pole */
+    bool step_floored;
+#endif
     /* averager */
     bool started;
     float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
@@ -365,9 +424,9 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
  * ones neither help nor harm an axis.) */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
 
-/* The same with the values of the model's regressors, in its order; a value that is not finite keeps the sample out. Values are
- * averaged over a block as the samples are. A model with regressors takes this call only (else SELFCAL_BAD_ARGUMENT), one
- * without does not look at `regressors`. Per node O(count^2 + axes * count) more. */
+/* The same with the values of the model's regressors, in its order; a value that is not finite, or at SELFCAL_SAMPLE_MAX,
+ * keeps the sample out. Values are averaged over a block as the samples are. A model with regressors takes this call only (else
+ * SELFCAL_BAD_ARGUMENT), one without does not look at `regressors`. Per node O(count^2 + axes * count) more. */
 selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]);
 /* True once an axis is retired. */
 bool selfcal_retired(const selfcal_t *self, uint8_t axis);
@@ -377,9 +436,9 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
- * Nothing happens at the start of an interval. For selfcal_gate_push(): call this before the window's last sample goes to
- * selfcal_push(), and selfcal_skip() while the gate says moving. No window then reaches back into an interval that is already
- * closed, provided that the block is a multiple of the window and that both began together. */
+ * Nothing happens at the start of an interval. With the gate, every sample goes to selfcal_gate_push() first; if it said resting
+ * before this sample and says so with it, the sample goes to selfcal_push(), else selfcal_moving() and selfcal_skip(1). So no
+ * window of motion reaches back into an interval that is already closed, provided that the block is a multiple of the window. */
 selfcal_status_t selfcal_moving(selfcal_t *self);
 
 /* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
@@ -407,6 +466,11 @@ float selfcal_within_sd(const selfcal_t *self, uint8_t axis);
 
 /* Offset (unit) that is taken off an axis before the filters: its first bank sample. */
 selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis);
+
+#ifdef SELFCAL_FIXED
+/* Diagnostics of an axis's number format. */
+const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis);
+#endif
 
 /* What one node knows of one axis, for tests and tools; folds the batch first, hence not const. */
 typedef struct {
@@ -442,7 +506,8 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 /* selfcal_save() writes this many bytes at a time, and the rest at last. */
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
-/* No snapshot of a model is longer: for a flash slot or a buffer laid out by the compiler. */
+/* No snapshot of a model without regressors is longer, with them by no more than SELFCAL_REGRESSORS_SIZE: for a flash slot or a
+ * buffer laid out by the compiler. */
 #define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
 
 /* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. */

@@ -4,14 +4,15 @@
  *        0  4  "SFCL"
  *        4  4  bytes of the whole, checksum included
  *        8  2  format version
- *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t)
+ *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 16 or 32 integers (SELFCAL_FIXED)
  *       11  1  axes of the model
  *       12  2  nodes of the model
  *       14  2  0
  *       16  4  id of the model
  *       20  4  layout: CRC-32 over kind (1 byte) and count (2 bytes) of every field below, so that a build with other fields or
  *              other maxima of the configuration is told apart without anyone counting up the version
- *       24     selfcal_t, its batches, its counters, every node, b, c, x, what the regressors have: the fields below, in their order
+ *       24     selfcal_t, its batches, its counters, every node, b, c, x, number formats, what the
+ *              regressors have: the fields below, in their order
  *     last  4  CRC-32 of all before (IEEE 802.3: reflected polynomial 0xEDB88320, start and final inversion 0xFFFFFFFF)
  * The first 8 bytes and the checksum are where they are in every version.
  *
@@ -22,6 +23,11 @@
 #include "internal.h"
 
 #define VERSION 1U
+#ifdef SELFCAL_FIXED
+#define ARITHMETIC SELFCAL_FIXED
+#else
+#define ARITHMETIC sizeof(selfcal_real_t)
+#endif
 enum { HEADER = 24, TRAILER = 4 };
 static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 
@@ -44,7 +50,37 @@ static const uint8_t kind_size[KINDS] = {
 };
 
 /* In the order of the structs. F: every member but the pointers, which selfcal_init() sets; PART: structs with a list of
- * their own. A selfcal_sum_t is two reals. */
+ * their own. A selfcal_sum_t is two reals; signed numbers are the bits of unsigned ones. */
+#ifdef SELFCAL_FIXED
+#define FIXED_BANK_FIELDS(F, PART)          \
+    PART(selfcal_t, scale, selfcal_scale_t) \
+    F(selfcal_t, y_fixed, U32)              \
+    F(selfcal_t, step, U32)                 \
+    F(selfcal_t, step_from, U32)            \
+    F(selfcal_t, step_to, U32)              \
+    F(selfcal_t, step_beta, FLOAT)          \
+    F(selfcal_t, step_floored, BOOL)
+
+#define FIXED_NODE_FIELDS(F)           \
+    F(selfcal_node_t, g_mantissa, U32) \
+    F(selfcal_node_t, u_mantissa, U32) \
+    F(selfcal_node_t, w_mantissa, U32) \
+    F(selfcal_node_t, g_shift, U8)     \
+    F(selfcal_node_t, u_shift, U8)     \
+    F(selfcal_node_t, w_shift, U8)
+
+#define SCALE_FIELDS(F)               \
+    F(selfcal_scale_t, exponent, U16) \
+    F(selfcal_scale_t, coarser, U16)  \
+    F(selfcal_scale_t, finer, U16)    \
+    F(selfcal_scale_t, most_y, U32)   \
+    F(selfcal_scale_t, most_c, U32)
+#else
+#define FIXED_BANK_FIELDS(F, PART)
+#define FIXED_NODE_FIELDS(F)
+#define SCALE_FIELDS(F)
+#endif
+
 #define BANK_FIELDS(F, PART)                      \
     F(selfcal_t, n, U32)                          \
     F(selfcal_t, rho_lo, REAL)                    \
@@ -57,6 +93,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, push_nodes, U16)                 \
     F(selfcal_t, pending_gap, U32)                \
     F(selfcal_t, batches, U32)                    \
+    FIXED_BANK_FIELDS(F, PART)                    \
     F(selfcal_t, started, BOOL)                   \
     F(selfcal_t, origin, FLOAT)                   \
     F(selfcal_t, offset, REAL)                    \
@@ -84,7 +121,8 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_batch_t, r, REAL)        \
     F(selfcal_batch_t, gap, U32)       \
     F(selfcal_batch_t, gap_after, U32) \
-    F(selfcal_batch_t, count, U32)
+    F(selfcal_batch_t, count, U32)     \
+    F(selfcal_batch_t, part, BOOL)
 
 #define COUNTER_FIELDS(F)                     \
     F(selfcal_counters_t, samples, U64)       \
@@ -110,7 +148,8 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, steady, U32)     \
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
-    F(selfcal_node_t, ln_s, REAL)
+    F(selfcal_node_t, ln_s, REAL)      \
+    FIXED_NODE_FIELDS(F)
 
 #define COLUMN_FIELDS(F)              \
     F(selfcal_column_t, z, REAL)      \
@@ -138,7 +177,12 @@ static const field_t counter_fields[] = {COUNTER_FIELDS(ROW)};
 static const field_t node_fields[] = {NODE_FIELDS(ROW)};
 static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
 static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
+#ifdef SELFCAL_FIXED
+static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
+static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
+#else
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
+#endif
 
 /* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
  * bool that slips into padding; a test compares the bytes.) */
@@ -160,6 +204,11 @@ typedef struct {
 typedef struct {
     COLUMN_FIELDS(MIRROR)
 } selfcal_column_t_mirror;
+#ifdef SELFCAL_FIXED
+typedef struct {
+    SCALE_FIELDS(MIRROR)
+} selfcal_scale_t_mirror;
+#endif
 /* NOLINTEND(bugprone-sizeof-expression) */
 
 #define IN_PLACE(struct_t, member, kind) \
@@ -176,8 +225,15 @@ SELFCAL_STATIC_ASSERT(all_of_a_node, sizeof(selfcal_node_t) == sizeof(selfcal_no
 SELFCAL_STATIC_ASSERT(all_of_a_column, sizeof(selfcal_column_t) == sizeof(selfcal_column_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeof(void *));
 SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
+#ifdef SELFCAL_FIXED
+SCALE_FIELDS(IN_PLACE)
+SELFCAL_STATIC_ASSERT(all_of_a_scale, sizeof(selfcal_scale_t) == sizeof(selfcal_scale_t_mirror));
+SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 8);
+SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == 4);
+#else
 SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 2 * sizeof(selfcal_real_t));
 SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == sizeof(selfcal_real_t));
+#endif
 SELFCAL_STATIC_ASSERT(float_is_ieee_single, sizeof(float) == 4 && FLT_MANT_DIG == 24 && FLT_MAX_EXP == 128);
 SELFCAL_STATIC_ASSERT(wide_is_ieee_double, sizeof(selfcal_wide_t) == 8 && DBL_MANT_DIG == 53 && DBL_MAX_EXP == 1024);
 SELFCAL_STATIC_ASSERT(bool_is_a_byte, sizeof(bool) == 1);
@@ -190,7 +246,11 @@ typedef struct {
     size_t records, stride;
 } part_t;
 
+#ifdef SELFCAL_FIXED
+enum { PARTS = 13 };
+#else
 enum { PARTS = 12 };
+#endif
 
 /* The parts of a bank of `model`; without `self`, their sizes alone. */
 static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t part[PARTS]) {
@@ -207,6 +267,9 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {total_fields, LENGTH(total_fields), there ? self->b : NULL, cells, sizeof *self->b},
         {total_fields, LENGTH(total_fields), there ? self->c : NULL, cells, sizeof *self->c},
         {drift_fields, LENGTH(drift_fields), there ? self->x : NULL, cells, sizeof *self->x},
+#ifdef SELFCAL_FIXED
+        {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
+#endif
         {column_fields, LENGTH(column_fields), more ? columns->column : NULL, p, sizeof *columns->column},
         {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
         {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
@@ -335,7 +398,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     }
     put_number(&sink, 4, (uint32_t)size_of(model));
     put_number(&sink, 2, VERSION);
-    put_number(&sink, 1, sizeof(selfcal_real_t));
+    put_number(&sink, 1, ARITHMETIC);
     put_number(&sink, 1, model->axes);
     put_number(&sink, 2, model->nodes);
     put_number(&sink, 2, 0);
@@ -375,7 +438,7 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     if (number_at(bytes + 8, 2) != VERSION) {
         return SELFCAL_SNAPSHOT_VERSION;
     }
-    if (bytes[10] != sizeof(selfcal_real_t) || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
+    if (bytes[10] != ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
         number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id || number_at(bytes + 20, 4) != layout_of(part) ||
         length != size_of(model)) {
         return SELFCAL_SNAPSHOT_FOREIGN;

@@ -16,7 +16,7 @@ $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(IMAGE_MODEL)/selfcal_mod
 	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
 	cd $(OUT)/objects && arm-none-eabi-gcc $(ARM_$(CORE)) $(ARM_COMPILE) -fstack-usage -g $(IMAGE_CFLAGS) $(CFLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
 	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL) -c $(IMAGE_SOURCES:%=$(CURDIR)/%) $(IMAGE_MODEL)/selfcal_model.c
-	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,--emit-relocs,-Map=$(OUT)/selfcal.map,--fatal-warnings \
+	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
 	    $(OUT)/objects/*.o -lm -o $@
 
 $(OUT)/selfcal.bin: $(OUT)/selfcal.elf

@@ -73,14 +73,14 @@ def checks() -> Count:
 
 
 def c_tests() -> Count:
-    """Unity programs, built plainly and with sanitizers."""
+    """Unity programs, built plainly, with sanitizers, and these over the integer kernels."""
     code, output = run(["make", "--silent", "--keep-going", "c-tests"], TIMEOUT["c"])
     total = Count()
     if code != 0:
         print(f"FAILED c-tests do not build\n{output}")
         total.failed += 1
-    for variant in ("plain", "sanitized"):
-        for source in sorted((ROOT / "tests" / "c").glob("test_*.c")):
+    for variant in ("plain", "sanitized", "fixed16", "fixed32"):
+        for source in sorted((ROOT / "tests" / "c").glob("**/test_*.c")):
             program = BUILD / "c" / variant / source.stem
             if program.is_file():
                 total += c_test(program)

@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+enum { SAMPLES_A_TURN = 64 };
 enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
 
 /* A report takes some seconds on any wire; one that has not ended after so long never will. */
@@ -160,9 +161,13 @@ static bool compute(app_t *app)
 
 bool app_step(app_t *app)
 {
-    /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. */
+    /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. On a slow core
+     * several come during one slice. */
     bool busy = app->computing && compute(app);
-    busy = ((!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app)) || busy;
+    for (unsigned taken = 0; taken < SAMPLES_A_TURN && (!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app);
+         taken++) {
+        busy = true;
+    }
     busy = send_frames(app) || busy;
     if (!app->computing && !app->waiting) {
         busy = advance(app) || busy;

@@ -11,6 +11,10 @@
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
+#if SELFCAL_MODEL_REGRESSORS > 0
+#error "this application gives its bank no regressors"
+#endif
+
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */
 typedef struct {
     const port_t *port;
@@ -49,7 +53,7 @@ void app_module(app_t *app, const port_module_t *module);
  * watchdog must not be fed. */
 bool app_healthy(const app_t *app);
 
-/* One turn of the main loop: at most one sample, one slice of a report, and the frames the wire has room for. False once
+/* One turn of the main loop: the samples that wait, one slice of a report, and the frames the wire has room for. False once
  * the port has said PORT_END, the final report is out and the status says finished. */
 bool app_step(app_t *app);
 

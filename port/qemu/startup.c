@@ -11,6 +11,21 @@ static void unexpected(void)
     semihost_exit(3U);
 }
 
+#ifdef QEMU_STACK
+/* How deep the stack went, said at the end: what the bound from the call graph is held against. */
+#define UNTOUCHED 0x5AFE57ACU
+
+static void print_stack(uint32_t bytes)
+{
+    char text[] = "stack 0000\n";
+    for (int at = 9; at >= 6; at--) {
+        text[at] = (char)('0' + (int)(bytes % 10U));
+        bytes /= 10U;
+    }
+    semihost_print(text);
+}
+#endif
+
 void startup(void);
 void startup(void)
 {
@@ -26,7 +41,20 @@ void startup(void)
     for (uint32_t *to = link_bss; to < link_bss_end; to++) {
         *to = 0;
     }
+#ifdef QEMU_STACK
+    uint32_t *low = (uint32_t *)0x20000000;
+    for (uint32_t *at = low; at < (uint32_t *)__builtin_frame_address(0) - 16; at++) {
+        *at = UNTOUCHED;
+    }
+    const uint32_t code = (uint32_t)main();
+    while (*low == UNTOUCHED) {
+        low++;
+    }
+    print_stack((uint32_t)(link_stack - low) * sizeof *low);
+    semihost_exit(code);
+#else
     semihost_exit((uint32_t)main());
+#endif
 }
 
 typedef union {

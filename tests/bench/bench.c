@@ -3,6 +3,7 @@
  *   value NAME NUMBER
  * and ends with exit code 0. Every run is the same. */
 #include "image.h"
+#include "internal.h"
 #include "paper_float.h"
 #include "record.h"
 
@@ -132,6 +133,29 @@ static void measure_window(const char *name) {
     print_count(name, since(start), (uint64_t)WINDOW * SELFCAL_MODEL_NODES * AXES);
 }
 
+/* A batch without the averager: gains, kernels and long sums, from the last sample that fills it. */
+static taken_t run_one_batch(void) {
+    make_window();
+    selfcal_bank_flush(&bank);
+    image_time_t start = image_now();
+    for (unsigned i = 0; i < SELFCAL_BATCH; i++) {
+        float y[AXES];
+        for (unsigned axis = 0; axis < AXES; axis++) {
+            y[axis] = window[i][axis] - (float)selfcal_offset(&bank, (uint8_t)axis);
+        }
+        if (i == SELFCAL_BATCH - 1U) {
+            start = image_now();
+        }
+        selfcal_bank_sample(&bank, y, 1.0F);
+    }
+    (void)selfcal_bank_run(&bank, SELFCAL_MODEL_NODES);
+    return since(start);
+}
+
+static void measure_kernels(void) {
+    print_count("bank.steady.alone", run_one_batch(), (uint64_t)SELFCAL_BATCH * SELFCAL_MODEL_NODES * AXES);
+}
+
 /* The dearest of the next pushes. */
 static void print_worst_push(const char *name, unsigned samples) {
     taken_t worst = {0, 0, 0};
@@ -169,6 +193,7 @@ static void measure_steady(void) {
         push_window(WINDOW);
     }
     measure_window("bank.steady");
+    measure_kernels();
     print_worst_push("bank.steady.worst_push", WINDOW);
 
     selfcal_node_view_t view;

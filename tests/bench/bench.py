@@ -17,9 +17,14 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TypedDict
 
+import image_sizes
+
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "bench"
 REFERENCE = Path(__file__).with_name("counts.json")
+GUIDE = ROOT / "GUIDE.md"
+#: Where the guide has the table.
+TABLE = re.compile(r"(<!-- python tests/bench/bench.py --table -->\n).*(\n<!-- end of the table -->)", re.DOTALL)
 GROWTH = Fraction(2, 100)
 #: s; an image that takes longer hangs.
 TIMEOUT = 120
@@ -58,12 +63,18 @@ class Machine:
     board: str
     options: tuple[str, ...]
     systick_hz: int
+    image: str  # the firmware that is built for it; empty: none
+    report_s: int  # its default time between reports, BOARD_REPORT_MS
 
 
 MACHINES = {
-    "cortex-m4f": Machine("netduinoplus2", (), 168_000_000),
+    "cortex-m4f": Machine("netduinoplus2", (), 168_000_000, "stm32f405", 10),
+    # ... without the assembly kernel.
+    "cortex-m4f-portable": Machine("netduinoplus2", (), 168_000_000, "", 10),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
-    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000),
+    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000, "cortex-m0", 600),
+    # ... and by 32-bit products instead of 16-bit ones.
+    "cortex-m0-32bit": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000, "", 600),
 }
 
 
@@ -93,14 +104,14 @@ def run(command: list[str]) -> str:
 # ------------------------------------------------------------------------------------------------------------ measuring
 
 
-def run_image(target: str) -> tuple[dict[str, list[int]], dict[str, int]]:
-    """Counts and values that the image of a target prints."""
+def run_image(target: str, image: str) -> tuple[dict[str, list[int]], dict[str, int]]:
+    """Counts and values that an image of a target prints."""
     machine = MACHINES[target]
     output = run(
         [
             *("qemu-system-arm", "-M", machine.board, *machine.options, "-display", "none", "-monitor", "none"),
             *("-serial", "none", "-icount", "shift=6,sleep=off", "-semihosting-config", "enable=on,target=native"),
-            *("-kernel", str(BUILD / target / "image.elf")),
+            *("-kernel", str(BUILD / target / f"{image}.elf")),
         ]
     )
     values = {name: int(number) for name, number in re.findall(r"^value (\S+) (\d+)$", output, re.MULTILINE)}
@@ -114,9 +125,10 @@ def run_image(target: str) -> tuple[dict[str, list[int]], dict[str, int]]:
     def instructions(ticks: int, parts: int, rounds: int) -> int:
         return round((ticks - parts * empty) / ticks_per_instruction) - HANDLER * rounds
 
-    short, long = (instructions(*raw.pop(f"clock.loop_{turns}")[:3]) for turns in (1000, 2001000))
-    if abs(long - short - TURN * 2_000_000) > 1:  # one for the rounding of either
-        raise BenchError(f"{target}: SysTick does not count instructions: {long - short} for {TURN * 2_000_000}")
+    if "clock.loop_1000" in raw:
+        short, long = (instructions(*raw.pop(f"clock.loop_{turns}")[:3]) for turns in (1000, 2001000))
+        if abs(long - short - TURN * 2_000_000) > 1:  # one for the rounding of either
+            raise BenchError(f"{target}: SysTick does not count instructions: {long - short} for {TURN * 2_000_000}")
     return {name: [instructions(*numbers[:3]), numbers[3]] for name, numbers in raw.items()}, values
 
 
@@ -144,7 +156,10 @@ def text_sizes(target: str) -> dict[str, int]:
 
 def measure(target: str) -> Figures:
     """All exact figures of a target. Raises BenchError."""
-    counts, values = run_image(target)
+    counts, values = run_image(target, "image")
+    module_counts, module_values = run_image(target, "module")
+    counts |= module_counts
+    values |= module_values
     sizes = {name: value for name, value in values.items() if name.startswith("ram.")}
     facts = {name: value for name, value in values.items() if name not in sizes}
     if "paper" in counts:
@@ -154,6 +169,12 @@ def measure(target: str) -> Figures:
                 f"{target}: posterior weights of the library and of the paper's recursion differ by {difference}e-9, "
                 f"more than {WEIGHT_TOLERANCE:g} of the heaviest, {heaviest}e-9"
             )
+    if MACHINES[target].image:
+        try:
+            image, _ = image_sizes.measure(MACHINES[target].image)
+        except image_sizes.FirmwareError as error:
+            raise BenchError(f"{MACHINES[target].image}: {error}") from error
+        sizes |= {f"firmware.{kind}": size for kind, size in image.items()}
     return {"counts": counts, "sizes": text_sizes(target) | sizes, "facts": facts}
 
 
@@ -219,6 +240,7 @@ def table(bench: Bench) -> str:
     number("filters (nodes) of the default model", "facts", "nodes")
     per("`selfcal_push()`, six axes, averaging only", "push", ".1f")
     per("bank, every filter settled, per (node, sample, axis)", "bank.steady", ".2f")
+    per("… without the averager", "bank.steady.alone", ".2f")
     per("bank, every filter but one varying, per (node, sample, axis)", "bank.varying", ".2f")
     per("bank, first 3600 samples, per (node, sample, axis)", "bank.hour", ".2f")
     number("filters settled after them", "facts", "bank.hour.settled")
@@ -266,6 +288,26 @@ def table(bench: Bench) -> str:
     }
     row("… times as many as the settled bank's, one σv node", {t: f"{float(r):.1f}" for t, r in ratios.items()})
     row(f"… and with {SIGMAS} σv nodes", {t: f"{float(SIGMAS * r):.0f}" for t, r in ratios.items()})
+    row("**application: one sample of six axes at 819.2 Hz, averaged to 1 Hz**", {})
+    periods = {t: Fraction(f["facts"]["mhz"] * 10**6) / RATE_HZ for t, f in targets.items() if "mhz" in f["facts"]}
+    row("clock, MHz", {t: str(targets[t]["facts"]["mhz"]) for t in periods})
+    row("instructions a sample period has", {t: f"{float(period):,.0f}" for t, period in periods.items()})
+
+    def sample(title: str, instructions: dict[str, Fraction]) -> None:
+        row(title, {t: f"{float(number):,.0f}" for t, number in instructions.items()})
+        row("… of the sample period", {t: f"{float(n / periods[t]):.1%}" for t, n in instructions.items()})
+
+    counts = {t: {name: Fraction(*count) for name, count in targets[t]["counts"].items()} for t in periods}
+    between = ", ".join(f"{MACHINES[t].report_s} s" for t in periods if MACHINES[t].image)
+    reports = {t: AXES * counts[t]["report"] / (MACHINES[t].report_s * RATE_HZ) for t in periods}
+    sample("average sample without reports", {t: counts[t]["sample"] for t in periods})
+    sample(f"… and a report of all axes every {between}", {t: counts[t]["sample"] + reports[t] for t in periods})
+    sample("longest turn of the main loop between reports", {t: counts[t]["sample.worst"] for t in periods})
+    number("samples that wait at most", "facts", "sample.most_waiting")
+    worst = {t: counts[t]["sample.report.worst"] for t in periods}
+    sample("… and in a report: samples that wait, and its slice", worst)
+    number("samples that wait at most in a report", "facts", "report.most_waiting")
+    number("report of one axis, from its beginning, ms", "facts", "report.ms")
     row("**bytes**", {})
     for path in sorted((ROOT / "lib").glob("*.c")):
         number(f"flash, {path.name}", "sizes", f"text.{path.stem}")
@@ -276,6 +318,10 @@ def table(bench: Bench) -> str:
     number("RAM, `SELFCAL_SIZE`, six axes", "sizes", "ram.SELFCAL_SIZE")
     for name in ("selfcal_t", "selfcal_work_t", "selfcal_report_t", "selfcal_telemetry_t"):
         number(f"RAM, `{name}`", "sizes", f"ram.{name}")
+    row("**whole image**, bytes", {t: MACHINES[t].image for t in targets})
+    number("flash", "sizes", "firmware.flash")
+    number("RAM of the variables", "sizes", "firmware.ram")
+    number("stack, worst case by the call graph, one interrupt upon it", "sizes", "firmware.stack")
     heading = ["", *(f"{target.capitalize().replace('-m', '-M')}" for target in targets)]
     width = max(len(title) for title, _ in rows)
     lines = [f"| {heading[0]:{width}} |" + "".join(f" {name:>13} |" for name in heading[1:])]
@@ -310,7 +356,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--table", action="store_true", help="print counts.json as markdown; measure nothing")
     parser.add_argument("--host", action="store_true", help="measure ns on this machine as well")
-    parser.add_argument("--accept", action="store_true", help="write counts.json anew")
+    parser.add_argument("--accept", action="store_true", help="write counts.json and the guide's table anew")
     arguments = parser.parse_args()
     if arguments.table:
         print(table(read_reference()))
@@ -326,6 +372,10 @@ def main() -> int:
         print(f"\n{host_table(host)}")
     if arguments.accept:
         REFERENCE.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
+        guide, found = TABLE.subn(lambda match: match[1] + table(now) + match[2], GUIDE.read_text(encoding="utf-8"))
+        if found != 1:
+            raise BenchError(f"{GUIDE.name}: no place for the table")
+        GUIDE.write_text(guide, encoding="utf-8")
         return 0
     before = read_reference()
     if before["compiler"] not in ("", now["compiler"]):

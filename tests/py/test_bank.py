@@ -2,13 +2,14 @@
 
 That one is Eigen, double, with the bias as a state and sigma_v a grid dimension.
 The two share no code. Tolerances are those of the design, on equal nodes: for the double build |d ln p| <= 1e-3 and
-|dP| <= 1e-6, for the float build |dP| <= 1e-3 and parameter means within 0.02 posterior sd.
+|dP| <= 1e-6, for the float build |dP| <= 1e-3 and parameter means within 0.02 posterior sd, for the fixed-point builds
+|dP| <= 5e-3 and 0.05 sd.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,8 @@ LN_P_DOUBLE = 1e-3
 PROBABILITY_DOUBLE = 1e-6
 PROBABILITY_FLOAT = 1e-3
 MEAN_FLOAT = 0.02
+PROBABILITY_FIXED = 5e-3
+MEAN_FIXED = 0.05
 #: Nodes this far below the best carry e^-30 of the weight: their ln p is compared relative to its size instead.
 DEPTH = 30.0
 #: Records a law and length; the lengths of the issue.
@@ -44,14 +47,19 @@ class Agreement:
     mean: float
 
 
-def compare(y: NDArray[np.float64], dt_s: float, axis: str) -> dict[str, Agreement]:
-    """Feed `y` (NaN: missing) to both builds of the library and to the textbook bank at the same nodes.
+def compare(y: NDArray[np.float64], dt_s: float, axis: str, bias_sd: float = 10.0) -> dict[str, Agreement]:
+    """Feed `y` (NaN: missing) to the builds of the library and to the textbook bank at the same nodes.
 
     Flat weights over the nodes, which are the M4F's: 16 + 12 x 12 + 1.
     """
-    group = MODEL.group_of(axis)
     tables = make_tables(MODEL, 1.0 / dt_s, (axis,), "cortex-m4f")
-    banks = {"double": Bank(tables, double=True), "float": Bank(tables)}
+    tables = replace(tables, axes=(replace(tables.axes[0], range=0.0, bias_sd=bias_sd),))
+    banks = {
+        "double": Bank(tables, double=True),
+        "float": Bank(tables),
+        "fixed16": Bank(tables, fixed=16),
+        "fixed32": Bank(tables, fixed=32),
+    }
     present = np.isfinite(y)
     gaps = np.diff(np.flatnonzero(present), prepend=-1) - 1
     for bank in banks.values():
@@ -74,7 +82,7 @@ def compare(y: NDArray[np.float64], dt_s: float, axis: str) -> dict[str, Agreeme
         y - offset,
         dt_s,
         -offset,
-        group.priors["bias"].sd,
+        bias_sd,
         np.repeat(law, sigma.size).astype(np.int32),
         drift.ravel(),
         np.repeat(alpha, sigma.size),
@@ -132,6 +140,22 @@ def test_parity_with_the_textbook_bank(law: str, n: int, gaps: bool) -> None:
     _hold(f"{law} n={n} gaps={gaps}", found)
 
 
+@pytest.mark.parametrize("law", LAWS)
+def test_parity_at_a_hundred_thousand(law: str) -> None:
+    """The stated record length of the 16-bit products, with gaps."""
+    _hold(f"{law} n=1e5", [compare(y, 1.0, "gx") for y in records(law, 100_000, gaps=True)[:1]])
+
+
+@pytest.mark.parametrize("rho", [1e-3, 1e-2, 1e-1, 1.0, 10.0])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_parity_over_rho_and_offsets(rho: float, offset: float) -> None:
+    """A random walk of rho = K / N; a bias of a million times the noise, which float32 carries to 0.06 of it."""
+    noise = 1e-3 if rho > 0.1 else 0.1
+    y, _ = simulate_bank_samples("random_walk", {"N": noise, "K": rho * noise}, 1.0, 10_000, seed=7)
+    y = (y + offset * noise).astype(np.float32).astype(float)
+    _hold(f"rho {rho:g} offset {offset:g}", [compare(y, 1.0, "gx", max(10.0, offset * noise))])
+
+
 @pytest.mark.parametrize("axis", ["gx", "gy", "gz", "ax", "ay", "az"])
 def test_parity_on_a_real_recording(axis: str) -> None:
     """adis16405_run1, 1 Hz means, 10 000 s."""
@@ -147,6 +171,9 @@ def _hold(what: str, found: list[dict[str, Agreement]]) -> None:
         "float dP": (max(f["float"].probability for f in found), PROBABILITY_FLOAT),
         "float d mean / sd": (max(f["float"].mean for f in found), MEAN_FLOAT),
     }
+    for build in ("fixed16", "fixed32"):
+        worst[f"{build} dP"] = (max(f[build].probability for f in found), PROBABILITY_FIXED)
+        worst[f"{build} d mean / sd"] = (max(f[build].mean for f in found), MEAN_FIXED)
     print(f"\n{what}: " + ", ".join(f"{key} {value:.2g} (<= {limit:g})" for key, (value, limit) in worst.items()))
     for key, (value, limit) in worst.items():
         assert value <= limit, key

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from selfcal import _library32, _library64
+from selfcal.engines.library import Bank
+from selfcal.model import Model
+from selfcal.tables import make_tables
 
 from conftest import shared_recording
 
@@ -216,6 +219,41 @@ def test_a_shock_within_a_window() -> None:
     assert rest[3:100].all()
     assert not rest[100]
     assert gate.last()["shaken"] >= 1
+
+
+def test_the_bank_gets_no_sample_of_a_window_with_motion() -> None:
+    """Gate and bank in step, a sample at a time, as selfcal_moving() says: every sum is that of a bank which was told
+    that the intervals with a moving window are missing. Shocks lie at all places of the windows and intervals."""
+    window, block = 10, 50
+    tables = make_tables(Model.load(), float(block), ("gx",), bank_rate_hz=1.0)
+    sigma = 0.1
+    x = noise(400, window, 1, seed=14) * np.float32(sigma)
+    for start in (701, 1249, 1500, 2308, 2999, 3344):
+        x[start] += 30.0 * sigma
+    gate, bank, told = make(window, 1e-6, 1, sigma=sigma), Bank(tables), Bank(tables)
+    before, rest = 0, []
+    for sample in x:
+        now = gate.push(sample[None, :])[0]
+        if before and now:
+            bank.push(sample[None, :])
+        else:
+            bank.raw.moving()
+            bank.raw.skip(1)
+        rest.append(bool(before and now))
+        before = now
+    first = rest.index(True)
+    assert first % window == 0
+    assert gate.last()["alarms"] == 6
+    for start in range(first, x.shape[0], block):
+        interval = slice(start, start + block)
+        if all(rest[interval]):
+            told.push(x[interval])
+        else:
+            told.raw.skip(len(x[interval]))
+    assert bank.raw.count == told.raw.count > 50
+    assert repr([bank.raw.node(0, j) for j in range(bank.raw.nodes)]) == repr(
+        [told.raw.node(0, j) for j in range(told.raw.nodes)]
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- bad input

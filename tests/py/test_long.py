@@ -1,4 +1,4 @@
-"""Records of any length: float against double, and double against the textbook bank.
+"""Records of any length: float and fixed point against double, and double against the textbook bank.
 
 n = 10^6 against the textbook bank node for node, n = 10^7 float against double by the report.
 `make soak` sets SELFCAL_SOAK to 10^8, 28 h at 1 kHz.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -61,6 +62,62 @@ def test_float_holds_at_any_length(law: str) -> None:
     change = max(abs(single.probability[name] - p) for name, p in double.probability.items())
     print(f"\n{law} n={LENGTH:.0e}: dP {change:.2g}, d mean {worst:.2g} sd")
     assert worst <= 0.02
+
+
+@pytest.mark.parametrize("law", ["constant", "gauss_markov"])
+@pytest.mark.parametrize(("fixed", "length"), [(16, 100_000), (32, 1_000_000)])
+def test_fixed_point_holds_at_its_stated_length(fixed: Literal[16, 32], length: int, law: str) -> None:
+    """|dP| <= 5e-3 and means within 0.05 sd of the double build, and nothing had to be rescaled."""
+    tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
+    banks = [Bank(tables, fixed=fixed), Bank(tables, double=True)]
+    y, _ = piece(0, length, law, 0.0)
+    for bank in banks:
+        bank.push(y[:, None])
+    found, exact = (bank.report(0) for bank in banks)
+    worst = 0.0
+    for name, p in exact.probability.items():
+        assert abs(p - found.probability[name]) <= 5e-3
+        if p > 0.01:
+            for parameter, value in exact.parameters[name].items():
+                worst = max(worst, abs(found.parameters[name][parameter].mean - value.mean) / value.sd)
+    change = max(abs(found.probability[name] - p) for name, p in exact.probability.items())
+    print(f"\n{fixed}-bit products, {law} n={length:.0e}: dP {change:.2g}, d mean {worst:.2g} sd")
+    assert worst <= 0.05
+    assert banks[0].raw.scale(0)["coarser"] == 0
+
+
+@pytest.mark.parametrize(("fixed", "length"), [(16, 100_000), (32, 1_000_000)])
+@pytest.mark.parametrize("half_period", [1, 16, 500, 20_000])
+def test_fixed_point_holds_at_the_bound(fixed: Literal[16, 32], length: int, half_period: int) -> None:
+    """Readings that swing from end to end of the number format, so that |nu| comes to its bound at every node with
+    1/g above the half period: a sum that wrapped would be off by its whole format, not by its resolution.
+
+    B and C of every node against the double build: a step is 2^-27 of the swing, rounded gains 4e-6 of themselves.
+    """
+    tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
+    rng = np.random.default_rng(5)
+    noise = (0.04 * rng.standard_normal(16)).astype(np.float32)
+    banks = [Bank(tables, fixed=fixed), Bank(tables, double=True)]
+    for bank in banks:
+        bank.push(noise[:, None])
+    banks[0].raw.node(0, 0)  # runs the batch
+    scale = banks[0].raw.scale(0)
+    bound = 3 * 2**25 * 2.0 ** scale["exponent"]
+    assert bound > 20 * 0.04
+    swing = noise[0] + bound * np.where(np.arange(length - 16) // half_period % 2 == 0, 1.0, -1.0) * (1.0 - 1e-6)
+    for bank in banks:
+        bank.push(swing.astype(np.float32)[:, None])
+    worst_b, worst_c = 0.0, 0.0
+    for j in range(banks[0].raw.nodes):
+        ours, exact = (bank.raw.node(0, j) for bank in banks)
+        worst_c = max(worst_c, abs(ours["c"] / exact["c"] - 1.0))
+        worst_b = max(worst_b, abs(ours["b"] - exact["b"]) / math.sqrt(exact["a"] * exact["c"]))
+    after = banks[0].raw.scale(0)
+    print(f"\n{fixed}-bit products, half period {half_period}: C to {worst_c:.1g}, B to {worst_b:.1g}, {after}")
+    assert worst_c <= 1e-4
+    assert worst_b <= 1e-4
+    assert (after["exponent"], after["coarser"]) == (scale["exponent"], 0)
+    assert after["most_y"] > 0.999 * 3 * 2**25
 
 
 def test_double_against_the_textbook_at_a_million() -> None:

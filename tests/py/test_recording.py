@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,82 @@ def test_stamps_coarser_than_the_interval(tmp_path: Path) -> None:
     assert sum(missing.values()) <= 1
 
 
+#: Rate (Hz) and lattice (s) of time stamps; the interval is from 0.33 lattice steps (three samples a stamp) to 12.
+LATTICES = [
+    (819.2, 1e-3), (1000.0, 1e-3), (333.3, 1e-3), (95.0, 1e-3),
+    (150.0, 1e-2), (98.0, 1e-2), (100.0, 1e-2), (102.4, 1e-2), (300.0, 1e-2),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize(("rate", "lattice"), LATTICES)
+def test_coarse_stamps_with_missing_samples(tmp_path: Path, rate: float, lattice: float, lost: float) -> None:
+    """20 000 samples, stamps cut to the lattice, samples lost at random: the rate to 3e-4, or one line asking for it.
+
+    A sample is within a lattice step of its stamp, so that a few gaps can be misjudged by one: 6 of 20 000 make 3e-4.
+    """
+    rng = np.random.default_rng([round(rate * 10), round(lost * 1000)])
+    kept = rng.random(20_000) >= lost
+    kept[[0, -1]] = True
+    index = np.flatnonzero(kept)
+    time = np.floor((index / rate + 0.01 * rng.random()) / lattice) * lattice
+    try:
+        found, missing = stamped(tmp_path, time - time[0])
+    except UserError as error:
+        assert lost >= 0.03, error  # only where three of a hundred are missing
+        what = r"column 't': stamps of .* s (are too coarse to tell|make no even grid).*: give --rate HZ"
+        assert re.search(what, str(error))
+        found, missing = stamped(tmp_path, time - time[0], rate=rate)
+    assert found == pytest.approx(rate, rel=3e-4)
+    assert sum(missing.values()) == pytest.approx(20_000 - index.size, abs=6)
+
+
+def test_an_unbroken_coarse_record_has_no_gap(tmp_path: Path) -> None:
+    """Whatever the phase of the first stamp, and however short the record."""
+    for samples in (5, 20, 100, 2000):
+        for phase in np.linspace(0.0, 0.99, 12):
+            for rate in (819.2, 700.0, 999.0):
+                time = np.floor(np.arange(samples) * 1e3 / rate + phase) / 1e3
+                found, missing = stamped(tmp_path, time - time[0])
+                assert missing == {}
+                assert found == pytest.approx(rate, rel=1.3 / (samples - 1))  # a lattice step at either end
+
+
+def test_a_clock_that_wanders_under_coarse_stamps(tmp_path: Path) -> None:
+    """20 parts in a million to and fro over 200 000 samples with 1 in 200 missing."""
+    rng = np.random.default_rng(4)
+    true = np.cumsum((1.0 + 2e-5 * np.sin(np.arange(200_000) / 20_000.0)) / 819.2)
+    kept = rng.random(true.size) >= 0.005
+    kept[[0, -1]] = True
+    time = np.floor(true[kept] * 1e3) / 1e3
+    found, missing = stamped(tmp_path, time - time[0])
+    assert found == pytest.approx((true.size - 1) / (true[-1] - true[0]), rel=3e-5)
+    assert sum(missing.values()) == pytest.approx(true.size - np.count_nonzero(kept), abs=6)
+
+
+def test_stamps_repeat_only_for_being_coarse(tmp_path: Path) -> None:
+    """Three samples a stamp are fine; one row twice is not, nor are stamps that never move."""
+    time = np.floor(np.arange(300) / 3.0) / 100.0
+    assert stamped(tmp_path, time)[0] == pytest.approx(300.0, rel=0.01)
+    time = np.arange(3000) / 100.0
+    for row in (200, 250, 1700, 2900):
+        time[row:] -= 0.01
+    with pytest.raises(UserError, match="row 201: column 't': the time stamp repeats"):
+        stamped(tmp_path, time)
+    with pytest.raises(UserError, match="row 2: column 't': the time stamp repeats"):
+        stamped(tmp_path, np.zeros(300))
+
+
+def test_short_coarse_records_with_a_gap_ask_for_the_rate(tmp_path: Path) -> None:
+    """30 samples at 819.2 Hz in whole ms, two missing: other rates explain that as well."""
+    time = np.floor(np.delete(np.arange(40), [11, 25]) / 0.8192) / 1e3
+    with pytest.raises(UserError, match="too coarse to tell"):
+        stamped(tmp_path, time)
+    found, missing = stamped(tmp_path, time, rate=819.2)
+    assert found == 819.2
+    assert sum(missing.values()) == pytest.approx(2, abs=1)
+
+
 def test_stated_rate_is_taken_where_it_agrees(tmp_path: Path) -> None:
     time = np.arange(100) * 0.01
     assert stamped(tmp_path, time, rate=99.5)[0] == 99.5
@@ -196,6 +273,14 @@ BAD_CSV = {
     "blank lines": (b"\n \n\n", "line 1: the file holds empty lines only"),
     "header only": (HEAD, "line 1: there is a header but no rows"),
     "one row": (HEAD + b"0,1,2\n", "line 2: one row only, a recording needs two or more"),
+    "unclosed quote": (ROWS + b'0.3,"1,26\n', "line 5: column 'gx': an unclosed quote: '\"1'"),
+    "quote within": (ROWS + b'0.3,1"2,26\n', "line 5: column 'gx': an unclosed quote: '1\"2'"),
+    "unclosed quote in header": (b't[s],"gx[deg/s]\n0,1\n1,2\n', "line 1: column 2: an unclosed quote: '\"gx[deg/s]'"),
+    "unclosed bracket": (b"t[s],gx[deg/s\n0,1\n1,2\n", "line 1: column 'gx[deg/s': the brackets of its unit do not"),
+    "unopened bracket": (b"t[s],gx deg/s]\n0,1\n1,2\n", "line 1: column 'gx deg/s]': the brackets of its unit do not"),
+    "text column": (b"t[s],gx[deg/s],note\n0,1,a\n1,2,b\n", "line 1: column 'note' has no unit: write note[UNIT] in"
+                    " the header or give --unit note=UNIT, or leave it out by naming what to read with --column "),
+    "no unit of temp": (b"t[s],gx[deg/s],temp\n0,1,1\n1,2,1\n", "line 1: column 'temp' has no unit: write temp[degC]"),
     "text cell": (ROWS + b"0.3,x1,26\n", "line 5: column 'gx': 'x1' is not a number"),
     "empty cell": (ROWS + b"0.3,1,\n", "line 5: column 'temp': an empty cell"),
     "nan": (ROWS + b"0.3,NaN,26\n", "line 5: column 'gx': not a number (NaN)"),

@@ -160,12 +160,72 @@ def test_regressors_are_those_of_the_joint_normal_density(node: tuple, p: int) -
     assert bias_var[0, law] == pytest.approx(now @ expected_covariance @ now, abs=1e-6)
 
 
+FLICKER_ALPHA = 0.05
+
+
+def further_covariance(law: int, drift: float, sigma_v: float, walk: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances [n, n] of the drift and of the noise under laws 3 to 5, by their definitions."""
+    lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    white = np.eye(n) * sigma_v**2
+    if law == 3:
+        terms = [np.exp(-FLICKER_ALPHA * ratio * DT * lag) for ratio in (0.1, 1.0, 10.0)]
+        return drift**2 * np.log(10.0) / np.pi * sum(terms), white
+    if law == 4:
+        return np.zeros((n, n)), white * (1.0 + drift**2) + (lag == 1) * drift * sigma_v**2
+    return drift_covariance(2, drift, FLICKER_ALPHA, n, DT) + drift_covariance(1, walk, 1.0, n, DT), white
+
+
+@pytest.mark.parametrize(("law", "drift", "walk"), [(3, 0.4, 0.0), (4, 0.6, 0.0), (4, -1.0, 0.0), (5, 0.5, 0.1)])
+def test_further_laws_are_those_of_the_joint_normal_density(law: int, drift: float, walk: float) -> None:
+    """Flicker, moving average, and random walk with Gauss-Markov, with gaps and two regressors: density of the
+    record, and mean and variance of x0 + drift + c z at the last sample."""
+    n, sigma_v, sd = 30, 0.3, np.array([0.2, 1.0])
+    y, _ = a_record(n)
+    y[-1] = 0.7
+    have = np.isfinite(y)
+    z = np.column_stack([np.arange(n) * 0.1, np.sin(np.arange(n))])
+    slow, noise = further_covariance(law, drift, sigma_v, walk, n)
+    signal = slow + BIAS_SD**2 + z * sd**2 @ z.T
+    dense = (signal + noise)[np.ix_(have, have)]
+    node = (np.array([law], np.int32), np.array([drift]), np.array([FLICKER_ALPHA]), np.array([sigma_v]))
+    beside = {"z": z, "coefficient_sd": sd, "walk": np.array([walk])}
+    ln_p, mean, covariance = _reference.run_filters(y, DT, BIAS_MEAN, BIAS_SD, *node, **beside)
+    expected = stats.multivariate_normal(np.full(have.sum(), BIAS_MEAN), dense).logpdf(y[have])
+    assert ln_p[0] == pytest.approx(expected, abs=LN_P_TOLERANCE)
+    states = {3: 3, 4: 2, 5: 2}[law] + 3
+    assert mean.shape == (1, states)
+    assert covariance.shape == (1, states, states)
+
+    gain = np.linalg.solve(dense, signal[have, -1])
+    _, probability, _, _, now, var = _reference.run_bank(
+        y, DT, BIAS_MEAN, BIAS_SD, *node, ln_prior=[0.0], after=[n], **beside
+    )
+    assert probability[0, law] == 1.0
+    assert now[0, law] == pytest.approx(BIAS_MEAN + gain @ (y[have] - BIAS_MEAN), abs=1e-8)
+    assert var[0, law] == pytest.approx(signal[-1, -1] - gain @ signal[have, -1], abs=1e-8)
+
+
+def test_flicker_has_the_spectrum_it_states() -> None:
+    """Two-sided spectrum of the three terms, each 2 s^2 a/(a^2 + w^2), against B^2/(2 pi f) = B^2/w: within 12 % over
+    two decades, 2.4 % in the middle (the ripple of one term a decade, and what lies further out is missing)."""
+    w = np.geomspace(0.1, 10.0, 301)
+    ratio = sum(2.0 * np.log(10.0) / np.pi * a / (a**2 + w**2) for a in (0.1, 1.0, 10.0)) * w
+    assert abs(ratio - 1.0).max() < 0.12
+    assert abs(ratio[150] - 1.0) < 0.024
+
+
 def test_bad_arguments_are_refused() -> None:
     y = np.zeros(5)
     with pytest.raises(ValueError, match="sigma_v"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(0, 0.0, 1.0, 0.0)]))
     with pytest.raises(ValueError, match="law"):
-        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(3, 0.0, 1.0, 1.0)]))
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(6, 0.0, 1.0, 1.0)]))
+    with pytest.raises(ValueError, match="theta"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(4, 1.1, 1.0, 1.0)]))
+    with pytest.raises(ValueError, match="no factors r"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(4, 0.5, 1.0, 1.0)]), r=np.ones(5))
+    with pytest.raises(ValueError, match="as many states"):
+        _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(1, 0.5, 1.0, 1.0), (3, 0.5, 1.0, 1.0)]))
     with pytest.raises(ValueError, match="length"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays(NODES), r=np.ones(4))
     with pytest.raises(ValueError, match="come together"):

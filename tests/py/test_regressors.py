@@ -29,6 +29,7 @@ from selfcal.tables import Tables, make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.verbs.replay import replay
 
 LN_P_DOUBLE = 1e-3
 PROBABILITY_DOUBLE = 1e-6
@@ -207,7 +208,7 @@ def test_a_model_without_regressors_pays_nothing() -> None:
     bank, beside = Bank(plain), Bank(offered)
     bank.push(y[:, None])
     beside.push(y[:, None], None, z)
-    assert bank.raw.size == plain.nodes * (52 + 20)
+    assert bank.raw.size == plain.nodes * (56 + 20)
     node, fixed = 4 * 7 * 10 + 8 * 6 + 4, 6 * 4 * (2 * 16 + 5) + 5 * 8 + 7  # of p = 6 and one axis; batch of 16
     assert beside.raw.size == bank.raw.size + plain.nodes * node + fixed
     one, other = bank.report(0), beside.report(0, 0)
@@ -226,11 +227,12 @@ def test_what_does_not_fit_is_refused() -> None:
         bank.push(samples, None, np.zeros((20, 5)))
     z = np.zeros((20, 6))
     z[3, 2] = np.nan
+    z[7, 0] = 2.0**40  # SELFCAL_SAMPLE_MAX
     bank.push(np.random.default_rng(1).normal(size=(20, 1)), None, z)
     counters = bank.raw.counters()
-    assert counters["regressor_not_finite"] == 1
-    assert counters["samples"] == 19
-    assert bank.raw.count == 19
+    assert counters["regressor_not_finite"] == 2
+    assert counters["samples"] == 18
+    assert bank.raw.count == 18
     with pytest.raises(ValueError, match="argument out of range"):
         bank.raw.report(0, 0b1000000)
     none = replace(tables, regressors=tuple(replace(one, coefficient_sd=(0.0,)) for one in tables.regressors))
@@ -325,6 +327,11 @@ def test_identify_finds_what_is_in_the_record(tmp_path: Path) -> None:
             ours = library["regressors"][name]["coefficients"][column]
             assert ours["mean"] == pytest.approx(exact["mean"], abs=0.05 * exact["sd"])
             assert ours["sd"] == pytest.approx(exact["sd"], rel=0.03)
+
+
+def test_the_firmware_takes_no_regressors(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="gives its bank no regressors"):
+        replay(tmp_path / "log.csv", model=model_file(tmp_path, ENTRIES))
 
 
 def test_a_temperature_that_is_not_there_is_said(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
-// The C library as Python sees it: one class over selfcal_t that owns its memory and tables. Compiled twice from the same
-// sources, as _library32 (the float of the firmware) and _library64 (-DSELFCAL_REAL_DOUBLE, to tell rounding from method).
+// The C library as Python sees it: one class over selfcal_t that owns its memory and tables. Compiled from the same sources
+// as _library32 (the float of the firmware), _library64 (-DSELFCAL_REAL_DOUBLE, to tell rounding from method), _fixed16 and
+// _fixed32 (-DSELFCAL_FIXED, the firmware of parts without an FPU).
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -201,6 +202,21 @@ public:
         return d;
     }
 
+#ifdef SELFCAL_FIXED
+    nb::dict scale(uint8_t axis) const {
+        if (axis >= axes_.size())
+            throw std::invalid_argument("axis out of range");
+        const selfcal_scale_t *s = selfcal_scale(&bank_, axis);
+        nb::dict d;
+        d["exponent"] = s->exponent;
+        d["coarser"] = s->coarser;
+        d["finer"] = s->finer;
+        d["most_y"] = s->most_y;
+        d["most_c"] = s->most_c;
+        return d;
+    }
+#endif
+
     uint32_t count() const { return selfcal_count(&bank_); }
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const {
@@ -366,6 +382,9 @@ NB_MODULE(MODULE_NAME, m) {
         .def("save", &Bank::save)
         .def("restore", &Bank::restore)
         .def_prop_ro("sound", &Bank::sound)
+#ifdef SELFCAL_FIXED
+        .def("scale", &Bank::scale)
+#endif
         .def_prop_ro("count", &Bank::count)
         .def_prop_ro("nodes", &Bank::nodes)
         .def_prop_ro("size", &Bank::size);

@@ -75,21 +75,30 @@ sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, 
     return out;
 }
 
-sr::Node node(int law, double drift, double alpha, double sigma_v) {
+sr::Node node(int law, double drift, double alpha, double sigma_v, double walk) {
     if (law < 0 || law >= static_cast<int>(sr::laws))
-        throw std::invalid_argument("law must be 0, 1 or 2");
-    if (!(sigma_v > 0.0) || (law != 0 && !(drift >= 0.0)) || (law == 2 && !(alpha > 0.0)))
-        throw std::invalid_argument("sigma_v and alpha must be positive, drift at least 0");
-    return {static_cast<sr::Law>(law), drift, alpha, sigma_v};
+        throw std::invalid_argument("law must be 0 to " + std::to_string(sr::laws - 1));
+    const sr::Node out{static_cast<sr::Law>(law), drift, alpha, sigma_v, walk};
+    if (out.law == sr::Law::moving_average && !(std::abs(drift) <= 1.0))
+        throw std::invalid_argument("theta of a moving average must be -1 to 1");
+    const bool free = out.law == sr::Law::constant || out.law == sr::Law::moving_average;
+    const bool needs_alpha = !free && out.law != sr::Law::random_walk;
+    if (!(sigma_v > 0.0) || (!free && !(drift >= 0.0)) || (needs_alpha && !(alpha > 0.0)) || !(walk >= 0.0))
+        throw std::invalid_argument("sigma_v and alpha must be positive, drift and walk at least 0");
+    return out;
 }
 
-std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vector &alpha, const Vector &sigma_v) {
+std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vector &alpha, const Vector &sigma_v,
+                                const std::optional<Vector> &walk, bool factors) {
     const std::size_t m = law.shape(0);
-    if (drift.shape(0) != m || alpha.shape(0) != m || sigma_v.shape(0) != m)
-        throw std::invalid_argument("law, drift, alpha and sigma_v must have one length");
+    if (drift.shape(0) != m || alpha.shape(0) != m || sigma_v.shape(0) != m || (walk && walk->shape(0) != m))
+        throw std::invalid_argument("law, drift, alpha, sigma_v and walk must have one length");
     std::vector<sr::Node> nodes;
-    for (std::size_t j = 0; j < m; j++)
-        nodes.push_back(node(law(j), drift(j), alpha(j), sigma_v(j)));
+    for (std::size_t j = 0; j < m; j++) {
+        nodes.push_back(node(law(j), drift(j), alpha(j), sigma_v(j), walk ? (*walk)(j) : 0.0));
+        if (factors && nodes[j].law == sr::Law::moving_average)
+            throw std::invalid_argument("a moving average takes no factors r");
+    }
     return nodes;
 }
 
@@ -97,15 +106,19 @@ std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, dou
                                                const Laws &law, const Vector &drift, const Vector &alpha,
                                                const Vector &sigma_v, const std::optional<Vector> &r,
                                                const std::optional<Columns> &z,
-                                               const std::optional<Vector> &coefficient_sd) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
+                                               const std::optional<Vector> &coefficient_sd,
+                                               const std::optional<Vector> &walk) {
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk, r.has_value());
+    for (const sr::Node &one : nodes)
+        if (sr::order(one.law) != sr::order(nodes[0].law))
+            throw std::invalid_argument("the laws of one call must have as many states each");
     const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     std::vector<sr::Filtered> filtered;
     {
         nb::gil_scoped_release release;
         filtered = sr::run_filters(rec, nodes);
     }
-    const std::size_t size = 2 + rec.regressors;
+    const std::size_t size = (nodes.empty() ? 1 : sr::order(nodes[0].law)) + 1 + rec.regressors;
     const Array<double> ln_p({nodes.size()}), mean({nodes.size(), size}), covariance({nodes.size(), size, size});
     for (std::size_t j = 0; j < nodes.size(); j++) {
         ln_p.data()[j] = filtered[j].ln_p;
@@ -119,8 +132,8 @@ std::tuple<Output, Output, Output, Output, Output, Output>
 run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const Laws &law, const Vector &drift,
          const Vector &alpha, const Vector &sigma_v, const std::vector<double> &ln_prior,
          const std::vector<std::size_t> &after, const std::optional<Vector> &r, const std::optional<Columns> &z,
-         const std::optional<Vector> &coefficient_sd) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v);
+         const std::optional<Vector> &coefficient_sd, const std::optional<Vector> &walk) {
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk, r.has_value());
     if (ln_prior.size() != nodes.size())
         throw std::invalid_argument("ln_prior must have one value a node");
     for (std::size_t m = 0; m < after.size(); m++)
@@ -152,8 +165,10 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const L
 
 Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, int law, double drift, double alpha,
                    double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
-                   const std::optional<Vector> &coefficient_sd) {
-    const sr::Node one = node(law, drift, alpha, sigma_v);
+                   const std::optional<Vector> &coefficient_sd, double walk) {
+    const sr::Node one = node(law, drift, alpha, sigma_v, walk);
+    if (r && one.law == sr::Law::moving_average)
+        throw std::invalid_argument("a moving average takes no factors r");
     const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     const Array<double> out({rec.n});
     {
@@ -193,11 +208,11 @@ NB_MODULE(_reference, m) {
     using namespace nb::literals;
     m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
     m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = nb::none());
     m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = nb::none());
     m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = 0.0);
 
     nb::class_<sr::Scene>(m, "Scene")
         .def(nb::init<>())
@@ -212,7 +227,11 @@ NB_MODULE(_reference, m) {
         .def(nb::init<>())
         .def_prop_rw(
             "law", [](const sr::Axis &axis) { return static_cast<int>(axis.law); },
-            [](sr::Axis &axis, int law) { axis.law = node(law, 0.0, 1.0, 1.0).law; })
+            [](sr::Axis &axis, int law) {
+                if (law < 0 || law > static_cast<int>(sr::Law::gauss_markov))
+                    throw std::invalid_argument("law must be 0, 1 or 2");
+                axis.law = static_cast<sr::Law>(law);
+            })
         .def_rw("bias", &sr::Axis::bias)
         .def_rw("N", &sr::Axis::N)
         .def_rw("K", &sr::Axis::K)

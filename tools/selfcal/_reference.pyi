@@ -1,13 +1,14 @@
 """The textbook bank of Stepanov & Motorin (2017) and the recording simulator: host_sim/ compiled
 (bindings/reference.cpp).
 
-Nodes are four arrays of one length m: `law` int32 (0 constant, 1 random walk, 2 Gauss-Markov: the order of model.LAWS),
-`drift` (K in unit/s/sqrt(Hz), or sigma_m in unit; not used by law 0), `alpha` (1/s, law 2 only), `sigma_v` (unit, per
-sample: N / sqrt(dt_s)). A record is `y` float64[n] in its unit, NaN where a sample is missing, every `dt_s`; `r`
-float64[n] multiplies sigma_v^2, None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z`
-float64[n, p], p <= 6, finite where y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in the
-unit of y per unit of each column. Arguments that do not fit raise ValueError. All cores are used, the interpreter's
-lock is released.
+Nodes are arrays of one length m: `law` int32 (0 constant, 1 random walk, 2 Gauss-Markov: the order of model.LAWS;
+beyond the paper's 3 flicker, 4 moving average, 5 random walk and Gauss-Markov: host_sim/textbook_bank.hpp), `drift`
+(K in unit/s/sqrt(Hz), sigma_m or the flicker coefficient B in unit, theta; not used by law 0), `alpha` (1/s, laws 2,
+3 and 5), `sigma_v` (unit, per sample: N / sqrt(dt_s)), and `walk` (K of law 5, default 0). A record is `y` float64[n]
+in its unit, NaN where a sample is missing, every `dt_s`; `r` float64[n] multiplies sigma_v^2, None is 1. The bias x0
+is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where y is, with
+coefficients c normal about 0 with `coefficient_sd` float64[p], in the unit of y per unit of each column. Arguments
+that do not fit raise ValueError. All cores are used, the interpreter's lock is released.
 """
 
 from collections.abc import Sequence
@@ -32,9 +33,11 @@ def run_filters(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    walk: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats]:
-    """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, 2 + p] and
-    covariance [m, 2 + p, 2 + p] of the state (drift, x0, c)."""
+    """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, d + 1 + p] and
+    covariance [m, d + 1 + p, d + 1 + p] of the state (drift, x0, c), where a drift has d = 1 state, under laws 3 to 5
+    three, two and two. The laws of one call must agree in d."""
 
 def run_bank(
     y: _Floats,
@@ -50,13 +53,14 @@ def run_bank(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    walk: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
     """The bank at t instants, `after` so many samples (ascending). `ln_prior`: ln of each node's prior probability, up
     to a constant.
 
-    Returns weight [t, m] (equations 11 and 13: they sum to 1 over all nodes), probability [t, 3] of the laws (13), mean
-    [t, 3, 3] and covariance [t, 3, 3, 3] of (drift, alpha, sigma_v) under each law (12, 14), and mean and variance [t,
-    3] of x0 + drift + c z now under each law. A law of probability 0 has NaN moments.
+    Returns weight [t, m] (equations 11 and 13: they sum to 1 over all nodes), probability [t, 6] of the laws (13), mean
+    [t, 6, 3] and covariance [t, 6, 3, 3] of (drift, alpha, sigma_v) under each law (12, 14), and mean and variance [t,
+    6] of x0 + drift + c z now under each law. A law of probability 0 has NaN moments.
     """
 
 def innovations(
@@ -71,6 +75,7 @@ def innovations(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    walk: float = 0.0,
 ) -> _Floats:
     """Standardised innovations nu / sqrt(s) [n] of one node's filter, NaN where a sample is missing."""
 

@@ -47,6 +47,7 @@ class Engine(StrEnum):
 
     library = "library"
     reference = "reference"
+    fixed = "fixed"
 
 
 class Target(StrEnum):

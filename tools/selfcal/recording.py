@@ -23,15 +23,14 @@ from numpy.typing import NDArray
 
 from selfcal import units
 from selfcal.errors import UserError
+from selfcal.sampling import Ambiguous, sampling
 
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 #: Unit of a scaled LSB column where the scale states none, by the column's first letter.
 _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
-#: Rows looked at on either side of a long time step to tell missing samples from a late one.
-_NEIGHBOURS = 10
-#: Steps in one window of the rate estimate.
-_WINDOW = 64
+#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
+_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
@@ -277,10 +276,13 @@ class _Header:
         if unit is None:
             if self.columns and not mapped and name != "t" and name not in self.sensors:
                 return []
-            example = "s" if name == "t" else _LSB_UNITS.get(name[0], "V")
-            raise UserError(
-                f"{column} has no unit: write {name}[{example}] in the header or give --unit {name}={example}"
-            )
+            if "[" in name or "]" in name:
+                raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
+            known = {"t": "s", "temp": "degC", "supply": "V", **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
+            example = known.get(name, _LSB_UNITS.get(name[0]) if name in self.sensors else None)
+            hint = f"write {name}[{example or 'UNIT'}] in the header or give --unit {name}={example or 'UNIT'}"
+            leave = "" if example else ", or leave it out by naming what to read with --column NAME=HEADER"
+            raise UserError(f"{column} has no unit: {hint}{leave}")
         if not isinstance(unit, str) or not units.known(unit):
             raise UserError(f"{column} has the unknown unit '{unit}' (known: {', '.join(units.RECORDING_UNITS)})")
         size = 1.0
@@ -325,7 +327,12 @@ def _load_csv(path: Path, rate: float | None, header: _Header) -> Recording:
         raise UserError(f"{path}: line 1: the file holds empty lines only")
     if "," not in lines[0] and re.search(r"[;\t]", lines[0]):
         raise UserError(f"{path}: line 1: columns must be separated by commas")
-    keys = [key.strip().strip('"').strip() for key in lines[0].split(",")]
+    keys = []
+    for number, key in enumerate(lines[0].split(",")):
+        inner = _unquoted(key)
+        if inner is None:
+            raise UserError(f"{path}: line 1: column {number + 1}: an unclosed quote: '{_short(key.strip())}'")
+        keys.append(inner.strip())
     meta = _csv_meta(path)
     fields = header.fields(keys, "line 1: ", {})
     index = [keys.index(field.key) for field in fields]
@@ -348,6 +355,13 @@ def _load_csv(path: Path, rate: float | None, header: _Header) -> Recording:
     if table is None or len(table) != len(rows):
         table = _scan(rows, len(keys), index, fail)
     return _checked(path, rate, meta, fields, list(table.T), fail)
+
+
+def _unquoted(cell: str) -> str | None:
+    """A cell without the spaces and the pair of quotes around it; None if one quote has no partner."""
+    text = cell.strip()
+    inner = text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text
+    return None if '"' in inner else inner
 
 
 def _csv_text(path: Path) -> str:
@@ -395,7 +409,9 @@ def _scan(lines: Sequence[str], width: int, index: Sequence[int], fail: _Fail) -
         if len(cells) != width:
             fail(row, None, f"{len(cells)} cells where the header has {width}" if line.strip() else "an empty line")
         for field, column in enumerate(index):
-            cell = cells[column].strip().strip('"')
+            cell = _unquoted(cells[column])
+            if cell is None:
+                fail(row, field, f"an unclosed quote: '{_short(cells[column].strip())}'")
             if not _NUMBER.match(cell) and not _NOT_FINITE.match(cell):
                 fail(row, field, f"'{_short(cell)}' is not a number" if cell else "an empty cell")
             table[row, field] = float(cell)
@@ -493,16 +509,33 @@ def _checked(
         missing = np.zeros(table[0].size, np.int64)
     else:
         time = units.convert(stamps.values - stamps.values[0], stamps.unit, "s")
-        steps = np.diff(time)
-        if not (steps > 0.0).all():
-            row = int(np.argmin(steps > 0.0)) + 1
-            number = [field.name for field in fields].index("t")
-            fail(row, number, "the time stamp repeats" if steps[row - 1] == 0.0 else "time runs backwards")
-        found, missing = _sampling(time, steps, rate)
+        number = [field.name for field in fields].index("t")
+        found, missing = _sampling(path, time, stamps, rate, lambda row, what: fail(row, number, what))
         if rate is not None and (not 0.9 < found / rate < 1.1 or 2 * np.count_nonzero(missing) > missing.size):
             raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}")
         rate = found if rate is None else rate
     return Recording(path, rate, columns, missing, meta)
+
+
+def _sampling(
+    path: Path, time: NDArray[np.float64], stamps: Column, rate: float | None, fail: Callable[[int, str], NoReturn]
+) -> tuple[float, NDArray[np.int64]]:
+    """Rate in Hz and missing_before[n] from time stamps float64[n] (s, from 0); `stamps` are those of the file."""
+    steps = np.diff(time)
+    if (steps < 0.0).any():
+        fail(int(np.argmax(steps < 0.0)) + 1, "time runs backwards")
+    repeats = steps == 0.0
+    few = time.size < _REPEATS_FROM or np.count_nonzero(repeats) < _REPEATS_LEAST * time.size
+    if repeats.any() and (few or repeats.all()):
+        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+    noise = float(np.abs(units.convert(np.spacing(np.abs(stamps.values).max(keepdims=True)), stamps.unit, "s"))[0])
+    try:
+        dt, missing = sampling(time, noise, rate)
+    except Ambiguous as error:
+        raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
+    if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
+        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+    return float(f"{1.0 / dt:.10g}"), missing
 
 
 def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:
@@ -512,47 +545,3 @@ def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:
     if not (np.isfinite(rate) and rate > 0.0):
         raise UserError(f"{path}: meta: 'rate_hz' must be a number above 0")
     return rate
-
-
-def _sampling(
-    time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None
-) -> tuple[float, NDArray[np.int64]]:
-    """Rate in Hz and missing_before[n] from time stamps float64[n], their differences (both s) and any stated rate.
-
-    The interval is the median step, longer ones left out. Where stamps are coarser than the interval, steps alternate
-    (1, 1, 1, 2 ms for 819.2 Hz) and the median misleads; then sums of many steps are even, which missing samples would
-    scatter. Stamps that are that coarse and more than 0.5 % missing samples at once need a stated rate.
-    """
-    if rate is not None:
-        dt = 1.0 / rate
-    else:
-        dt = float(np.median(steps))
-        dt = float(np.median(steps[steps < 1.5 * dt]))
-        if time.size > 2 * _WINDOW:
-            sums = time[_WINDOW:] - time[:-_WINDOW]
-            if np.var(sums) <= 0.3 * dt**2:  # alternating steps: at most 1/4; random gaps: their mean number
-                dt = float(np.median(sums)) / _WINDOW
-    missing = _missing(time, steps, dt)
-    dt = float(time[-1]) / (time.size - 1 + int(missing.sum()))
-    return float(f"{1.0 / dt:.10g}"), missing
-
-
-def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:
-    """missing_before[n]. A late sample makes one long step and then a short one; missing ones shift all that follows.
-
-    So the shift is taken from the earliest of the rows since the last long step to the earliest of those that follow.
-    """
-    missing = np.zeros(time.size, np.int64)
-    long = np.flatnonzero(steps > 1.5 * dt) + 1
-    if long.size == 0:
-        return missing
-    reach = np.arange(_NEIGHBOURS)
-    last = np.concatenate(([0], long[:-1]))  # first row since the long step before
-    before = np.maximum(long[:, None] - 1 - reach, last[:, None])
-    after = np.minimum(long[:, None] + reach, time.size - 1)
-    # Relative to the row before the step, so that 10^8 rows cost no digits.
-    origin, start = long[:, None] - 1, time[long - 1][:, None]
-    early = (time[before] - start - (before - origin) * dt).min(axis=1)
-    late = (time[after] - start - (after - origin) * dt).min(axis=1)
-    missing[long] = np.maximum(0, np.rint((late - early) / dt)).astype(np.int64)
-    return missing

@@ -1,14 +1,14 @@
-"""The C library from Python: the very code of the firmware, in its float (`_library32`) or in double (`_library64`)."""
+"""The C library from Python: the very code of the firmware, in its float, its two fixed-point forms, or in double."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _dense, _library32, _library64
+from selfcal import _dense, _fixed16, _fixed32, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS
 from selfcal.result import AxisResult, Estimate
@@ -31,11 +31,20 @@ def _regressors(tables: Tables) -> tuple[list[float], list[float]] | None:
 
 
 class Bank:
-    """A bank over the axes of `tables`; `double`: the verification build, `dense`: 64 nodes a dimension."""
+    """A bank over the axes of `tables`.
 
-    def __init__(self, tables: Tables, *, double: bool = False, dense: bool = False) -> None:
+    `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `fixed` the integer kernels by
+    products of so many bits (SELFCAL_FIXED).
+    """
+
+    def __init__(
+        self, tables: Tables, *, double: bool = False, dense: bool = False, fixed: Literal[16, 32] | None = None
+    ) -> None:
         self.tables = tables
-        self.raw: Any = (_dense if dense else _library64 if double else _library32).Bank(
+        build = _dense if dense else _library64 if double else _library32
+        if fixed is not None:
+            build = {16: _fixed16, 32: _fixed32}[fixed]
+        self.raw: Any = build.Bank(
             tables.dt_s,
             tables.block,
             [

@@ -37,6 +37,8 @@ def codegen(
 
 
 def _header(model: Model, tables: Tables) -> str:
+    largest = max((grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid), default=0)
+    axes, hypotheses = len(tables.axes), len(tables.hypotheses)
     return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
 #ifndef SELFCAL_MODEL_H
 #define SELFCAL_MODEL_H
@@ -44,11 +46,15 @@ def _header(model: Model, tables: Tables) -> str:
 #include "selfcal.h"
 
 #define SELFCAL_MODEL_NODES {tables.nodes}U
-#define SELFCAL_MODEL_AXES {len(tables.axes)}U
-#define SELFCAL_MODEL_HYPOTHESES {len(tables.hypotheses)}U
+#define SELFCAL_MODEL_AXES {axes}U
+#define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
 #define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+
+#if SELFCAL_GRID_MAX < {largest} || SELFCAL_AXES_MAX < {axes} || SELFCAL_HYPOTHESES_MAX < {hypotheses}
+#error "SELFCAL_GRID_MAX, SELFCAL_AXES_MAX or SELFCAL_HYPOTHESES_MAX is too small for this model"
+#endif
 
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];

@@ -70,15 +70,16 @@ def identify(
 ) -> dict[str, Any]:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
-    `engine`: 'library' (the firmware's C code in float, one bank an axis) or 'reference' (the textbook bank in double,
-    its grid refined until the probabilities settle). `decimate`: rate of the block means in Hz, else the model's.
+    `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU,
+    by 16-bit products) or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
+    `decimate`: rate of the block means in Hz, else the model's.
     `export`: a format of `selfcal.export` and the file to write.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
-    if engine not in ("library", "reference"):
-        raise UserError(f"there is no engine '{engine}' (library, reference)")
+    if engine not in ("library", "reference", "fixed"):
+        raise UserError(f"there is no engine '{engine}' (library, reference, fixed)")
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
@@ -147,14 +148,16 @@ def identify_axis(
         raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
     if not present.std() > 0.0:
         raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
+    if engine == "fixed" and regressors:
+        raise UserError("the fixed-point bank knows no regressors: take --engine library, or a model without them")
     choices = choices_of(regressors)
     results: list[AxisResult] = []
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
-    if engine == "library":
+    if engine in ("library", "fixed"):
         from selfcal.engines.library import Bank
 
-        bank = Bank(tables)
+        bank = Bank(tables, fixed=16 if engine == "fixed" else None)
         bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
         for choice in choices:
             results.append(bank.report(0, mask_of(regressors, choice)))

@@ -91,6 +91,8 @@ def replay(
         if file is not None and not Path(file).parent.is_dir():
             raise UserError(f"{file}: cannot write: there is no such folder")
     loaded_model = Model.load(model)
+    if loaded_model.regressors:
+        raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded_model, axes)
     for name in names:

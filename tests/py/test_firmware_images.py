@@ -1,0 +1,217 @@
+"""The images of `make firmware`: their sizes (tests/bench/image_sizes.py), their start, and `make flash`.
+
+Truth of the stack's bound: the deepest that a run in the emulator went, painted and looked at (a bound may only be
+above it), and small programs whose depth can be counted by hand.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests" / "bench"))
+
+import image_sizes  # noqa: E402
+from image_sizes import FirmwareError, Image  # noqa: E402
+
+from selfcal import recording as recording_module  # noqa: E402
+from selfcal.model import Model  # noqa: E402
+from selfcal.recording import load  # noqa: E402
+from selfcal.verbs.replay import TARGETS, build, emulator, write_rows  # noqa: E402
+from selfcal.wire import load_dbc  # noqa: E402
+
+#: Frames of a status: the items that the DBC has.
+STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})
+CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
+#: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
+CALLS = {"app.c": ["board_time_ms", "board_sample", "board_send", "board_idle"], "replay.c": ["board_read"]}
+
+
+@pytest.fixture(scope="module")
+def images() -> None:
+    subprocess.run(["make", "-s", "firmware-images"], cwd=ROOT, check=True, capture_output=True)
+
+
+def link(folder: Path, source: str, core: str = "cortex-m0") -> Image:
+    """An image of one C file with a vector table of its own."""
+    (folder / "objects").mkdir()
+    (folder / "small.c").write_text(source)
+    compiler = ["arm-none-eabi-gcc", "-mthumb", *CORES[core], "-O2", "-std=c99"]
+    options = ["-g", "-fstack-usage", "-fno-inline", "-fno-optimize-sibling-calls", "-c", "../small.c"]
+    subprocess.run([*compiler, *options], cwd=folder / "objects", check=True)
+    layout = ["-nostartfiles", "-Wl,-e,start,-Ttext=0,-Tdata=0x20000000,--defsym=end=0"]
+    subprocess.run([*compiler, *layout, "objects/small.o", "-o", "small.elf"], cwd=folder, check=True)
+    return Image(folder / "small.elf")
+
+
+START = "extern volatile int sink;\nvolatile int sink;\nvoid start(void);\n"
+VECTORS = "const void *const vectors[16] = {0, (const void *)start};\n"
+
+
+@pytest.mark.parametrize("core", CORES)
+def test_a_stack_counted_by_hand(core: str, tmp_path: Path) -> None:
+    """start 8 (r4, lr), deep 400 + 8 or more, leaf 0; aligned to 8, so the sum lies between 416 and 448."""
+    source = (
+        "void leaf(volatile int *at); void leaf(volatile int *at) { *at = 1; }\n"
+        "void deep(void); void deep(void) { volatile int room[100]; leaf(room); sink = room[0]; }\n"
+        "void start(void) { deep(); sink = 2; }\n"
+    )
+    size, path = link(tmp_path, START + source + VECTORS, core).stack({})
+    assert 416 <= size <= 448
+    assert [step.split()[0] for step in path.split(" > ")] == ["start", "deep", "leaf"]
+
+
+def test_a_call_through_a_table(tmp_path: Path) -> None:
+    """The deepest function of the table that the caller's file is said to use."""
+    source = (
+        "void low(void); void low(void) { sink = 1; }\n"
+        "void deep(void); void deep(void) { volatile int room[100]; room[0] = 1; sink = room[0]; }\n"
+        "extern void (*const table[2])(void); void (*const table[2])(void) = {low, deep};\n"
+        "void start(void) { table[sink & 1](); sink = 2; }\n"
+    )
+    size, path = link(tmp_path, START + source + VECTORS).stack({"small.c": ["table"]})
+    assert 408 <= size <= 432
+    assert [step.split()[0] for step in path.split(" > ")] == ["start", "deep"]
+
+
+@pytest.mark.parametrize(
+    ("source", "complaint"),
+    [
+        ("int f(int n); int f(int n) { return n < 2 ? n : f(n - 1) * f(n - 2) + sink; }\n"
+         "void start(void) { sink = f(sink); }\n", "recursion: f"),
+        ("void start(void) { ((void (*)(void))sink)(); sink = 1; }\n", "start in small.c calls by pointer"),
+        ("void start(void) { volatile char room[sink]; room[0] = 1; sink = room[sink]; }\n", "frame"),
+    ],
+)  # fmt: skip
+def test_what_has_no_bound_is_refused(source: str, complaint: str, tmp_path: Path) -> None:
+    with pytest.raises(FirmwareError, match=complaint):
+        link(tmp_path, START + source + VECTORS).stack({})
+
+
+@pytest.mark.parametrize("core", CORES)
+def test_the_stack_stays_below_its_bound(core: str, tmp_path: Path) -> None:
+    """And the bound is not idle: a run with reports goes at least two thirds as deep."""
+    whole = load(ROOT / "tests" / "data" / "simulated_adis16405.npz")
+    columns = {
+        axis: (whole.columns[axis].unit, whole.in_unit(axis, whole.columns[axis].unit)[:600]) for axis in ("gx", "ax")
+    }
+    recording_module.save(tmp_path / "part.npz", columns, whole.rate_hz, {})
+    recording = load(tmp_path / "part.npz")
+    model = Model.load()
+    program = build(model, recording.rate_hz, ("gx", "ax"), core)
+    settings = [f"MODEL_DIR={program.parent}", f"OUT={tmp_path}", f"CORE={core}"]
+    settings += [f"QEMU_CFLAGS=-g -fstack-usage -dumpdir {tmp_path}/objects/ -DQEMU_STACK"]
+    (tmp_path / "objects").mkdir()
+    subprocess.run(["make", "-s", "-f", "port/qemu/qemu.mk", "qemu", *settings], cwd=ROOT, check=True)
+    write_rows(recording, model, ("gx", "ax"), tmp_path / "rows.bin")
+    module = subprocess.Popen(
+        emulator(tmp_path / TARGETS[core].image, "rows.bin", 20.0, core, "stdio,id=uart,signal=off"),
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert module.stderr is not None and module.stdin is not None and module.stdout is not None
+    assert module.stderr.readline() == b"SELFCAL_UART\n"
+    module.stdin.write(b"O\r")
+    module.stdin.flush()
+    module.stdout.read(1 + 22 * (3 * (STATUS + 2 * 44) + STATUS))
+    _, errors = module.communicate(b"C\r", timeout=60)
+    found = re.fullmatch(rb"stack (\d+)\n", errors)
+    assert found, errors
+    assert module.returncode == 0
+    bound, path = Image(tmp_path / TARGETS[core].image).stack(CALLS)
+    print(f"{core}: went {int(found[1])}, bound {bound}: {path}")
+    assert int(found[1]) <= bound
+    assert int(found[1]) >= bound * 2 / 3
+
+
+@pytest.mark.usefixtures("images")
+def test_the_images_keep_their_budgets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["image_sizes.py", *image_sizes.TARGETS])
+    assert image_sizes.main() == 0
+    table = capsys.readouterr().out
+    for target in image_sizes.TARGETS:
+        sizes, _ = image_sizes.measure(target)
+        binary = (ROOT / "build" / target / "selfcal.bin").stat().st_size
+        assert sizes["flash"] == pytest.approx(binary, abs=16)  # what is burnt, but for the filling between sections
+        assert re.search(rf"^{target} +{sizes['flash']:,} ", table, re.MULTILINE)
+        assert (ROOT / "build" / target / "selfcal.hex").read_text().endswith(":00000001FF\n")
+    tight = image_sizes.read_budget("cortex-m0") | {"stack": 100}
+    monkeypatch.setattr(image_sizes, "read_budget", lambda target: tight)
+    monkeypatch.setattr(sys, "argv", ["image_sizes.py", "cortex-m0"])
+    assert image_sizes.main() == 1
+    assert "cortex-m0: stack is " in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("images")
+def test_the_cortex_m0_image_starts() -> None:
+    """As it is, on the emulated board: no sensor there, but the main loop turns and the UART's interrupts answer."""
+    image = ROOT / "build" / "cortex-m0" / "selfcal.elf"
+    board = ["-M", *TARGETS["cortex-m0"].board, "-display", "none", "-monitor", "none", "-serial", "stdio"]
+    module = subprocess.Popen(
+        ["qemu-system-arm", *board, "-kernel", str(image)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert module.stdin is not None and module.stdout is not None
+    try:
+        time.sleep(1.0)  # bytes that come before the UART is on are lost
+        module.stdin.write(b"V\rN\r\rO\rt1230\r")
+        module.stdin.flush()
+        assert module.stdout.read(15) == b"V0101\rNSCAL\r\r\r\a"
+    finally:
+        module.kill()
+        module.communicate()
+
+
+def flash(
+    folder: Path, tools: tuple[str, ...], *arguments: str, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """tools/setup/flash.sh with programs of these names that print what they are called with."""
+    for name in ("make", *tools):
+        program = folder / name
+        program.write_text('#!/bin/sh\necho "$(basename "$0") $*"\n')
+        program.chmod(0o755)
+    for name in ("sh", "basename"):
+        (folder / name).symlink_to(f"/bin/{name}" if Path(f"/bin/{name}").exists() else f"/usr/bin/{name}")
+    command = ["/bin/sh", str(ROOT / "tools" / "setup" / "flash.sh"), *arguments, "stm32f405", "cortex-m0"]
+    env = {**os.environ, "PATH": str(folder), **environment}
+    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("tools", "environment", "line"),
+    [
+        (("openocd", "st-flash"), {}, "openocd -f interface/stlink.cfg -f target/stm32f4x.cfg -c program "),
+        (("st-flash", "dfu-util"), {}, "st-flash --reset write build/stm32f405/selfcal.bin 0x08000000"),
+        (("dfu-util",), {}, "dfu-util -a 0 -s 0x08000000:leave -D build/stm32f405/selfcal.bin"),
+        (("openocd", "dfu-util"), {"FLASHER": "dfu-util"}, "dfu-util -a 0"),
+    ],
+)
+def test_flash_takes_what_is_there(
+    tools: tuple[str, ...], environment: dict[str, str], line: str, tmp_path: Path
+) -> None:
+    done = flash(tmp_path, tools, "stm32f405", **environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0] == "make --no-print-directory firmware"
+    assert done.stdout.splitlines()[-1].startswith(line)
+
+
+def test_flash_without_a_tool_or_a_target(tmp_path: Path) -> None:
+    done = flash(tmp_path, (), "stm32f405")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "make flash: none of these is installed: openocd st-flash dfu-util (packages openocd, stlink-tools, dfu-util)\n"
+    )
+
+
+def test_flash_of_an_unknown_target(tmp_path: Path) -> None:
+    done = flash(tmp_path, ("openocd",), "avr")
+    assert done.returncode == 2
+    assert done.stderr == "make flash TARGET=..., one of: stm32f405 cortex-m0\n"

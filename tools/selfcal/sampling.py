@@ -1,0 +1,255 @@
+"""Sampling rate and missing samples from time stamps.
+
+Stamps that are fine beside the sampling interval show it: it is the median step, and a missing sample a step of two.
+Stamps of 1 ms at 819.2 Hz do not: steps of 1 and 2 ms alternate, and a missing sample looks much like its neighbours.
+What such stamps do obey is that sample k was stamped within one lattice step of k dt. A sequential decoder follows the
+times that are still possible under a supposed dt: where none is left a sample is missing. Of all dt the one that needs
+the fewest missing samples is taken; where others need hardly more, the stamps cannot tell and that is said.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Rows looked at on either side of a long time step to tell missing samples from a late one.
+_NEIGHBOURS = 10
+#: Steps in one window of the first estimate.
+_WINDOW = 64
+#: Lattice step over interval from which stamps are coarse; below it a step of one interval is never taken for two.
+_COARSE = 0.25
+#: Rows that decide on dt, the shares of missing samples and of a too long first estimate, the step of dt.
+_HEAD, _LOST, _LONG, _STEP = 3000, 0.25, 0.05, 1e-4
+#: Change of rate within a record that the decoder follows.
+_WANDER = 3e-5
+#: Lattice steps between a sample and its stamp: less than one where the interval is a multiple, or a simple fraction,
+#: of the lattice; more where stamps come late.
+_SLACKS = np.array([0.02, 0.52, 0.69, 0.85, 1.0, 1.5]) * 1.0001
+#: Missing samples a row that a slack must save: none up to a lattice step; beyond, a stamp could be any of 1.5 (0.4 nat
+#: a row, where a missing sample costs some 3), and such a slack would swallow gaps.
+_PRICE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.15])
+#: A stamp that fits nowhere weighs as many missing samples.
+_ODD = 10
+#: Another dt with this many missing samples more or fewer is as good.
+_AS_GOOD = 5
+
+Found = tuple[float, NDArray[np.int64]]
+
+
+class Ambiguous(ValueError):
+    """The stamps do not tell the rate; the text says why."""
+
+
+def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
+    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing).
+
+    `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one. Raises Ambiguous. Coarse stamps of a
+    record with gaps take about a second and 10^6 rows another; all others are fast.
+    """
+    steps = np.diff(time)
+    window = max(1, min(_WINDOW, steps.size // 4))
+    typical = float(np.median(time[window:] - time[:-window])) / window
+    lattice = _lattice(steps, max(4.0 * noise_s, 1e-9 * typical))
+    if lattice > _COARSE * typical:
+        try:
+            return _coarse(time, lattice, typical, rate)
+        except Ambiguous:
+            if rate is None:
+                raise  # a stated rate decides, and is checked by who knows it
+    positive = steps[steps > 0.0]
+    first = float(np.median(positive[positive < 1.5 * np.median(positive)])) if rate is None else 1.0 / rate
+    return _fine(time, steps, first)
+
+
+def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
+    """Step (s) of the lattice that all time stamps lie on; 0 where there is none."""
+    ordered = np.sort(steps[steps > tolerance])
+    if ordered.size == 0:
+        return 0.0
+    starts = np.flatnonzero(np.diff(ordered, prepend=-np.inf) > tolerance)
+    if starts.size > 1000:
+        return 0.0
+    distinct = np.add.reduceat(ordered, starts) / np.diff(starts, append=ordered.size)
+    lattice = float(min(distinct.min(), np.diff(distinct).min(initial=np.inf)))
+    times = np.rint(distinct / lattice)
+    if (np.abs(distinct - times * lattice) > np.maximum(10.0 * tolerance, 0.01 * lattice)).any():
+        return 0.0
+    return float(distinct @ times / (times @ times))
+
+
+# ------------------------------------------------------------------------------------------------------- fine stamps
+
+
+def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> Found:
+    """Missing samples for a first dt, and dt from the time against the index with those in it, until both stay."""
+    missing = _missing(time, steps, dt)
+    for _ in range(8):
+        dt = float(time[-1]) / (time.size - 1 + int(missing.sum()))
+        again = _missing(time, steps, dt)
+        if np.array_equal(again, missing):
+            break
+        missing = again
+    return dt, missing
+
+
+def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:
+    """missing_before[n]. A late sample makes one long step and then a short one; missing ones shift all that follows.
+
+    So the shift is taken from the earliest of the rows since the last long step to the earliest of those that follow.
+    """
+    missing = np.zeros(time.size, np.int64)
+    long = np.flatnonzero(steps > 1.5 * dt) + 1
+    if long.size == 0:
+        return missing
+    reach = np.arange(_NEIGHBOURS)
+    last = np.concatenate(([0], long[:-1]))  # first row since the long step before
+    before = np.maximum(long[:, None] - 1 - reach, last[:, None])
+    after = np.minimum(long[:, None] + reach, time.size - 1)
+    # Relative to the row before the step, so that 10^8 rows cost no digits.
+    origin, start = long[:, None] - 1, time[long - 1][:, None]
+    early = (time[before] - start - (before - origin) * dt).min(axis=1)
+    late = (time[after] - start - (after - origin) * dt).min(axis=1)
+    missing[long] = np.maximum(0, np.rint((late - early) / dt)).astype(np.int64)
+    return missing
+
+
+# ----------------------------------------------------------------------------------------------------- coarse stamps
+
+
+def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: float | None) -> Found:
+    whole = _unbroken(time, lattice)
+    if whole is not None:
+        return whole, np.zeros(time.size, np.int64)
+    low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
+    head = time[:_HEAD]
+    grid, scores = _scan(head, lattice, low, high)
+    each = scores.min(axis=1)
+    best = _on_lattice(grid, each, lattice, head.size)
+    reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
+    same = np.abs(grid / grid[best] - 1.0) < reach
+    rivals = grid[~same & (each < each[best] + _AS_GOOD)]
+    if each[best] > 0.5 * head.size:
+        raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
+    exact = abs(grid[best] / lattice - np.rint(grid[best] / lattice)) < 1e-9
+    if rivals.size and not exact:
+        raise Ambiguous(
+            f"stamps of {lattice:.3g} s are too coarse to tell {1.0 / grid[best]:.4g} from {1.0 / rivals[0]:.4g} Hz"
+        )
+    near = np.flatnonzero(same)
+    for column, slack in enumerate(_SLACKS):
+        fit = scores[near, column]
+        if fit.min() > 1.1 * each[best] + _AS_GOOD:
+            continue
+        first = float(grid[near[int(fit.argmin())]])
+        dt, missing, odd = _settle(time, first, float(slack) * lattice)
+        if odd <= 1e-3 * time.size and abs(dt / first - 1.0) < reach:
+            return dt, missing
+    raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
+
+
+def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
+    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold."""
+    best = int(each.argmin())
+    times = np.rint(grid / lattice)
+    for k in np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid)):
+        if each[k] <= each[best] + _AS_GOOD and each[k] <= max(3.0, 0.05 * rows):
+            return int(k)
+    return best
+
+
+def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
+    """The mean step, if for some dt all stamps lie within a lattice step of an even grid without a gap; else None.
+
+    The span of what is left is a convex function of dt: a ternary search finds its least. The mean step is within
+    lattice/duration of the true dt, which the dt of the least span need not be.
+    """
+    index = np.arange(time.size)
+
+    def span(dt: float) -> float:
+        left = time - index * dt
+        return float(left.max() - left.min())
+
+    middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
+    low, high = middle - reach, middle + reach
+    if span(middle) < lattice:
+        return middle
+    for _ in range(40):
+        third = (high - low) / 3.0
+        if span(low + third) < span(high - third):
+            high -= third
+        else:
+            low += third
+    return middle if span(0.5 * (low + high)) < lattice * (1.0 + 1e-6) else None
+
+
+def _scan(
+    time: NDArray[np.float64], lattice: float, low: float, high: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """dt [m] from `low` to `high`, and scores [m, slacks]: gaps, and odd stamps _ODD times. The decoder
+    of _decode() for all at once, O(rows * m)."""
+    even = np.exp(np.arange(math.log(low), math.log(high), _STEP))
+    simple = lattice * np.concatenate([np.arange(1.0, 5.0), 1.0 / np.arange(2.0, 9.0)])
+    grid = np.concatenate([even, simple[(simple > low) & (simple < high)]])
+    dt, slack = np.repeat(grid, _SLACKS.size), np.tile(_SLACKS * lattice, grid.size)
+    down, up = dt * (1.0 - 0.5 * _STEP), dt * (1.0 + 0.5 * _STEP)
+    lo = np.full(dt.size, time[0])
+    hi = lo + slack
+    score = np.zeros(dt.size)
+    for stamp in time[1:].tolist():
+        lo += down
+        hi += up
+        late = np.ceil(np.maximum(stamp - hi, 0.0) / dt)
+        score += late > 0.0
+        late *= dt
+        lo += late
+        hi += late
+        end = stamp + slack
+        odd = lo >= end
+        score += _ODD * odd
+        np.copyto(lo, np.where(odd, stamp, np.maximum(lo, stamp)))
+        np.copyto(hi, np.where(odd, end, np.minimum(hi, end)))
+    return grid, score.reshape(-1, _SLACKS.size) + time.size * _PRICE
+
+
+def _decode(time: NDArray[np.float64], dt: float, slack: float) -> tuple[NDArray[np.int64], int]:
+    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be."""
+    missing = np.zeros(time.size, np.int64)
+    stamps = time.tolist()
+    lo, hi, odd, last = stamps[0], stamps[0] + slack, 0, 0
+    down, up = dt * (1.0 - _WANDER), dt * (1.0 + _WANDER)
+    for row in range(1, len(stamps)):
+        stamp = stamps[row]
+        end = stamp + slack
+        lo += down
+        hi += up
+        if stamp > hi:
+            gap = math.ceil((stamp - hi) / dt)
+            missing[row] = gap
+            last = row
+            lo += gap * dt
+            hi += gap * dt
+            if lo >= end:  # between two: the nearer
+                odd += 1
+                missing[row] -= lo - end > stamp - hi + dt
+                lo, hi = stamp, end
+        elif lo >= end:  # too early: a late stamp before was taken for a gap
+            odd += 1
+            missing[last] -= min(int(missing[last]), round((lo - end) / dt))
+            lo, hi = stamp, end
+        lo = max(lo, stamp)
+        hi = min(hi, end)
+    return missing, odd
+
+
+def _settle(time: NDArray[np.float64], dt: float, slack: float) -> tuple[float, NDArray[np.int64], int]:
+    """dt, missing_before[n] and odd stamps once dt is that of the time against the index with the missing samples."""
+    missing, odd = _decode(time, dt, slack)
+    for _ in range(4):
+        fitted = float(time[-1] - time[0]) / (time.size - 1 + int(missing.sum()))
+        if abs(fitted - dt) < 1e-10 * dt:
+            break
+        dt = fitted
+        missing, odd = _decode(time, dt, slack)
+    return dt, missing, odd
