@@ -117,8 +117,8 @@ class Tap:
         return sum(sample not in made for _, sample in self.pushed)
 
     def mistimed(self) -> int:
-        """Steps between pushed samples that are more than one sample, and a thousandth of the step, off the time between
-        the samples by the sensor's clock: for a sensor that was reset, whose count then stood still."""
+        """Steps between pushed samples that are more than one sample, and a thousandth of the step, off the time
+        between the samples by the sensor's clock: for a sensor that was reset, whose count then stood still."""
         period = self.board.sensor.period_us()
         made = {tuple(readings([sample])[0].tolist()): us for _, us, sample in self.board.sensor.taken}
         steps = zip(self.pushed, self.pushed[1:], strict=False)

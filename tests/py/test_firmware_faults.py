@@ -135,8 +135,8 @@ def test_sensor_bad_from_the_start(name: str, code: int) -> None:
 
 @pytest.mark.parametrize("chance", [1e-5, 1e-4, 1e-3])
 def test_spi_bit_flips(chance: float) -> None:
-    """Bits turned over on either wire: no wrong sample is taken. Two bursts carry 192 bits of the six channels, so that at
-    1e-3 every sixth sample is lost."""
+    """Bits turned over on either wire: no wrong sample is taken. Two bursts carry 192 bits of the six channels, so that
+    at 1e-3 every sixth sample is lost."""
     seconds = 8.0 * MANY
     board = Board(image(*QUIET), seed=int(1 / chance))
     tap = Tap(board)
