@@ -179,7 +179,12 @@ class Image:
         raise FirmwareError(f"'{name}' is not in flash")
 
     def functions_in(self, name: str) -> set[int]:
-        """Addresses of the functions that a const object points to, or that of a function itself."""
+        """Addresses of the functions that a const object points to, or that of a function itself.
+
+        A name that ends in `?` may be missing: then nothing linked it, so the pointer is null.
+        """
+        if name.endswith("?"):
+            return self.functions_in(name[:-1]) if name[:-1] in self.symbols else set()
         if name not in self.objects:
             return {address for address, function in self.functions.items() if function.name == name}
         return {word & ~1 for word in self.words(name) if word & 1 and word & ~1 in self.functions}

@@ -31,7 +31,12 @@ from selfcal.wire import load_dbc  # noqa: E402
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})
 CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
 #: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
-CALLS = {"app.c": ["board_time_ms", "board_sample", "board_send", "board_idle"], "replay.c": ["board_read"]}
+CALLS = {file: ["selfcal_regressors_code?"] for file in ("averager.c", "check.c", "posterior.c")} | {
+    "bank.c": ["selfcal_regressors_code?", "selfcal_kernel_run"],
+    "snapshot.c": [],
+    "app.c": ["board_time_ms", "board_sample", "board_send", "board_idle"],
+    "replay.c": ["board_read"],
+}
 
 
 @pytest.fixture(scope="module")
