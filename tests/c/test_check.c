@@ -188,11 +188,27 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(node[1].a.hi = -1.0F);
     BROKEN(node[1].a.lo = NAN);
     BROKEN(node[1].ln_s.hi = INFINITY);
+#ifdef SELFCAL_FIXED
+    BROKEN(bank.b[0] = INT64_MAX);
+    BROKEN(bank.b[last] = INT64_MIN);
+    BROKEN(bank.c[last] = -1);
+    BROKEN(bank.c[0] = INT64_MAX);
+    BROKEN(bank.x[last] = INT32_MAX);
+    BROKEN(bank.x[0] = INT32_MIN);
+    BROKEN(bank.scale[AXES - 1U].exponent = 201);
+    BROKEN(bank.scale[0].most_y = -1);
+    BROKEN(bank.y_fixed[0][SELFCAL_BATCH - 1U] = INT32_MAX);
+    BROKEN(bank.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
+    BROKEN(node[level].g_shift++);
+    BROKEN(node[level].u_shift = 64);
+    BROKEN(node[level].w_mantissa++);
+#else
     BROKEN(bank.b[0].hi = NAN);
     BROKEN(bank.b[last].lo = INFINITY);
     BROKEN(bank.c[last].hi = -1.0F);
     BROKEN(bank.c[0].hi = NAN);
     BROKEN(bank.x[last] = NAN);
+#endif
     /* before the first sample */
     setUp();
     sound = bank;

@@ -5,6 +5,17 @@
 #include "selfcal_model.h"
 #include "unity.h"
 
+/* A drift, and the bits of what is none. */
+#ifdef SELFCAL_FIXED
+#define SOME_X 77
+#define NO_X 0x7FFFFFFFU
+#define REAL_BYTES SELFCAL_FIXED
+#else
+#define SOME_X 7.7e-5F
+#define NO_X 0x7FC00000U /* a quiet NaN */
+#define REAL_BYTES sizeof(selfcal_real_t)
+#endif
+
 enum { AXES = 2, BLOCK = 3, SAMPLES = 420 };
 #define MEMORY_BYTES SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
 #define BYTES_MAX SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
@@ -230,11 +241,7 @@ static void the_format_is_the_one_described(void) {
     TEST_ASSERT_EQUAL_MEMORY("SFCL", saved.bytes, 4);
     TEST_ASSERT_EQUAL(saved.length, number_at(&saved, OFFSET_LENGTH, 4));
     TEST_ASSERT_EQUAL(1, number_at(&saved, OFFSET_VERSION, 2));
-#ifdef SELFCAL_FIXED
-    TEST_ASSERT_EQUAL(SELFCAL_FIXED, number_at(&saved, OFFSET_REAL, 1));
-#else
-    TEST_ASSERT_EQUAL(sizeof(selfcal_real_t), number_at(&saved, OFFSET_REAL, 1));
-#endif
+    TEST_ASSERT_EQUAL(REAL_BYTES, number_at(&saved, OFFSET_REAL, 1));
     TEST_ASSERT_EQUAL(AXES, number_at(&saved, OFFSET_AXES, 1));
     TEST_ASSERT_EQUAL(model.nodes, number_at(&saved, OFFSET_NODES, 2));
     TEST_ASSERT_EQUAL(0, number_at(&saved, 14, 2));
@@ -430,7 +437,7 @@ static void contents_that_no_bank_can_have_are_refused(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&other, &again));
     const size_t used = where_differ(&saved, &again);
     other.self.used++;
-    other.self.x[0] = 7.7e-5F;
+    other.self.x[0] = SOME_X;
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&other, &again));
     const size_t x = where_differ(&saved, &again);
     other.self.x[0] = bank.self.x[0];
@@ -443,7 +450,7 @@ static void contents_that_no_bank_can_have_are_refused(void) {
     corrupt(in_batch, 4, SELFCAL_BATCH);
     corrupt(in_batch, 4, 0xFFFFFFFFU);
     corrupt(used, 4, BLOCK + 1U);
-    corrupt(x, 4, 0x7FC00000U); /* a quiet NaN */
+    corrupt(x, 4, NO_X);
     corrupt(in_gap, 1, 2);
     corrupt(in_gap, 1, 0xFF);
 }
