@@ -9,6 +9,10 @@ SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 72);
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
 #endif
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
+SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72); /* 4 (p + 1) (p + 4) */
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
 #endif
 
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
@@ -23,15 +27,55 @@ static bool finite_sum(selfcal_sum_t sum) {
     return isfinite(sum.hi) && isfinite(sum.lo);
 }
 
-/* What a kernel keeps for a node and axis. */
-static bool cell_is_sound(const selfcal_t *self, size_t k) {
+/* What a kernel keeps, see kernel_fixed.c and kernel_float.c: for a node and axis, a level node, an axis. */
 #ifdef SELFCAL_FIXED
-    const int32_t bound = (int32_t)SELFCAL_FIXED_LIMIT + (1L << 24); /* kernel_fixed.c, HEAD-ROOM */
-    return self->c[k] >= 0 && self->x[k] <= bound && self->x[k] >= -bound;
-#else
-    return finite_sum(self->b[k]) && finite_sum(self->c[k]) && self->c[k].hi >= R(0.0) && isfinite(self->x[k]);
-#endif
+
+static bool between(int64_t value, int64_t lo, int64_t hi) {
+    return value >= lo && value <= hi;
 }
+
+static bool cell_is_sound(const selfcal_t *self, size_t k) {
+    const int64_t drift = SELFCAL_FIXED_LIMIT + (1L << 24), room = (int64_t)1 << 62; /* HEAD-ROOM; SUMS */
+    return between(self->b[k], -room, room) && between(self->c[k], 0, room) && between(self->x[k], -drift, drift);
+}
+
+/* No shift is undefined. */
+static bool level_is_sound(const selfcal_node_t *node) {
+    return node->g_mantissa >= 0 && between(node->g_shift, 1, 31) && node->u_mantissa >= 0 &&
+           (node->u_mantissa == 0 || between(node->u_shift, 1, 63)) && node->w_mantissa > 0 && between(node->w_shift, 24, 63);
+}
+
+static bool scale_is_sound(const selfcal_t *self, uint8_t axis) {
+    const selfcal_scale_t *scale = &self->scale[axis];
+    const int64_t limit = SELFCAL_FIXED_LIMIT;
+    bool sound = between(scale->exponent, -200, 200) && between(scale->most_y, 0, limit) && scale->most_c >= 0;
+    for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
+        sound = sound && between(self->y_fixed[axis][i], -limit, limit);
+    }
+    for (uint32_t i = 0; i <= SELFCAL_BATCH; i++) {
+        sound = sound && between(self->step[axis][i], -3 * limit, 3 * limit);
+    }
+    return sound;
+}
+
+#else
+
+static bool cell_is_sound(const selfcal_t *self, size_t k) {
+    return finite_sum(self->b[k]) && finite_sum(self->c[k]) && self->c[k].hi >= R(0.0) && isfinite(self->x[k]);
+}
+
+static bool level_is_sound(const selfcal_node_t *node) {
+    (void)node;
+    return true;
+}
+
+static bool scale_is_sound(const selfcal_t *self, uint8_t axis) {
+    (void)self;
+    (void)axis;
+    return true;
+}
+
+#endif
 
 static bool memory_is_laid_out(const selfcal_t *self) {
     const selfcal_model_t *model = self->model;
@@ -48,7 +92,7 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
     const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
     for (uint32_t i = 0; i < batch->count; i++) {
         /* a block counts from half of its samples on */
-        if (!within(batch->r[i], R(1.0) / ratio_max, R(2.0) * ratio_max)) {
+        if (!within(batch->r[i], R(1.0) / ratio_max, R(2.0) * ratio_max) || (batch->r[i] != R(1.0) && !batch->part)) {
             return false;
         }
         for (uint8_t axis = 0; axis < self->model->axes; axis++) {
@@ -90,7 +134,7 @@ static bool averager_is_sound(const selfcal_t *self) {
         return false;
     }
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        if (self->bad[axis] > self->watched || !isfinite(self->last[axis])) {
+        if (self->bad[axis] > self->watched || !isfinite(self->last[axis]) || !scale_is_sound(self, axis)) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&
@@ -110,13 +154,50 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
         !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
         node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
-        (node->level ? node->d != R(0.0) || node->e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
+        (node->level ? node->d != R(0.0) || node->e != R(0.0) || !level_is_sound(node) : node->level_from > 0U) || node->level_from > node->steady ||
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
         return false;
     }
     const size_t axes = self->model->axes;
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
         if (!cell_is_sound(self, k)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* What regressors.c has beside: there if the model has regressors, in its place, and of numbers. */
+static bool columns_are_sound(const selfcal_t *self) {
+    const selfcal_columns_t *columns = self->columns;
+    const selfcal_regressors_t *regressors = self->model->regressors;
+    if (columns == NULL || regressors == NULL) {
+        return columns == NULL && regressors == NULL;
+    }
+    const size_t p = regressors->count, nodes = self->model->nodes, cells = nodes * self->model->axes;
+    if (columns->column != (const void *)(columns + 1) || columns->a != (const void *)(columns->column + p) ||
+        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p ||
+        columns->low != (const void *)(columns->x + nodes * (p + 1U))) {
+        return false;
+    }
+    for (const selfcal_column_t *column = columns->column; column < columns->column + p; column++) {
+        for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
+            if (!isfinite(column->z[0][i]) || !isfinite(column->z[1][i])) {
+                return false;
+            }
+        }
+        if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) || !isfinite(column->offset) ||
+            !isfinite(column->sum)) {
+            return false;
+        }
+    }
+    for (const selfcal_sum_t *sum = columns->a; sum < columns->x + nodes * (p + 1U); sum++) { /* a, b and x in a row */
+        if (!finite_sum(*sum)) {
+            return false;
+        }
+    }
+    for (size_t k = 0; k < cells; k++) {
+        if (!isfinite(columns->low[k])) {
             return false;
         }
     }
@@ -140,7 +221,7 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self)) {
+    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !columns_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     if (self->n > 0U && !grid_is_sound(self)) {

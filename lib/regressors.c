@@ -61,7 +61,7 @@ static void init(selfcal_t *self, unsigned char *memory) {
 
 static bool usable(selfcal_t *self, const float values[]) {
     for (size_t k = 0; k < columns_of(self); k++) {
-        if (!isfinite(values[k])) {
+        if (!(fabsf(values[k]) < SELFCAL_SAMPLE_MAX)) { /* nor NaN; the bound is that of samples, for the same sums */
             self->counters.regressor_not_finite++;
             return false;
         }

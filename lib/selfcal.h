@@ -269,7 +269,7 @@ typedef struct {
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
-    uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite */
+    uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite, or at SELFCAL_SAMPLE_MAX */
 } selfcal_counters_t;
 
 /* One filter: the gain side, shared by all axes because covariances do not depend on the data. Relative to sigma_v.
@@ -415,7 +415,8 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
  * ones neither help nor harm an axis.) */
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]);
 
-/* The same with the values of the model's regressors, in its order; a value that is not finite keeps the sample out. Values are
+/* The same with the values of the model's regressors, in its order; a value that is not finite, or at
+ * SELFCAL_SAMPLE_MAX, keeps the sample out. Values are
  * averaged over a block as the samples are. A model with regressors takes this call only (else SELFCAL_BAD_ARGUMENT), one
  * without does not look at `regressors`. Per node O(count^2 + axes * count) more. */
 selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]);
@@ -497,7 +498,8 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 /* selfcal_save() writes this many bytes at a time, and the rest at last. */
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
-/* No snapshot of a model is longer: for a flash slot or a buffer laid out by the compiler. */
+/* No snapshot of a model is longer (SELFCAL_REGRESSORS_SIZE more with regressors): for a flash slot or a buffer laid out by the
+ * compiler. */
 #define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
 
 /* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. */

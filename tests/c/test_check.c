@@ -142,6 +142,7 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(gathered->r[0] = 0.99F / SELFCAL_VARIANCE_RATIO_MAX);
     BROKEN(waits->r[0] = 2.01F * SELFCAL_VARIANCE_RATIO_MAX);
     BROKEN(gathered->r[0] = NAN);
+    BROKEN(waits->r[0] = 1.5F); /* which `part` would have to tell */
     /* the averager */
     BROKEN(bank.started = false);
     BROKEN(bank.origin[0] = NAN);
@@ -199,9 +200,9 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.scale[0].most_y = -1);
     BROKEN(bank.y_fixed[0][SELFCAL_BATCH - 1U] = INT32_MAX);
     BROKEN(bank.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
-    BROKEN(node[level].g_shift++);
-    BROKEN(node[level].u_shift = 64);
-    BROKEN(node[level].w_mantissa++);
+    BROKEN(node[level].g_shift = 0);
+    BROKEN(node[level].w_shift = 23);
+    BROKEN(node[level].w_mantissa = 0);
 #else
     BROKEN(bank.b[0].hi = NAN);
     BROKEN(bank.b[last].lo = INFINITY);
