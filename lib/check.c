@@ -149,13 +149,15 @@ static bool averager_is_sound(const selfcal_t *self) {
 
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
-    const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
+    /* the kernels choose which nodes run first */
+    const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
     if (!within(node->beta, R(0.0), R(1.0)) || !(node->q >= R(0.0)) || !isfinite(node->q) || !(node->p_inf >= R(0.0)) ||
         !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
         node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
-        (node->level ? node->d != R(0.0) || node->e != R(0.0) || !level_is_sound(node) : node->level_from > 0U) || node->level_from > node->steady ||
-        node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
+        (node->level ? node->d != R(0.0) || node->e != R(0.0) || !level_is_sound(node) : node->level_from > 0U) ||
+        node->level_from > node->steady || node->steady > seen || !finite_sum(node->a) ||
+        !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
         return false;
     }
     const size_t axes = self->model->axes;

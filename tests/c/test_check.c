@@ -163,7 +163,6 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.counters.samples = selfcal_count(&bank));
     BROKEN(bank.counters.blocks_part = selfcal_count(&bank) + 1U);
     BROKEN(bank.counters.gaps = 0);
-    BROKEN(node[model.nodes - 1U].steady = bank.n + 1U);
     BROKEN(node[0].steady = bank.n + waits->count + 1U);
     /* the grid */
     BROKEN(bank.rho_step[1] = 0.0F);
