@@ -77,7 +77,7 @@ TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer kernels: the formats by a test of their own, the rest as the bank in float.
-TESTS_FIXED := $(foreach test,fixed bank snapshot,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
+TESTS_FIXED := $(foreach test,fixed bank snapshot check,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -122,7 +122,7 @@ $(eval $(call C_TESTS,fixed32))
 .PHONY: fuzz
 FUZZ := $(BUILD)/fuzz
 FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_GRID_MAX=6 -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 \
-              -DSELFCAL_RETIRE_BLOCKS=4
+              -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
 RUNS ?= 10000000
 
 # RUNS executions, or SECONDS seconds, from what was found before on. What fails is left in build/fuzz: run build/fuzz/fuzz_api on it.

@@ -151,12 +151,12 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, ln_s, REAL)      \
     FIXED_NODE_FIELDS(F)
 
-#define COLUMN_FIELDS(F)              \
-    F(selfcal_column_t, z, REAL)      \
-    F(selfcal_column_t, last, REAL)   \
+#define COLUMN_FIELDS(F)               \
+    F(selfcal_column_t, z, REAL)       \
+    F(selfcal_column_t, last, REAL)    \
     F(selfcal_column_t, origin, FLOAT) \
-    F(selfcal_column_t, first, FLOAT) \
-    F(selfcal_column_t, offset, REAL) \
+    F(selfcal_column_t, first, FLOAT)  \
+    F(selfcal_column_t, offset, REAL)  \
     F(selfcal_column_t, sum, REAL)
 
 /* What a part of the bank is made of. */

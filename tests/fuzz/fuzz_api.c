@@ -11,7 +11,10 @@
 #include "selfcal.h"
 
 enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, PUSHES_MAX = 200 };
-#define BYTES_MAX SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX)
+#define MORE SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX)
+#define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
+
+#define LENGTH(array) (sizeof(array) / sizeof((array)[0]))
 
 #define HOLDS(condition)                                                        \
     do {                                                                        \
@@ -27,7 +30,7 @@ typedef struct {
 
 typedef struct {
     selfcal_t self;
-    selfcal_wide_t memory[SELFCAL_SIZE(NODES_MAX, SELFCAL_AXES_MAX) / sizeof(selfcal_wide_t) + 1U];
+    selfcal_wide_t memory[(SELFCAL_SIZE(NODES_MAX, SELFCAL_AXES_MAX) + MORE) / sizeof(selfcal_wide_t) + 1U];
 } bank_t;
 
 typedef struct {
@@ -40,6 +43,9 @@ static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
 static selfcal_model_t model;
+static selfcal_regressors_t regressors;
+static float reference[SELFCAL_REGRESSORS_MAX], coefficient_sd[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
+static float values[SELFCAL_REGRESSORS_MAX]; /* of the regressors, as they come with the next sample */
 
 static bank_t bank, twin;
 static bool twinned;      /* the twin is at the bank's state */
@@ -151,11 +157,25 @@ static void make_model(input_t *in) {
             model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
         }
     }
+    if ((kind >> 7 & 1U) != 0U) {
+        regressors.code = &selfcal_regressors_code;
+        regressors.count = (uint8_t)(1U + (shape >> 4 & 1U) % SELFCAL_REGRESSORS_MAX);
+        regressors.reference = reference;
+        regressors.coefficient_sd = coefficient_sd;
+        for (unsigned k = 0; k < SELFCAL_REGRESSORS_MAX; k++) {
+            reference[k] = 20.0F;
+            values[k] = 20.0F;
+        }
+        for (unsigned k = 0; k < LENGTH(coefficient_sd); k++) {
+            coefficient_sd[k] = k % 4U == 3U ? 0.0F : 0.01F;
+        }
+        model.regressors = &regressors;
+    }
     if (shape >> 5 != 7U) {
         return;
     }
     /* something is wrong with this one */
-    switch (byte(in) % 16U) {
+    switch (byte(in) % 20U) {
     case 0: model.dt_s = any_float(in); break;
     case 1: model.block = (uint32_t)bits(in, 4); break;
     case 2: model.axes = byte(in); break;
@@ -171,6 +191,10 @@ static void make_model(input_t *in) {
     case 12: hypothesis_table[0].law = (selfcal_law_t)(byte(in) & 3U); break;
     case 13: hypothesis_table[0].rho = hypothesis_table[0].rho == NULL ? &grid : NULL; break;
     case 14: hypothesis_table[0].alpha = hypothesis_table[0].alpha == NULL ? &grid : NULL; break;
+    case 15: regressors.count = byte(in); break;
+    case 16: regressors.reference = NULL; break;
+    case 17: reference[0] = any_float(in); break;
+    case 18: coefficient_sd[0] = any_float(in); break;
     default: hypothesis_table[0].ln_probability = any_float(in); break;
     }
 }
@@ -205,6 +229,11 @@ static void equal_banks(const bank_t *one, const bank_t *two) {
     const size_t from = offsetof(selfcal_t, n);
     HOLDS(memcmp((const uint8_t *)&one->self + from, (const uint8_t *)&two->self + from, sizeof(selfcal_t) - from) == 0);
     HOLDS(memcmp(one->memory, two->memory, SELFCAL_SIZE(model.nodes, model.axes)) == 0);
+    if (model.regressors != NULL) {
+        const uint8_t *a = (const void *)one->self.columns->column, *b = (const void *)two->self.columns->column;
+        const size_t cells = (size_t)model.nodes * model.axes;
+        HOLDS(memcmp(a, b, (size_t)((const uint8_t *)(one->self.columns->low + cells) - a)) == 0);
+    }
 }
 
 static bool grown(uint32_t before_, uint32_t now) {
@@ -271,10 +300,14 @@ static void push(const float sample[]) {
         return;
     }
     pushes--;
-    HOLDS(selfcal_push(&bank.self, sample) == SELFCAL_OK);
-    if (twinned) {
-        HOLDS(selfcal_push(&twin.self, sample) == SELFCAL_OK);
+    HOLDS(selfcal_push(&bank.self, sample) == SELFCAL_OK || model.regressors != NULL);
+    if (model.regressors != NULL) {
+        HOLDS(selfcal_push_with(&bank.self, sample, values) == SELFCAL_OK);
     }
+    if (twinned) {
+        HOLDS(selfcal_push_with(&twin.self, sample, values) == SELFCAL_OK);
+    }
+    values[0] += 0.1F;
     if (has_gate) {
         check_motion(selfcal_gate_push(&gate, sample));
     }
@@ -307,6 +340,13 @@ static void push_many(input_t *in) {
             sample[axis] = level + scale * (float)(state >> 8) / 16777216.0F;
         }
         push(sample);
+    }
+}
+
+static void set_values(input_t *in) {
+    const uint8_t how = byte(in);
+    for (unsigned k = 0; k < SELFCAL_REGRESSORS_MAX; k++) {
+        values[k] = how == 255U ? any_float(in) : moderate(in);
     }
 }
 
@@ -363,11 +403,12 @@ static void look_at_node(input_t *in) {
 
 static void report_begin(input_t *in) {
     const uint8_t axis = byte(in) % (SELFCAL_AXES_MAX + 1U);
-    const selfcal_status_t status = selfcal_report_begin(&work, &bank.self, axis, &report);
+    const uint8_t mask = model.regressors != NULL ? byte(in) & 3U : 0U;
+    const selfcal_status_t status = selfcal_report_begin_subset(&work, &bank.self, axis, mask, NULL, &report);
     HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED || status == SELFCAL_BAD_ARGUMENT);
-    HOLDS((status == SELFCAL_BAD_ARGUMENT) == (axis >= model.axes));
+    HOLDS((status == SELFCAL_BAD_ARGUMENT) == (axis >= model.axes) || mask != 0U);
     if (twinned) {
-        HOLDS(selfcal_report_begin(&twin_work, &twin.self, axis, &twin_report) == status);
+        HOLDS(selfcal_report_begin_subset(&twin_work, &twin.self, axis, mask, NULL, &twin_report) == status);
     }
     reporting = status == SELFCAL_OK;
 }
@@ -599,6 +640,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 15: rate(&in); break;
         case 16: begin_gate(&in); break;
         case 17: look_at_gate(&in); break;
+        case 18: set_values(&in); break;
         default: push_moderate(&in); break;
         }
         check_bank();
