@@ -9,6 +9,10 @@ SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
 #endif
 #ifndef SELFCAL_REAL_DOUBLE
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
+SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72); /* 4 (p + 1) (p + 4) */
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
 #endif
 
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
@@ -38,7 +42,7 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
     const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
     for (uint32_t i = 0; i < batch->count; i++) {
         /* a block counts from half of its samples on */
-        if (!within(batch->r[i], R(1.0) / ratio_max, R(2.0) * ratio_max)) {
+        if (!within(batch->r[i], R(1.0) / ratio_max, R(2.0) * ratio_max) || (batch->r[i] != R(1.0) && !batch->part)) {
             return false;
         }
         for (uint8_t axis = 0; axis < self->model->axes; axis++) {
@@ -167,7 +171,8 @@ static bool regressors_are_sound(const selfcal_t *self) {
 
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
-    const uint32_t seen = self->n + (j < self->ran ? self->batch[1U - self->gathering].count : 0U);
+    /* the kernels choose which nodes run first */
+    const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
     if (!within(node->beta, R(0.0), R(1.0)) || !(node->q >= R(0.0)) || !isfinite(node->q) || !(node->p_inf >= R(0.0)) ||
         !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
         node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
