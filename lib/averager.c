@@ -189,7 +189,7 @@ static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
 /* Whether this push runs some nodes: every one, or every SELFCAL_PUSH_EVERY-th if that is in time twice over. */
 static bool nodes_are_due(const selfcal_t *self) {
     return (self->position & (SELFCAL_PUSH_EVERY - 1U)) == 0U || self->block < SELFCAL_PUSH_EVERY ||
-           (uint64_t)self->block * SELFCAL_BATCH < 2U * SELFCAL_PUSH_EVERY * (uint64_t)self->model->nodes;
+           (uint64_t)self->block * SELFCAL_BATCH < (uint64_t)2U * SELFCAL_PUSH_EVERY * self->model->nodes;
 }
 
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
