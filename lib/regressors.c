@@ -25,12 +25,11 @@ static size_t columns_of(const selfcal_t *self) {
 
 static bool valid_regressors(const selfcal_model_t *model) {
 #ifdef SELFCAL_FIXED
-    const bool columns = false;
+    (void)model; /* the integer kernels know no columns */
+    return false;
 #else
-    const bool columns = true;
-#endif
     const selfcal_regressors_t *regressors = model->regressors;
-    if (!columns || regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
+    if (regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
         regressors->coefficient_sd == NULL) {
         return false;
     }
@@ -45,6 +44,7 @@ static bool valid_regressors(const selfcal_model_t *model) {
         }
     }
     return true;
+#endif
 }
 
 /* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
