@@ -16,7 +16,7 @@
 #include "internal.h"
 
 /* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
-enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
+enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_SHIFTED_NODES 32U
 #define STEP_SCANNED_CELLS 16U
@@ -1096,6 +1096,9 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         break;
     case SPLINE_SIGMA:
         fit(work, work->values[1], work->ln_sigma);
+        work->stage = BOX;
+        break;
+    case BOX:
         first_box(work);
         work->best = -INFINITY;
         work->pass = 0;

@@ -239,6 +239,7 @@ static void measure_report(void) {
         {"report.shift", "report.shift.worst_step", "report.shift.steps"},
         {"report.spline_profile", "report.spline_profile.worst_step", "report.spline_profile.steps"},
         {"report.spline_sigma", "report.spline_sigma.worst_step", "report.spline_sigma.steps"},
+        {"report.box", "report.box.worst_step", "report.box.steps"},
         {"report.scan", "report.scan.worst_step", "report.scan.steps"},
         {"report.sum", "report.sum.worst_step", "report.sum.steps"},
         {"report.weights", "report.weights.worst_step", "report.weights.steps"},
