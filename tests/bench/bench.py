@@ -208,6 +208,10 @@ def compare(now: Bench, before: Bench) -> list[str]:
             if name not in old or name not in new:
                 complaints.append(f"{'new' if name in new else 'gone'}: {target} {name}")
                 continue
+            if old[name] == 0:  # a file without code in this build
+                if new[name] > 0:
+                    complaints.append(f"grew: {target} {name}: from nothing to {float(new[name]):.6g}")
+                continue
             change = new[name] / old[name] - 1
             line = f"{target} {name}: {float(old[name]):.6g} -> {float(new[name]):.6g} ({float(change):+.1%})"
             if change > GROWTH:
