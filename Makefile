@@ -112,10 +112,10 @@ $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(
 	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(CURDIR)/%) -c $(TESTED:%=$(CURDIR)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
-$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a
-	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
-$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a
-	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$^ -lm -o $$@
+$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
+$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h
+	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))

@@ -47,10 +47,6 @@ static bool valid_grid(const selfcal_grid_t *grid) {
     return grid->nodes >= 6U && grid->nodes <= SELFCAL_GRID_MAX && grid->fit != NULL;
 }
 
-static uint16_t hypothesis_nodes(const selfcal_hypothesis_t *hypothesis) {
-    return (uint16_t)(grid_rows(hypothesis) * grid_columns(hypothesis));
-}
-
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
     uint8_t h = 0;
@@ -58,7 +54,7 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
         index = (uint16_t)(index - hypothesis_nodes(&hypothesis[h]));
         h++;
     }
-    const uint16_t columns = grid_columns(&hypothesis[h]);
+    const uint16_t columns = grid_nodes(hypothesis[h].alpha);
     const uint16_t row = (uint16_t)(index / columns), column = (uint16_t)(index % columns);
     selfcal_place_t place = {h, NAN, NAN};
     if (hypothesis[h].rho != NULL) {
@@ -209,7 +205,7 @@ static void place_nodes(selfcal_t *self) {
             alpha_lo = r_fmin(alpha_lo, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min);
             alpha_hi = r_fmax(alpha_hi, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max);
         }
-        const uint16_t rows = grid_rows(hypothesis), columns = grid_columns(hypothesis);
+        const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
         rho_lo = r_fmin(rho_lo, LN_RHO_MAX - R(1.0));
         rho_hi = r_fmin(rho_hi, LN_RHO_MAX);
         self->rho_lo[h] = rho_lo;

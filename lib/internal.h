@@ -57,6 +57,15 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* `count` bank intervals without a sample. */
 void selfcal_bank_gap(selfcal_t *self, uint64_t count);
+/* Nodes of a hypothesis: those of rho times those of alpha, which changes fastest. */
+static inline uint16_t grid_nodes(const selfcal_grid_t *grid) {
+    return grid != NULL ? grid->nodes : 1U;
+}
+
+static inline uint16_t hypothesis_nodes(const selfcal_hypothesis_t *hypothesis) {
+    return (uint16_t)(grid_nodes(hypothesis->rho) * grid_nodes(hypothesis->alpha));
+}
+
 /* From now on `block` samples make a bank interval: how many nodes a push has to run follows. */
 void selfcal_bank_pace(selfcal_t *self, uint32_t block);
 /* Runs up to `nodes` nodes over the batch that waits; false with none waiting. */

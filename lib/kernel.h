@@ -19,15 +19,6 @@ struct gains {
     selfcal_sum_t scale;                 /* what the span's sums of nu and nu^2 are still to be multiplied by */
 };
 
-/* Nodes of a hypothesis: `rows` of rho times `columns` of alpha, which changes fastest. */
-static inline uint16_t grid_rows(const selfcal_hypothesis_t *hypothesis) {
-    return hypothesis->rho != NULL ? hypothesis->rho->nodes : 1U;
-}
-
-static inline uint16_t grid_columns(const selfcal_hypothesis_t *hypothesis) {
-    return hypothesis->alpha != NULL ? hypothesis->alpha->nodes : 1U;
-}
-
 /* The order in which a kernel takes the nodes: this is the index of the `i`-th. */
 #ifdef SELFCAL_FIXED
 size_t kernel_node(const selfcal_t *self, size_t i);

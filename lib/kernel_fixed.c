@@ -226,16 +226,16 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
 size_t kernel_node(const selfcal_t *self, size_t i) {
     const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
     size_t first = 0;
-    while (i - first >= (size_t)grid_rows(hypothesis) * grid_columns(hypothesis)) {
-        first += (size_t)grid_rows(hypothesis) * grid_columns(hypothesis);
+    while (i - first >= hypothesis_nodes(hypothesis)) {
+        first += hypothesis_nodes(hypothesis);
         hypothesis++;
     }
-    const size_t rows = grid_rows(hypothesis);
+    const size_t rows = grid_nodes(hypothesis->rho);
     size_t row = i - first, column = 0;
     for (; row >= rows; row -= rows) {
         column++; /* shorter than a division in software */
     }
-    return first + row * grid_columns(hypothesis) + column;
+    return first + row * grid_nodes(hypothesis->alpha) + column;
 }
 
 /* What a span adds: the sum of nu in 2^SUM_BITS steps, the sum of nu^2 in 2^16 steps^2. */

@@ -34,10 +34,6 @@ static const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {
     return &work->bank->model->hypothesis[work->hypothesis];
 }
 
-static uint16_t grid_nodes(const selfcal_grid_t *grid) {
-    return grid != NULL ? grid->nodes : 1U;
-}
-
 /* A node is dearer with regressors in use: one a step. */
 static unsigned step_nodes(const selfcal_work_t *work) {
     return work->mask == 0U ? STEP_NODES : 1U;
@@ -261,7 +257,7 @@ static void sigma_cells(selfcal_work_t *work) {
 }
 
 static uint16_t nodes_of(const selfcal_work_t *work) {
-    return (uint16_t)(grid_nodes(hypothesis_of(work)->rho) * grid_nodes(hypothesis_of(work)->alpha));
+    return hypothesis_nodes(hypothesis_of(work));
 }
 
 /* Where the hypothesis's node k lies. */

@@ -15,7 +15,7 @@ from pathlib import Path
 import unicorn.arm_const as arm
 from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
-from unicorn import Uc, UcError  # type: ignore[attr-defined]
+from unicorn import Uc, UcError  # type: ignore[attr-defined]  # the package re-exports them without saying so
 from unicorn.unicorn_const import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_INTR, UC_MODE_MCLASS, UC_MODE_THUMB
 
 FLASH, FLASH_BYTES = 0x08000000, 0x100000

@@ -1,13 +1,15 @@
-"""What the tests share: where the real recordings are, and skipping loudly where they are not."""
+"""What the tests share: where the real recordings are, a loud skip where they are not; how far two reports differ."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from selfcal.recording import Recording, load
+from selfcal.result import AxisResult
 
 ROOT = Path(__file__).resolve().parents[2]
 #: The recordings' licence keeps them out of this repository.
@@ -20,3 +22,17 @@ def shared_recording(name: str) -> Recording:
     if not path.exists():
         pytest.skip(f"REAL DATA ABSENT: {path} (see README, 'Real recordings')")
     return load(path)
+
+
+def worst_difference(report: AxisResult, exact: AxisResult) -> tuple[float, float, float, float]:
+    """Largest |d ln evidence|, |dP|, |d mean|/sd and |sd ratio - 1| over the laws that are not ruled out (P > 1 %), dP
+    over all; NaN where one is."""
+    evidence, mean, sd = [0.0], [0.0], [0.0]
+    for law in (law for law, p in exact.probability.items() if not p < 0.01):
+        evidence.append(abs(report.log_evidence[law] - exact.log_evidence[law]))
+        for name, value in exact.parameters[law].items():
+            found = report.parameters[law][name]
+            mean.append(abs(found.mean - value.mean) / value.sd)
+            sd.append(abs(found.sd / value.sd - 1.0))
+    probability = [abs(p - report.probability[law]) for law, p in exact.probability.items()]
+    return float(np.max(evidence)), float(np.max(probability)), float(np.max(mean)), float(np.max(sd))

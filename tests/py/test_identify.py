@@ -16,12 +16,11 @@ from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import LAWS, NODES, Model, Prior
 from selfcal.recording import save
-from selfcal.result import AxisResult
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import REPORT_MIN, block_means, identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
-from conftest import shared_recording
+from conftest import shared_recording, worst_difference
 
 MODEL = Model.load()
 GROUP = MODEL.group_of("gx")
@@ -31,20 +30,6 @@ GROUP = MODEL.group_of("gx")
 MEAN_SD = 0.05
 SD_RATIO = 0.05
 LN_EVIDENCE = 0.05
-
-
-def worst_difference(report: AxisResult, dense: AxisResult) -> tuple[float, float, float, float]:
-    """Largest |d ln evidence|, |dP|, |d mean|/sd and |sd ratio - 1| over the laws that are not ruled out (P > 1 %)."""
-    evidence = probability = mean = sd = 0.0
-    for law, p in dense.probability.items():
-        probability = max(probability, abs(p - report.probability[law]))
-        if p < 0.01:
-            continue
-        evidence = max(evidence, abs(report.log_evidence[law] - dense.log_evidence[law]))
-        for name, exact in dense.parameters[law].items():
-            mean = max(mean, abs(report.parameters[law][name].mean - exact.mean) / exact.sd)
-            sd = max(sd, abs(report.parameters[law][name].sd / exact.sd - 1.0))
-    return evidence, probability, mean, sd
 
 
 @pytest.mark.parametrize("n", [10, 100, 1000, 3600])

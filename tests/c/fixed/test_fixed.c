@@ -2,6 +2,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "../noise.h"
 #include "selfcal_model.h"
 #include "unity.h"
 
@@ -11,18 +12,6 @@ static selfcal_t bank;
 static selfcal_model_t model;
 static selfcal_axis_t axis_table[AXES];
 static selfcal_wide_t memory[SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES) / sizeof(selfcal_wide_t) + 1U];
-
-static uint32_t state;
-static float noise(void) {
-    float sum = 0.0F; /* of 12 uniforms: variance 1 */
-    for (int i = 0; i < 12; i++) {
-        state ^= state << 13;
-        state ^= state >> 17;
-        state ^= state << 5;
-        sum += (float)state / 4294967296.0F;
-    }
-    return sum - 6.0F;
-}
 
 void setUp(void) {
     model = selfcal_model;

@@ -1,0 +1,20 @@
+/* Noise of the tests that want some. */
+#ifndef NOISE_H
+#define NOISE_H
+
+#include <stdint.h>
+
+/* xorshift: any sequence will do, it must only be the same everywhere */
+static uint32_t state;
+static float noise(void) {
+    float sum = 0.0F; /* of 12 uniforms: variance 1 */
+    for (int i = 0; i < 12; i++) {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        sum += (float)state / 4294967296.0F;
+    }
+    return sum - 6.0F;
+}
+
+#endif
