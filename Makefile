@@ -173,6 +173,7 @@ flash: setup
 BENCH := $(BUILD)/bench
 BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
+ARM_FAST += $(CURDIR)/tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
 MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
@@ -189,10 +190,10 @@ define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
-$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c
+$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk
 	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
-	cd $$(@D)/objects && arm-none-eabi-gcc $(ARM_$(1)) -O2 -std=c99 -ffp-contract=off -ffunction-sections $(WARNINGS) -I$(CURDIR)/lib \
-	    -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D) -c $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c
+	cd $$(@D)/objects && $$(call arm_objects,$(ARM_$(1)) -I$(CURDIR)/lib -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D), \
+	    $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app
@@ -239,10 +240,10 @@ EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
 
 # What a Cortex-M4F and a Cortex-M0 get.
 check-arm: $(MODEL)/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) -O2 $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT -c -o /dev/null,$(filter-out port/posix/%,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m0)))
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 
 check-c++:
 	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))

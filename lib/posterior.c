@@ -19,7 +19,7 @@
 enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_SHIFTED_NODES 32U
-#define STEP_SCANNED_CELLS 16U
+#define STEP_SCANNED_CELLS 24U
 #define STEP_SUMMED_CELLS 6U
 
 /* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
@@ -309,8 +309,8 @@ static void step_values(selfcal_work_t *work) {
         selfcal_wide_t unused;
         const field_t exact = node_field(work, k, work->n_eff, &unused);
         const expectation_t expected_of = node_expectation(work, &work->truth, k);
-        work->values[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)expected_of.profile);
-        work->values[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)expected_of.ln_sigma);
+        work->field[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)expected_of.profile);
+        work->field[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)expected_of.ln_sigma);
     }
 }
 
@@ -318,8 +318,8 @@ static void step_values(selfcal_work_t *work) {
 static void step_shift(selfcal_work_t *work) {
     for (uint16_t k = part(work, STEP_SHIFTED_NODES, nodes_of(work)); k < work->at; k++) {
         const expectation_t before = node_expectation(work, &work->truth_before, k), now = node_expectation(work, &work->truth, k);
-        work->values[0][k] = work->values[0][k] + before.profile - now.profile;
-        work->values[1][k] += before.ln_sigma - now.ln_sigma;
+        work->field[0][k] = work->field[0][k] + before.profile - now.profile;
+        work->field[1][k] += before.ln_sigma - now.ln_sigma;
     }
 }
 
@@ -396,8 +396,8 @@ static void make_row(const selfcal_work_t *work, row_t *row) {
         row->ln_sigma[i] = R(0.0);
         for (uint16_t j = 0; j < taps; j++) {
             const size_t at = (size_t)i * columns + row->basis_first + j;
-            row->profile[i] = r_fma(row->basis[j], work->profile[at], row->profile[i]);
-            row->ln_sigma[i] = r_fma(row->basis[j], work->ln_sigma[at], row->ln_sigma[i]);
+            row->profile[i] = r_fma(row->basis[j], work->spline[0][at], row->profile[i]);
+            row->ln_sigma[i] = r_fma(row->basis[j], work->spline[1][at], row->ln_sigma[i]);
         }
     }
 }
@@ -513,9 +513,10 @@ static void step_scan(selfcal_work_t *work) {
     }
 }
 
-/* Takes what the pass found as the next box; true when the search is over. The first pass only finds the peak, so that the
- * next ones need not keep what lay near an earlier, lower best. */
+/* Ends a pass: true when the search is over; work->moved if found_lo and found_hi now are the next box, else it stays. The first
+ * pass only finds the peak, so that the next ones need not keep what lay near an earlier, lower best. */
 static bool end_scan(selfcal_work_t *work) {
+    work->moved = false;
     if (!(work->found_lo[0] < work->found_hi[0])) {
         /* Against a limit where the likelihood is steep, a wide cell reaches in from where no narrow one does, and all that is left
          * lies far below what it promised: once more in this box, for the best that is in it. */
@@ -527,19 +528,14 @@ static bool end_scan(selfcal_work_t *work) {
         return hypothesis_of(work)->rho == NULL;
     }
     bool shrunk = false;
-    selfcal_real_t hi[2];
+    work->moved = true;
     for (int d = 0; d < 2; d++) {
         const bool present = d == 0 ? hypothesis_of(work)->rho != NULL : hypothesis_of(work)->alpha != NULL;
-        work->found_lo[d] = r_fmax(work->found_lo[d], work->limit_lo[d]);
-        hi[d] = r_fmin(work->found_hi[d], work->limit_hi[d]);
-        shrunk = shrunk ||
-                 (present && hi[d] - work->found_lo[d] < SHRINK * work->width[d] * (selfcal_real_t)SELFCAL_REPORT_CELLS);
-        if (!present) {
-            work->found_lo[d] = work->limit_lo[d];
-            hi[d] = work->limit_hi[d];
-        }
+        work->found_lo[d] = present ? r_fmax(work->found_lo[d], work->limit_lo[d]) : work->limit_lo[d];
+        work->found_hi[d] = present ? r_fmin(work->found_hi[d], work->limit_hi[d]) : work->limit_hi[d];
+        shrunk = shrunk || (present && work->found_hi[d] - work->found_lo[d] <
+                                           SHRINK * work->width[d] * (selfcal_real_t)SELFCAL_REPORT_CELLS);
     }
-    set_box(work, work->found_lo, hi);
     return !shrunk || work->pass >= PASSES_MAX;
 }
 
@@ -552,8 +548,7 @@ static void begin_sum(selfcal_work_t *work) {
     work->off_grid = 0.0;
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
-    memset(work->weight, 0, sizeof work->weight);
-    memset(work->weight_sq, 0, sizeof work->weight_sq);
+    memset(work->field, 0, sizeof work->field);
     memset(work->histogram, 0, sizeof work->histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         const selfcal_prior_t *prior = &axis_of(work)->prior[p];
@@ -725,8 +720,8 @@ static void step_sum(selfcal_work_t *work) {
     for (uint16_t j = 0; j < rows; j++) {
         for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
             const size_t at = (size_t)j * columns + row.basis_first + k;
-            work->weight[at] = r_fma(weight[j], row.basis[k], work->weight[at]);
-            work->weight_sq[at] = r_fma(weight_sq[j], row.basis[k], work->weight_sq[at]);
+            work->field[0][at] = r_fma(weight[j], row.basis[k], work->field[0][at]);
+            work->field[1][at] = r_fma(weight_sq[j], row.basis[k], work->field[1][at]);
         }
     }
 }
@@ -856,17 +851,17 @@ static void step_bias(selfcal_work_t *work) {
         if (begins && k == 0U) {
             work->bias_about = now.mean;
         }
-        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->values[0][k] * off;
-        work->bias_weight += (selfcal_wide_t)work->values[0][k];
+        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->spline[0][k] * off;
+        work->bias_weight += (selfcal_wide_t)work->spline[0][k];
         work->bias_first += weighed;
         work->bias_second += weighed * off;
-        work->bias_own += (selfcal_wide_t)work->values[1][k] * (v.drift_var + now.own[0]);
+        work->bias_own += (selfcal_wide_t)work->spline[1][k] * (v.drift_var + now.own[0]);
         if (v.law == SELFCAL_GAUSS_MARKOV) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-            const selfcal_wide_t own = (selfcal_wide_t)work->values[1][k] * best_sq;
-            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->values[0][k] * now.drift;
+            const selfcal_wide_t own = (selfcal_wide_t)work->spline[1][k] * best_sq;
+            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift;
             const selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
             decay[0] += weighed_fall;
             decay[1] += 2.0 * (own * (stationary - v.drift_var + now.own[1]) - weighed_fall * off);
@@ -1016,6 +1011,22 @@ static void go_to(selfcal_work_t *work, int stage) {
     work->at = 0;
 }
 
+/* The box of the next pass, or of the sums. */
+static void step_box(selfcal_work_t *work) {
+    if (work->pass == 0U) {
+        first_box(work);
+        work->best = -INFINITY;
+    } else if (work->moved) {
+        set_box(work, work->found_lo, work->found_hi);
+    }
+    if (work->found) {
+        begin_sum(work);
+    } else {
+        begin_pass(work);
+    }
+    work->stage = work->found ? SUM : SCAN;
+}
+
 /* After a row of a pass: the next one, the next pass, or what follows the search. */
 static void next_scan(selfcal_work_t *work) {
     work->at = 0;
@@ -1025,19 +1036,17 @@ static void next_scan(selfcal_work_t *work) {
     }
     const bool over = end_scan(work), found = work->best > (selfcal_real_t)-INFINITY;
     work->pass++;
-    if (!over) {
-        begin_pass(work);
-    } else if (!found) {
+    if (over && !found) {
         work->mass = 0.0;
         go_to(work, EVIDENCE); /* nothing within the priors' limits */
-    } else if (!work->refined && hypothesis_of(work)->rho != NULL) {
+    } else if (over && !work->refined && hypothesis_of(work)->rho != NULL) {
         work->refined = true; /* once more, about the peak that was found */
         work->truth_before = work->truth;
         set_truth(work, work->best_at[0], work->best_at[1]);
         go_to(work, SHIFT);
     } else {
-        begin_sum(work);
-        work->stage = SUM;
+        work->found = over;
+        work->stage = BOX;
     }
 }
 
@@ -1087,19 +1096,17 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case SPLINE_PROFILE:
-        fit(work, work->values[0], work->profile);
+        fit(work, work->field[0], work->spline[0]);
         work->stage = SPLINE_SIGMA;
         break;
     case SPLINE_SIGMA:
-        fit(work, work->values[1], work->ln_sigma);
+        fit(work, work->field[1], work->spline[1]);
+        work->pass = 0;
+        work->found = false;
         work->stage = BOX;
         break;
     case BOX:
-        first_box(work);
-        work->best = -INFINITY;
-        work->pass = 0;
-        begin_pass(work);
-        work->stage = SCAN;
+        step_box(work);
         break;
     case SCAN:
         step_scan(work);
@@ -1118,11 +1125,11 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case WEIGHTS:
-        cardinal_weights(work, work->weight, work->values[0]);
+        cardinal_weights(work, work->field[0], work->spline[0]);
         work->stage = WEIGHTS_SQ;
         break;
     case WEIGHTS_SQ:
-        cardinal_weights(work, work->weight_sq, work->values[1]);
+        cardinal_weights(work, work->field[1], work->spline[1]);
         work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
         memset(work->bias_decay, 0, sizeof work->bias_decay);
         go_to(work, BIAS);

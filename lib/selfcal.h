@@ -593,12 +593,12 @@ typedef struct {
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
     uint16_t best_node;
     bool refined;            /* the expectation is about the peak, no longer about the best node */
+    bool moved, found;       /* the box is to change after a pass; it is the one to sum over */
     selfcal_truth_t truth, truth_before;
-    selfcal_real_t values[2][SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* at the nodes: both fields less their expectation; later weights */
-    selfcal_real_t profile[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* B-spline coefficients of the profile ln-likelihood ... */
-    selfcal_real_t ln_sigma[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of ln of sigma_v's conditional mode, both less their expectation */
-    selfcal_real_t weight[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];   /* posterior mean of each basis function ... */
-    selfcal_real_t weight_sq[SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* ... and of it times sigma_v^2 over that of the best cell */
+    /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
+    selfcal_real_t field[2][SELFCAL_GRID_MAX * SELFCAL_GRID_MAX];  /* at the nodes; later posterior means of the basis functions */
+    selfcal_real_t spline[2][SELFCAL_GRID_MAX * SELFCAL_GRID_MAX]; /* B-spline coefficients; later weights of the nodes ... */
+    /* ... as they are, and with sigma_v^2 over that of the best cell */
     /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
     selfcal_real_t lo[2], width[2];
     selfcal_real_t limit_lo[2], limit_hi[2];

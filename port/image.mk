@@ -14,8 +14,8 @@ $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
 $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(IMAGE_MODEL)/selfcal_model.c $(IMAGE_MODEL)/selfcal_model.h \
                     port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/arm.mk
 	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
-	cd $(OUT)/objects && arm-none-eabi-gcc $(ARM_$(CORE)) $(ARM_COMPILE) -fstack-usage -g $(IMAGE_CFLAGS) $(CFLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
-	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL) -c $(IMAGE_SOURCES:%=$(CURDIR)/%) $(IMAGE_MODEL)/selfcal_model.c
+	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(IMAGE_CFLAGS) $(CFLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
+	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL),$(abspath $(IMAGE_SOURCES)) $(IMAGE_MODEL)/selfcal_model.c)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
 	    $(OUT)/objects/*.o -lm -o $@
 

@@ -14,6 +14,8 @@ QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
 qemu: $(OUT)/selfcal-qemu.elf
 
 $(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/arm.mk
-	@mkdir -p $(OUT)
-	arm-none-eabi-gcc $(ARM_$(CORE)) $(ARM_COMPILE) $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
-	    -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) $(QEMU_SOURCES) -lm -o $@
+	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
+	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -I$(CURDIR)/lib -I$(CURDIR)/port \
+	    -I$(CURDIR)/port/app -I$(CURDIR)/port/replay -I$(abspath $(MODEL_DIR)),$(abspath $(QEMU_SOURCES)))
+	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
+	    $(OUT)/objects/*.o -lm -o $@

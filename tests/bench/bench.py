@@ -77,6 +77,8 @@ MACHINES = {
     "cortex-m0-32bit": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x8000"), 16_000_000, "", 600),
 }
 
+SMALL_GRID = 12 * 12 + 12 + 1
+
 
 class BenchError(Exception):
     """What went wrong, in one line."""
@@ -316,6 +318,11 @@ def table(bench: Bench) -> str:
     row("**bytes**", {})
     for path in sorted((ROOT / "lib").glob("*.c")):
         number(f"flash, {path.name}", "sizes", f"text.{path.stem}")
+    always = [f"text.{name}" for name in ("averager", "bank", "kernel_fixed", "kernel_float", "posterior", "telemetry")]
+    row(
+        "… averager, bank, kernel, posterior, telemetry together",
+        {t: f"{sum(f['sizes'][name] for name in always):,}" for t, f in targets.items()},
+    )
     number("flash, library", "sizes", "text.library")
     number("… linked with `--gc-sections`", "sizes", "linked.library")
     number("… and what it draws from libm, libc, libgcc", "sizes", "linked.runtime")
@@ -323,6 +330,18 @@ def table(bench: Bench) -> str:
     number("RAM, `SELFCAL_SIZE`, six axes", "sizes", "ram.SELFCAL_SIZE")
     for name in ("selfcal_t", "selfcal_work_t", "selfcal_report_t", "selfcal_telemetry_t"):
         number(f"RAM, `{name}`", "sizes", f"ram.{name}")
+    rams = {t: {name: size for name, size in f["sizes"].items() if name.startswith("ram.")} for t, f in targets.items()}
+    a_node = {t: ram["ram.SELFCAL_SIZE"] // targets[t]["facts"]["nodes"] for t, ram in rams.items()}
+    row("RAM, all of these", {t: f"{sum(ram.values()):,}" for t, ram in rams.items()})
+    row("… of which one node", {t: f"{size:,}" for t, size in a_node.items()})
+    row(
+        f"… with {SMALL_GRID} nodes (12 x 12 Gauss-Markov, 12 random walk, 1 constant)",
+        {
+            t: f"{sum(ram.values()) - (targets[t]['facts']['nodes'] - SMALL_GRID) * a_node[t]:,}"
+            for t, ram in rams.items()
+            if targets[t]["facts"]["nodes"] > SMALL_GRID
+        },
+    )
     row("**whole image**, bytes", {t: MACHINES[t].image for t in targets})
     number("flash", "sizes", "firmware.flash")
     number("RAM of the variables", "sizes", "firmware.ram")
