@@ -67,7 +67,8 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
 }
 
 static bool valid_model(const selfcal_model_t *model) {
-    if (!(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
+    if ((model->forgetting != NULL && !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s)) ||
+        !(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {
         return false;
@@ -241,6 +242,7 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     memset(memory, 0, needed);
     self->model = model;
     self->variance_ratio = R(1.0);
+    self->keep = 1.0;
     self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
     self->node = (selfcal_node_t *)(void *)(self->c + cells);
@@ -403,6 +405,9 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
 /* The nodes `from` to `to` - 1, in the kernel's order, over the batch that waits. */
 static void run_batch(selfcal_t *self, uint16_t from, uint16_t to) {
     const selfcal_batch_t *batch = waiting(self);
+    for (uint16_t i = from; self->keep < 1.0 && i < to; i++) {
+        self->model->forgetting->code->fade(self, kernel_node(self, i));
+    }
     for (uint16_t i = from; self->n == 0U && i < to; i++) {
         init_node(self, (uint16_t)kernel_node(self, i));
     }
@@ -434,6 +439,7 @@ bool selfcal_bank_run(selfcal_t *self, uint16_t nodes) {
     self->ran = to;
     if (to == all) {
         self->n += batch->count;
+        self->weight = self->keep * self->weight + (selfcal_wide_t)batch->count;
         batch->count = 0;
         batch->part = false;
         batch->gap_after = 0;
@@ -451,6 +457,7 @@ bool selfcal_bank_hand_over(selfcal_t *self) {
     self->pending_gap = 0;
     self->gathering = (uint8_t)(1U - self->gathering);
     self->batches++;
+    self->keep = self->model->forgetting != NULL && self->n > 0U ? self->model->forgetting->code->part_kept(self) : 1.0;
     if (self->columns != NULL) {
         self->model->regressors->code->hand_over(self);
     }

@@ -83,12 +83,24 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index);
 /* selfcal_node() of the sums as they are, without what has only been gathered. */
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 
+/* Forgetting leaves so much of a column's sum of squares: in a filter that has let go of the column nothing comes after, and neither a
+ * float nor an integer could hold what B and A are then far below their sizes. */
+#define SELFCAL_KEPT_MIN 1e-9
+
 /* What is read now at one node, given sigma_v: its mean less the offset, the drift's part of that, and its variance over sigma_v^2
  * without that of the drift given the bias (and the coefficients): as it is now, and with d of the drift gone
  * own[0] + 2 d own[1] + d^2 own[2]. */
 typedef struct {
     selfcal_wide_t mean, drift, own[3];
 } selfcal_now_t;
+
+/* forgetting.c, for a model that forgets. */
+struct selfcal_forgetting_code {
+    /* Of the sums, as the batch that waits comes after what they hold. */
+    selfcal_wide_t (*part_kept)(selfcal_t *self);
+    /* All sums of node `j` fade to self->keep. */
+    void (*fade)(selfcal_t *self, size_t j);
+};
 
 /* regressors.c, for a model with regressors. */
 typedef struct gains gains_t; /* kernel.h */
@@ -107,6 +119,8 @@ struct selfcal_regressors_code {
     /* selfcal_kernel_run() and selfcal_kernel_gap(), columns and all. */
     void (*run)(selfcal_t *self, size_t j, const gains_t *gains);
     void (*gap)(selfcal_t *self, size_t j, selfcal_wide_t less);
+    /* Forgetting, of its own sums: the readings times `part`, the column "1" times `part_of_one`. */
+    void (*fade)(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one);
     /* With the regressors of a report in use: ln of sigma_v's mode, profile ln-likelihood and the share of samples that went into the
      * bias and the coefficients, of one node; the residual is `least` at least. */
     void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_wide_t *ln_sigma,

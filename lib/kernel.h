@@ -43,6 +43,9 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
 /* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
 void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
 
+/* Forgetting: sums B and C of every axis of node `j`, times what is kept of each. */
+void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
+
 #ifdef SELFCAL_FIXED
 /* The nodes have been placed: chooses an axis's step by ln of its white noise per bank sample. */
 void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma);
@@ -98,6 +101,10 @@ static inline selfcal_sum_t make_sum(selfcal_wide_t value) {
     const selfcal_real_t hi = (selfcal_real_t)value;
     const selfcal_sum_t sum = {hi, (selfcal_real_t)(value - (selfcal_wide_t)hi)};
     return sum;
+}
+
+static inline void sum_fade(selfcal_sum_t *sum, selfcal_wide_t keep) {
+    *sum = make_sum(keep * sum_value(*sum));
 }
 
 /* ------------------------------------------------------------------------------------------------- converged nodes */

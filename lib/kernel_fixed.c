@@ -405,6 +405,18 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) 
 
 /* ----------------------------------------------------------------------------------------------------------- the rest */
 
+static selfcal_total_t faded(selfcal_total_t sum, selfcal_wide_t keep) {
+    return (selfcal_total_t)(keep * (selfcal_wide_t)sum + (sum < 0 ? -0.5 : 0.5));
+}
+
+void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        self->b[k] = faded(self->b[k], keep_b);
+        self->c[k] = faded(self->c[k], keep_c);
+    }
+}
+
 void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     const int32_t keep = (int32_t)((1.0 - less) * (selfcal_wide_t)(1L << 30));
     const size_t axes = self->model->axes;

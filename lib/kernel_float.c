@@ -184,6 +184,14 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     }
 }
 
+void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        sum_fade(&self->b[k], keep_b);
+        sum_fade(&self->c[k], keep_c);
+    }
+}
+
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
     const selfcal_node_t *node = &self->node[k / self->model->axes];
     *b = sum_value(self->b[k]);

@@ -145,7 +145,7 @@ static void fit(const selfcal_work_t *work, const selfcal_real_t values[], selfc
 /* Takes (rho, alpha) as what made the data. A drift slower than the record looks like a random walk within it, and its level
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
-    const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->n;
+    const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const selfcal_wide_t dt = (selfcal_wide_t)work->bank->model->dt_s;
     const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
     selfcal_real_t rate = R(0.0), variance = r_exp(R(2.0) * ln_rho);
@@ -157,7 +157,7 @@ static void set_truth(selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_
     truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
     truth->rate = -r_expm1(-slow);
     truth->ln_v = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, dt, truth).ln_v;
-    truth->wide = (selfcal_real_t)work->bank->n * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
+    truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
 }
 
 /* What the expectation says of the two fields; the splines hold the rest. */
@@ -174,11 +174,11 @@ static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth
     }
     if (truth->wide) {
         const expected_t_wide e = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, (selfcal_wide_t)dt, truth);
-        result.profile = (selfcal_real_t)(-0.5 * (selfcal_wide_t)work->bank->n * (e.ln_v - truth->ln_v));
+        result.profile = (selfcal_real_t)(-0.5 * work->bank->weight * (e.ln_v - truth->ln_v));
         result.ln_sigma = (selfcal_real_t)(0.5 * (e.ln_v - e.ln_s));
     } else {
         const expected_t e = expected(ln_rho, ln_alpha, pole, (selfcal_real_t)dt, truth);
-        result.profile = R(-0.5) * (selfcal_real_t)work->bank->n * (e.ln_v - (selfcal_real_t)truth->ln_v);
+        result.profile = R(-0.5) * (selfcal_real_t)work->bank->weight * (e.ln_v - (selfcal_real_t)truth->ln_v);
         result.ln_sigma = R(0.5) * (e.ln_v - e.ln_s);
     }
     return result;
@@ -194,7 +194,7 @@ typedef struct {
 static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
     const selfcal_t *bank = work->bank;
     const uint16_t index = (uint16_t)(work->first_node + k);
-    const selfcal_wide_t n = (selfcal_wide_t)bank->n;
+    const selfcal_wide_t n = bank->weight;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t p0 = sd * sd;
     /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior. */
@@ -274,7 +274,7 @@ static uint16_t part(selfcal_work_t *work, unsigned step, uint16_t whole) {
 
 /* The best node settles n_eff, by the share of the bias there, and is the first guess of what made the data. */
 static void step_peak(selfcal_work_t *work) {
-    const selfcal_wide_t n = (selfcal_wide_t)work->bank->n;
+    const selfcal_wide_t n = work->bank->weight;
     if (work->at == 0U) {
         work->peak = (selfcal_wide_t)-INFINITY;
         work->n_eff = n - (selfcal_wide_t)work->unknowns;
@@ -1069,6 +1069,10 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     case GATHER:
         if (step_gather(work)) {
             report->n = work->bank->n;
+            if (work->bank->weight + 1.0 < (selfcal_wide_t)(SELFCAL_REPORT_MIN + work->unknowns)) {
+                work->bank = NULL;
+                return SELFCAL_TOO_SHORT; /* the rest is forgotten */
+            }
             go_to(work, PEAK);
         }
         break;

@@ -446,7 +446,7 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
     const selfcal_wide_t variance = sigma_v * sigma_v;
     make_normal(self, axis, node, mask, &normal);
     make_fit(&normal, variance, &fit);
-    *ln_p = -0.5 * ((selfcal_wide_t)self->n * (SELFCAL_LN_2PI + 2.0 * log(sigma_v)) + view.ln_s + normal.residual / variance +
+    *ln_p = -0.5 * (self->weight * (SELFCAL_LN_2PI + 2.0 * log(sigma_v)) + view.ln_s + normal.residual / variance +
                     fit.ln_det + fit.miss);
     return SELFCAL_OK;
 }
@@ -461,7 +461,7 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_e
     const selfcal_wide_t variance = fmax(normal.residual, least) / n_eff;
     make_fit(&normal, variance, &fit);
     *ln_sigma = 0.5 * log(variance);
-    *profile = -0.5 * ((selfcal_wide_t)work->bank->n * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff + fit.ln_det +
+    *profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff + fit.ln_det +
                        fit.miss);
     *share = fit.share;
 }
@@ -500,6 +500,25 @@ static void finish(const selfcal_work_t *work) {
     }
 }
 
+static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one) {
+    const size_t p = columns_of(self), axes = self->model->axes;
+    selfcal_sum_t *a = &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)];
+    selfcal_wide_t of[1 + SELFCAL_REGRESSORS_MAX] = {part_of_one};
+    for (size_t k = 0; k <= p; k++, a += k) {
+        if (k > 0U) {
+            of[k] = part * part * sum_value(a[k]) > SELFCAL_KEPT_MIN * SELFCAL_KEPT_MIN ? part : 1.0; /* in any unit */
+        }
+        for (size_t l = 0; l <= k; l++) {
+            sum_fade(&a[l], of[k] * of[l]);
+        }
+    }
+    for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
+        for (size_t k = 0; k < p; k++) {
+            sum_fade(&self->columns->b[at * p + k], part * of[k + 1U]);
+        }
+    }
+}
+
 const selfcal_regressors_code_t selfcal_regressors_code = {
-    valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, field, now, finish,
+    valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, fade, field, now, finish,
 };

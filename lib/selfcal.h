@@ -235,6 +235,17 @@ typedef struct {
     const float *coefficient_sd; /* [axes][count] prior N(0, sd^2), unit per unit of the regressor; 0: not for this axis */
 } selfcal_regressors_t;
 
+typedef struct selfcal_forgetting_code selfcal_forgetting_code_t;
+extern const selfcal_forgetting_code_t selfcal_forgetting_code;
+
+/* For parts whose parameters change: what a bank sample adds to the ln-likelihood counts for 2^-(age/half_life_s), from one batch to the
+ * next. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
+ * are up to sqrt(2) wider than need be. O(axes) for each node and batch. */
+typedef struct {
+    const selfcal_forgetting_code_t *code; /* &selfcal_forgetting_code: only a model that forgets links what it takes */
+    float half_life_s; /* at least SELFCAL_BATCH dt_s */
+} selfcal_forgetting_t;
+
 typedef struct {
     uint32_t id;        /* checksum of the tables: what a snapshot or a monitor tells models apart by */
     float dt_s;         /* bank interval, 1e-6 to 1e6 */
@@ -245,6 +256,7 @@ typedef struct {
     const selfcal_axis_t *axis;             /* [axes] */
     const selfcal_hypothesis_t *hypothesis; /* [hypotheses] */
     const selfcal_regressors_t *regressors; /* NULL: none, and none of their cost */
+    const selfcal_forgetting_t *forgetting; /* likewise */
 } selfcal_model_t;
 
 /* ------------------------------------------------------------------------------------------------------------- bank */
@@ -365,6 +377,8 @@ typedef struct {
     selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_drift_t *x;      /* [nodes][axes]: predicted drift of the zero-bias filter */
     uint32_t n;              /* bank samples in all sums */
+    selfcal_wide_t weight;   /* what they count for: n without forgetting */
+    selfcal_wide_t keep;     /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
     /* One batch is gathered while the nodes run, some at every push, over the one before. */
@@ -560,7 +574,7 @@ typedef struct {
 
 typedef struct {
     uint8_t axis;
-    uint32_t n;                /* bank samples it rests on */
+    uint32_t n;                /* bank samples it rests on, forgotten ones among them */
     float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit */
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
@@ -618,7 +632,8 @@ typedef struct {
     selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][3];                  /* sums of selfcal_decay_t over the nodes of each alpha */
 } selfcal_work_t;
 
-/* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. */
+/* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples; of a bank that forgets, the first step that looks at
+ * its sums says so too. */
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
 /* The same with the regressors of `mask` in use, a bit each: one subset, whose ln_evidence compares with those of the others. Bias

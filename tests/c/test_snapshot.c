@@ -354,7 +354,9 @@ static void other_models_builds_and_versions_are_refused(void) {
     /* a length that header and checksum agree on, and the layout does not */
     again = saved;
     again.length += 4U;
-    again.bytes[OFFSET_LENGTH] = (uint8_t)(again.bytes[OFFSET_LENGTH] + 4U);
+    for (size_t i = 0; i < 4U; i++) {
+        again.bytes[OFFSET_LENGTH + i] = (uint8_t)(again.length >> (8U * i));
+    }
     TEST_ASSERT_TRUE(number_at(&again, OFFSET_LENGTH, 4) == again.length);
     mend_crc(&again);
     refused(SELFCAL_SNAPSHOT_FOREIGN, &again);

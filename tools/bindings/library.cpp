@@ -40,7 +40,7 @@ struct Grid {
 class Bank {
 public:
     Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses,
-         uint32_t id, const std::optional<RegressorsTuple> &regressors) {
+         uint32_t id, const std::optional<RegressorsTuple> &regressors, double half_life_s) {
         for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
             if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || uniform.size() != SELFCAL_PARAMETERS)
@@ -66,6 +66,7 @@ public:
                   static_cast<uint16_t>(nodes),
                   axes_.data(),
                   hypotheses_.data(),
+                  nullptr,
                   nullptr};
         if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
             throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
@@ -76,6 +77,9 @@ public:
             regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(), coefficient_sd_.data()};
             model_.regressors = &regressors_;
         }
+        forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
+        if (half_life_s != 0.0)
+            model_.forgetting = &forgetting_;
         memory_.resize(size() / sizeof(double) + 1);
         check(selfcal_init(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double)));
     }
@@ -218,6 +222,7 @@ public:
 #endif
 
     uint32_t count() const { return selfcal_count(&bank_); }
+    double weight() const { return bank_.weight; }
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const {
         return SELFCAL_SIZE(model_.nodes, model_.axes) + SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size());
@@ -286,6 +291,7 @@ private:
     std::vector<std::unique_ptr<Grid>> grids_;
     std::vector<float> reference_, coefficient_sd_;
     selfcal_regressors_t regressors_{};
+    selfcal_forgetting_t forgetting_{};
     std::vector<double> memory_;
     selfcal_model_t model_{};
     selfcal_t bank_{};
@@ -357,6 +363,7 @@ NB_MODULE(MODULE_NAME, m) {
     using MODULE_NAME::Bank;
     m.attr("version") = SELFCAL_VERSION;
     m.attr("GRID_MAX") = SELFCAL_GRID_MAX;
+    m.attr("BATCH") = SELFCAL_BATCH;
     m.attr("REGRESSORS_MAX") = SELFCAL_REGRESSORS_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
@@ -365,8 +372,8 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("OFF_GRID") = static_cast<int>(SELFCAL_OFF_GRID);
     nb::class_<Bank>(m, "Bank")
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t,
-                      const std::optional<RegressorsTuple> &>(),
-             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
+                      const std::optional<RegressorsTuple> &, double>(),
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(), nb::arg("half_life_s") = 0.0)
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
@@ -386,6 +393,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def("scale", &Bank::scale)
 #endif
         .def_prop_ro("count", &Bank::count)
+        .def_prop_ro("weight", &Bank::weight)
         .def_prop_ro("nodes", &Bank::nodes)
         .def_prop_ro("size", &Bank::size);
     using MODULE_NAME::Gate;

@@ -110,6 +110,7 @@ class Model:
     nodes: Mapping[str, GridNodes]
     simulate: Mapping[str, Any]
     regressors: tuple[Regressor, ...] = ()
+    half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -295,11 +296,11 @@ class _Reader:
         )
 
     def model(self) -> Model:
-        top = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate", "regressors")
+        needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
-        tree = self.only(raw, top, "")
+        tree = self.only(raw, (*needed, "regressors", "half_life_s"), "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         groups_tree = self.entry(tree, "groups", "")
         if not isinstance(groups_tree, dict) or not groups_tree:
@@ -329,4 +330,5 @@ class _Reader:
             nodes={name: self.nodes(fields, f"nodes.{name}") for name, fields in targets.items()},
             simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
             regressors=self.regressors(tree.get("regressors") or [], groups),
+            half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
         )

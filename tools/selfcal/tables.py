@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS, Model, Regressor
 
@@ -85,6 +86,7 @@ class Tables:
     axes: tuple[AxisTable, ...]
     hypotheses: tuple[HypothesisTable, ...]
     regressors: tuple[RegressorTable, ...] = ()
+    half_life_s: float = 0.0
 
     @property
     def nodes(self) -> int:
@@ -98,7 +100,8 @@ class Tables:
             (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0)
             for h in self.hypotheses
         ]
-        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses, *self.regressors)).encode())
+        extras = (*self.regressors, *([self.half_life_s] if self.half_life_s else []))
+        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses, *extras)).encode())
 
 
 def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
@@ -145,6 +148,11 @@ def make_tables(
                 stuck_limit=group.stuck_limit,
             )
         )
+    if 0.0 < model.half_life_s < _library32.BATCH * block / rate_hz:
+        raise UserError(
+            f"{model.path}: half_life_s: {model.half_life_s:g} s are less than {_library32.BATCH} bank intervals "
+            f"({_library32.BATCH * block / rate_hz:g} s)"
+        )
     grids: dict[str, tuple[Grid | None, Grid | None]] = {
         "constant": (None, None),
         "random_walk": (make_grid(nodes.random_walk), None),
@@ -163,6 +171,7 @@ def make_tables(
             for one in model.regressors
             for column in one.columns
         ),
+        half_life_s=model.half_life_s,
     )
 
 

@@ -54,6 +54,7 @@ class Bank:
             [(h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha)) for h in tables.hypotheses],
             tables.id,
             _regressors(tables),
+            tables.half_life_s,
         )
 
     def push(
@@ -91,7 +92,7 @@ class Bank:
         try:
             report = self.raw.report(axis, mask)
         except ValueError as error:  # std::length_error
-            raise UserError(_too_short(self.tables, self.raw.count)) from error
+            raise UserError(_too_short(self.tables, self.raw.count, self.raw.weight)) from error
         log_evidence, probability, parameters, coefficients = {}, {}, {}, {}
         used = [k for k in range(len(self.tables.regressors)) if mask >> k & 1]
         for table, entry in zip(self.tables.hypotheses, report["hypotheses"], strict=True):
@@ -117,7 +118,9 @@ def outside_priors(prior: AxisTable) -> str:
     )
 
 
-def _too_short(tables: Tables, count: int) -> str:
+def _too_short(tables: Tables, count: int, weight: float) -> str:
+    if count > _library32.REPORT_MIN and weight < _library32.REPORT_MIN:
+        return f"all is forgotten: after {tables.half_life_s:g} s a bank sample counts half, and the last are too old"
     return (
         f"too short: {count} bank samples of {tables.dt_s:g} s, a report needs {_library32.REPORT_MIN} "
         "(record longer, or give --decimate HZ)"

@@ -73,6 +73,9 @@ def _source(model: Model, tables: Tables) -> str:
     hypotheses = (_hypothesis(h) for h in tables.hypotheses)
     parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
     parts += _regressors(tables)
+    if tables.half_life_s:
+        code = f"{{&selfcal_forgetting_code, {_f(tables.half_life_s)}}}"
+        parts += [f"static const selfcal_forgetting_t forgetting = {code};", ""]
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
     parts += [
         f"const char *const selfcal_model_axis_name[] = {{{names}}};",
@@ -83,6 +86,7 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {tables.block}U, /* block */",
         "    SELFCAL_MODEL_AXES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_NODES, axes, hypotheses,",
         f"    {'&regressors' if tables.regressors else 'NULL'},",
+        f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
         "};",
         "",
     ]

@@ -148,6 +148,8 @@ def identify_axis(
         raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
     if not present.std() > 0.0:
         raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
+    if engine == "reference" and model.half_life_s:
+        raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     if engine == "fixed" and regressors:
         raise UserError("the fixed-point bank knows no regressors: take --engine library, or a model without them")
     choices = choices_of(regressors)

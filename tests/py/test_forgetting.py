@@ -1,0 +1,192 @@
+"""Forgetting: sums in which a sample counts for 2^-(age / half-life), a batch at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from selfcal import _library32
+from selfcal.engines.library import Bank
+from selfcal.errors import UserError
+from selfcal.model import Model, Regressor
+from selfcal.tables import Tables, make_tables
+from selfcal.verbs.identify import identify
+from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+
+from conftest import ROOT, worst_difference
+
+MODEL = Model.load()
+RECORDING = ROOT / "tests" / "data" / "simulated_adis16405.npz"
+TIME = Regressor("time", "time", "s", {"gyro": 1e-4}, 0.5)
+
+
+def tables(half_life_s: float, model: Model = MODEL) -> Tables:
+    return make_tables(replace(model, half_life_s=half_life_s), 1.0, ("gx",))
+
+
+def weights(missing: np.ndarray, half_life: float) -> np.ndarray:
+    """What every sample [n] counts for, as selfcal.h has it: by the intervals of the later batches."""
+    n, batch = len(missing), _library32.BATCH
+    ends = np.cumsum(missing + 1)[[min(at + batch, n) - 1 for at in range(0, n, batch)]]  # of each batch
+    return np.repeat(2.0 ** (-(ends[-1] - ends) / half_life), batch)[:n]
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Relative to sigma_v^2: pole, variance added per interval, predicted variance of the drift at the first sample."""
+
+    phi: float
+    q: float
+    first: float
+
+
+def faded(
+    node: Filter,
+    y: np.ndarray,
+    columns: np.ndarray,
+    missing: np.ndarray,
+    half_life: float,
+    sd: np.ndarray,
+    sigma: float,
+) -> float:
+    """ln-likelihood of `y` [n] under weights, by the printed recursions with a filter each for y and every column
+    [n, c], and the coefficients ~ N(0, sd^2) integrated out of the weighted normal equations."""
+    n, series = len(y), np.column_stack([y, columns])
+    x, p, sums, ln_s = np.zeros(series.shape[1]), node.first, np.zeros((series.shape[1],) * 2), 0.0
+    w = weights(missing, half_life)
+    for i in range(n):
+        for _ in range(int(missing[i])):
+            x, p = node.phi * x, node.phi**2 * p + node.q
+        nu, s = series[i] - x, 1.0 + p
+        sums += w[i] * np.outer(nu, nu) / s
+        ln_s += w[i] * math.log(s)
+        x, p = node.phi * (x + p / s * nu), node.phi**2 * p / s + node.q
+    a, b, c = sums[1:, 1:] / sigma**2, sums[1:, 0] / sigma**2, sums[0, 0] / sigma**2
+    precision = a + np.diag(1.0 / sd**2)
+    _, ln_det = np.linalg.slogdet(precision * np.outer(sd, sd))
+    return float(
+        -0.5 * (w.sum() * math.log(2 * math.pi * sigma**2) + ln_s + c - b @ np.linalg.solve(precision, b) + ln_det)
+    )
+
+
+@pytest.mark.parametrize("with_time", [False, True], ids=["plain", "regressor"])
+def test_the_likelihood_is_that_of_the_weighted_record(with_time: bool) -> None:
+    """Truth: the recursions as printed, on every kind of node, in double. Tolerance: that of equal nodes (1e-3 nat)."""
+    rng = np.random.default_rng(5)
+    n, half_life = 700, 100.0
+    missing = np.where(rng.random(n) < 0.02, rng.integers(1, 40, n), 0)
+    missing[0] = 0
+    t = np.cumsum(missing + 1.0)
+    y = 0.3 + 1e-4 * t * with_time + 0.05 * rng.standard_normal(n) + np.cumsum(2e-3 * rng.standard_normal(n))
+    made = tables(half_life, replace(MODEL, regressors=(TIME,) if with_time else ()))
+    bank = Bank(made, double=True)
+    bank.push(y[:, None], missing.astype(np.uint64), t[:, None] if with_time else None)
+    y = y.astype(np.float32).astype(float)
+    sd = np.array([made.axes[0].bias_sd, TIME.sd["gyro"]])[: 1 + with_time]
+    columns = np.column_stack([np.ones(n), t])[:, : 1 + with_time]
+    sigma, worst = 0.06, 0.0
+    for index in range(0, made.nodes, 7):
+        view = bank.raw.node(0, index)
+        rho, alpha = math.exp(view["ln_rho"]), math.exp(view["ln_alpha"])
+        law = view["law"]
+        phi = math.exp(-alpha) if law == 2 else 1.0
+        q = {0: 0.0, 1: rho**2, 2: rho**2 * -math.expm1(-2 * alpha)}[law]
+        first = {0: 0.0, 1: rho**2, 2: rho**2}[law]
+        truth = faded(Filter(phi, q, first), y, columns, missing, half_life, sd, sigma)
+        found = bank.raw.log_likelihood_subset(0, index, int(with_time), sigma)
+        worst = max(worst, abs(found - truth))
+    print(f"\nworst |d ln p| {worst:.1e}")
+    assert worst < 1e-3
+    assert bank.raw.weight == pytest.approx(weights(missing, half_life).sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("fixed", [None, 16, 32])
+def test_float_and_integers_forget_as_double_does(fixed: Literal[16, 32] | None) -> None:
+    """5000 half-lives: what rounding leaves must fade as well. Tolerances of the design: 1e-3 and 0.02 sd in float,
+    5e-3 and 0.05 sd in integers."""
+    truth = draw(MODEL.group_of("gx"), "gauss_markov", np.random.default_rng(3))
+    y = simulate_bank_samples("gauss_markov", truth, 1.0, 300_000, 3)[0][:, None]
+    made = tables(60.0)
+    bank, exact = Bank(made, fixed=fixed), Bank(made, double=True)
+    for one in (bank, exact):
+        one.push(y)
+    _, probability, mean, _ = worst_difference(bank.report(0), exact.report(0))
+    print(f"\n{fixed or 'float'}: dP {probability:.1e}, mean {mean:.1e} sd")
+    assert probability < (5e-3 if fixed else 1e-3) and mean < (0.05 if fixed else 0.02)
+
+
+def test_a_parameter_that_changes_is_followed() -> None:
+    """White noise alone whose density triples, 10 half-lives before the end: what is left of the past is 2^-10. Without
+    forgetting N is between the two."""
+    rng = np.random.default_rng(7)
+    y = (np.r_[np.full(30_000, 0.02), np.full(10_000, 0.06)] * rng.standard_normal(40_000))[:, None]
+    found = {}
+    for half_life in (1000.0, 0.0):
+        bank = Bank(tables(half_life))
+        bank.push(y)
+        found[half_life] = bank.report(0).parameters["constant"]["N"]
+    n = found[1000.0]
+    assert n.q05 < 0.06 < n.q95
+    # 1000 / ln 2 samples: the sd of sigma_v is sigma / sqrt(2 n); the intervals are not narrower than that
+    assert n.sd == pytest.approx(0.06 / math.sqrt(2 * 1000 / math.log(2)), rel=0.05)
+    assert 0.03 < found[0.0].mean < 0.04
+
+
+def test_nothing_is_forgotten_within_a_short_record() -> None:
+    """A half-life of 10^6 records: the same as without, to what a 10^-6 th part of n ln V can do."""
+    truth = draw(MODEL.group_of("gx"), "random_walk", np.random.default_rng(2))
+    y = simulate_bank_samples("random_walk", truth, 1.0, 1000, 2)[0][:, None]
+    banks = Bank(tables(1e9), double=True), Bank(tables(0.0), double=True)
+    for bank in banks:
+        bank.push(y)
+    assert max(worst_difference(*(bank.report(0) for bank in banks))) < 1e-2
+
+
+def test_after_a_long_gap_nothing_is_left_and_the_bank_starts_again() -> None:
+    y = 0.05 * np.random.default_rng(1).standard_normal((300 * _library32.BATCH, 1))
+    bank = Bank(tables(100.0))
+    bank.push(y)
+    bank.push(y[:1], np.array([10**7], np.uint64))
+    with pytest.raises(UserError, match="all is forgotten"):
+        bank.report(0)
+    assert bank.raw.sound
+    bank.push(y)
+    fresh = Bank(tables(100.0))
+    fresh.push(y)
+    assert bank.report(0).parameters["constant"]["N"].mean == pytest.approx(
+        fresh.report(0).parameters["constant"]["N"].mean, rel=0.02
+    )
+
+
+def test_a_snapshot_in_between_changes_nothing() -> None:
+    y = 0.05 * np.random.default_rng(1).standard_normal((900, 1))
+    whole = Bank(tables(100.0))
+    whole.push(y)
+    for cut in (0, 7, 100, 501):
+        bank = Bank(tables(100.0))
+        bank.push(y[:cut])
+        restored = Bank(tables(100.0))
+        restored.restore(bank.save())
+        restored.push(y[cut:])
+        assert restored.save() == whole.save()
+
+
+def test_bad_half_lives_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="less than 16 bank intervals"):
+        tables(15.0)
+    assert tables(16.0).id != tables(17.0).id != tables(0.0).id
+    text = MODEL.path.read_text()
+    for value, message in (
+        ("-1", "half_life_s: must be"),
+        ("soon", "half_life_s: must be"),
+        ("600", "forgets nothing"),
+    ):
+        file = tmp_path / "model.yaml"
+        file.write_text(f"{text}\nhalf_life_s: {value}\n")
+        with pytest.raises(UserError, match=message):
+            identify(RECORDING, model=file, engine="reference", axes=["gx"])
