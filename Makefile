@@ -239,9 +239,9 @@ EMBEDDED_cortex-m4f := $(wildcard port/qemu/*.c port/stm32f405/*.c)
 EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
 
 # What a Cortex-M4F and a Cortex-M0 get.
-check-arm: $(MODEL)/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) -O2 $(ARM_COMPILE) $(INCLUDES) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(C_ALL:port/posix/%=) $(EMBEDDED_cortex-m4f))
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT -c -o /dev/null,$(filter-out port/posix/%,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m0)))
+check-arm: $(BUILD)/stm32f405/model/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) -O2 $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/stm32f405/model) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m4f) $(BUILD)/stm32f405/model/selfcal_model.c)
+	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) -O2 $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT -c -o /dev/null,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m0) $(BUILD)/cortex-m0/model/selfcal_model.c)
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
 

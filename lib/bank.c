@@ -90,7 +90,7 @@ static bool valid_model(const selfcal_model_t *model) {
         const bool alpha = hypothesis->law == SELFCAL_GAUSS_MARKOV;
         if ((unsigned)hypothesis->law >= SELFCAL_LAWS || rho != (hypothesis->rho != NULL) ||
             alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
-            (alpha && !valid_grid(hypothesis->alpha))) {
+            (alpha && !valid_grid(hypothesis->alpha)) || hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
             return false;
         }
         nodes += hypothesis_nodes(hypothesis);

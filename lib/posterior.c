@@ -21,6 +21,7 @@ enum { GATHER, PEAK, SIGMA, VALUES, SHIFT, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SC
 #define STEP_SHIFTED_NODES 32U
 #define STEP_SCANNED_CELLS 24U
 #define STEP_SUMMED_CELLS 6U
+#define STEP_LINES 8U
 
 /* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
 #define DEPTH R(20.0)
@@ -83,32 +84,19 @@ static uint8_t basis_at(uint16_t nodes, selfcal_real_t z, selfcal_real_t out[6])
     return (uint8_t)(span - 5U);
 }
 
-static selfcal_real_t dot(const selfcal_real_t a[], const selfcal_real_t b[], size_t count) {
-    selfcal_real_t sum = R(0.0);
-    for (size_t i = 0; i < count; i++) {
-        sum = r_fma(a[i], b[i], sum);
-    }
-    return sum;
-}
-
-/* Node values [rho][alpha] become spline coefficients in `out`. */
-static void fit(const selfcal_work_t *work, const selfcal_real_t values[], selfcal_real_t out[]) {
-    const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
-    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
+/* One line of values, `stride` apart, by the grid's matrix or its transpose; as it is without a grid. */
+static void transform_line(const selfcal_grid_t *grid, bool transposed, const selfcal_real_t in[], selfcal_real_t out[], size_t stride) {
+    const size_t nodes = grid_nodes(grid);
     selfcal_real_t line[SELFCAL_GRID_MAX];
-    for (size_t i = 0; i < rows; i++) {
-        for (size_t j = 0; j < columns; j++) {
-            const selfcal_real_t *value = &values[i * columns];
-            out[i * columns + j] = alpha != NULL ? dot(&alpha->fit[j * columns], value, columns) : value[j];
-        }
+    for (size_t i = 0; i < nodes; i++) {
+        line[i] = in[i * stride];
     }
-    for (size_t j = 0; rho != NULL && j < columns; j++) {
-        for (size_t i = 0; i < rows; i++) {
-            line[i] = out[i * columns + j];
+    for (size_t i = 0; i < nodes; i++) {
+        selfcal_real_t sum = grid == NULL ? line[i] : R(0.0);
+        for (size_t k = 0; grid != NULL && k < nodes; k++) {
+            sum = r_fma(grid->fit[transposed ? k * nodes + i : i * nodes + k], line[k], sum);
         }
-        for (size_t i = 0; i < rows; i++) {
-            out[i * columns + j] = dot(&rho->fit[i * rows], line, rows);
-        }
+        out[i * stride] = sum;
     }
 }
 
@@ -270,6 +258,23 @@ static uint16_t part(selfcal_work_t *work, unsigned step, uint16_t whole) {
     const uint16_t from = work->at;
     work->at = (uint16_t)(from + step < whole ? from + step : whole);
     return from;
+}
+
+/* Node values [rho][alpha] become spline coefficients: along alpha, then along rho. `transposed`: posterior means of the basis functions
+ * become weights of the node values; the mean of anything the spline interpolates is the sum of its node values under them.
+ * Some lines; true after the last. */
+static bool step_transform(selfcal_work_t *work, bool transposed, const selfcal_real_t in[], selfcal_real_t out[]) {
+    const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
+    const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha), lines = (uint16_t)(rows + columns);
+    for (uint16_t i = part(work, STEP_LINES, lines); i < work->at; i++) {
+        if (i < rows) {
+            const size_t row = (size_t)i * columns;
+            transform_line(alpha, transposed, &in[row], &out[row], 1);
+        } else {
+            transform_line(rho, transposed, &out[i - rows], &out[i - rows], columns);
+        }
+    }
+    return work->at == lines;
 }
 
 /* The best node settles n_eff, by the share of the bias there, and is the first guess of what made the data. */
@@ -795,34 +800,6 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     estimate->flags = flags;
 }
 
-/* Posterior means of the basis functions become weights of the node values: the mean of anything the spline interpolates is
- * the sum of its node values under them (the transpose of fit()). */
-static void cardinal_weights(const selfcal_work_t *work, const selfcal_real_t of_basis[], selfcal_real_t out[]) {
-    const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
-    const size_t rows = grid_nodes(rho), columns = grid_nodes(alpha);
-    selfcal_real_t line[SELFCAL_GRID_MAX];
-    for (size_t i = 0; i < rows; i++) {
-        for (size_t j = 0; j < columns; j++) {
-            selfcal_real_t sum = alpha != NULL ? R(0.0) : of_basis[i];
-            for (size_t l = 0; alpha != NULL && l < columns; l++) {
-                sum = r_fma(alpha->fit[l * columns + j], of_basis[i * columns + l], sum);
-            }
-            out[i * columns + j] = sum;
-        }
-    }
-    for (size_t j = 0; rho != NULL && j < columns; j++) {
-        for (size_t i = 0; i < rows; i++) {
-            line[i] = R(0.0);
-            for (size_t k = 0; k < rows; k++) {
-                line[i] = r_fma(rho->fit[k * rows + i], out[k * columns + j], line[i]);
-            }
-        }
-        for (size_t i = 0; i < rows; i++) {
-            out[i * columns + j] = line[i];
-        }
-    }
-}
-
 /* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void step_bias(selfcal_work_t *work) {
@@ -1100,14 +1077,16 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case SPLINE_PROFILE:
-        fit(work, work->field[0], work->spline[0]);
-        work->stage = SPLINE_SIGMA;
+        if (step_transform(work, false, work->field[0], work->spline[0])) {
+            go_to(work, SPLINE_SIGMA);
+        }
         break;
     case SPLINE_SIGMA:
-        fit(work, work->field[1], work->spline[1]);
-        work->pass = 0;
-        work->found = false;
-        work->stage = BOX;
+        if (step_transform(work, false, work->field[1], work->spline[1])) {
+            work->pass = 0;
+            work->found = false;
+            work->stage = BOX;
+        }
         break;
     case BOX:
         step_box(work);
@@ -1129,14 +1108,16 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case WEIGHTS:
-        cardinal_weights(work, work->field[0], work->spline[0]);
-        work->stage = WEIGHTS_SQ;
+        if (step_transform(work, true, work->field[0], work->spline[0])) {
+            go_to(work, WEIGHTS_SQ);
+        }
         break;
     case WEIGHTS_SQ:
-        cardinal_weights(work, work->field[1], work->spline[1]);
-        work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
-        memset(work->bias_decay, 0, sizeof work->bias_decay);
-        go_to(work, BIAS);
+        if (step_transform(work, true, work->field[1], work->spline[1])) {
+            work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
+            memset(work->bias_decay, 0, sizeof work->bias_decay);
+            go_to(work, BIAS);
+        }
         break;
     case BIAS:
         step_bias(work);

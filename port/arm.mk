@@ -1,9 +1,14 @@
 # How the library and the application are compiled for the cores; included by whatever builds for one.
-ARM_cortex-m4f-portable := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
+# SELFCAL_GRID_MAX, SELFCAL_HYPOTHESIS_NODES_MAX: the largest of the core's nodes in the default model. Half of the host's cells a dimension: a
+# quarter of the time.
+CONFIG_cells := -DSELFCAL_REPORT_CELLS=48 -DSELFCAL_SIGMA_CELLS=24
+CONFIG_cortex-m4f := $(CONFIG_cells) -DSELFCAL_GRID_MAX=20 -DSELFCAL_HYPOTHESIS_NODES_MAX=240
+# Integers; a node's batch takes 4 sample periods at 819.2 Hz and 48 MHz.
+CONFIG_cortex-m0 := $(CONFIG_cells) -DSELFCAL_GRID_MAX=8 -DSELFCAL_HYPOTHESIS_NODES_MAX=48 -DSELFCAL_FIXED=16 -DSELFCAL_PUSH_EVERY=16
+ARM_cortex-m4f-portable := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard $(CONFIG_cortex-m4f)
 ARM_cortex-m4f := $(ARM_cortex-m4f-portable) -DSELFCAL_KERNEL_M4F
-# Integers; a node's batch takes 4 sample periods at 819.2 Hz and 48 MHz; the largest grid dimension of nodes.cortex-m0 is 8.
-ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb -DSELFCAL_FIXED=16 -DSELFCAL_PUSH_EVERY=16 -DSELFCAL_GRID_MAX=8
-ARM_cortex-m0-32bit := -mcpu=cortex-m0 -mthumb -DSELFCAL_FIXED=32
+ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb $(CONFIG_cortex-m0)
+ARM_cortex-m0-32bit := -mcpu=cortex-m0 -mthumb $(CONFIG_cells) -DSELFCAL_GRID_MAX=8 -DSELFCAL_HYPOTHESIS_NODES_MAX=48 -DSELFCAL_FIXED=32
 ARM_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
 ARM_COMPILE := -std=c99 -ffp-contract=off -ffunction-sections -fdata-sections $(ARM_WARNINGS)
 # What every sample runs through is compiled for speed, the rest for size: 4 KB less, 3 % more instructions in a report.

@@ -57,21 +57,17 @@ def part(folder: Path, seconds: float, axes: Sequence[str] = SIX, hole: slice | 
     return load(path)
 
 
-#: The arithmetic that a core's firmware has and the host's has not unless it is told.
-AS_CORE = {"cortex-m4f": "", "cortex-m0": "-DSELFCAL_FIXED=16"}
-
-
 def program(
     model: Model, rate_hz: float, axes: Sequence[str], target: str, core: str, folder: Path, flags: str = ""
 ) -> Path:
-    """The firmware of `target` with the nodes and the arithmetic of `core`, made with further compiler flags."""
+    """The firmware of `target` with the nodes and the configuration of `core`, made with further compiler flags."""
     made = build(model, rate_hz, axes, target, nodes=core)
     make = TARGETS[target].make
-    flags = f"{AS_CORE[core] if target == 'host' else ''} {flags}".strip()
     settings = [
         f"MODEL_DIR={made.parent}",
         f"OUT={folder / target}",
         f"CORE={target}",
+        f"AS={core}",
         f"{make.upper()}_CFLAGS={flags}",
     ]
     subprocess.run(["make", "-s", "-f", f"port/{make}/{make}.mk", make, *settings], cwd=ROOT, check=True)

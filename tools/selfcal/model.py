@@ -23,7 +23,7 @@ LAWS: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("N", "sigma_m", "alpha"),
 }
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
-NODES = (6, 16)
+NODES = (6, 24)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.

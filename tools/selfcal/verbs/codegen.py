@@ -38,6 +38,7 @@ def codegen(
 
 def _header(model: Model, tables: Tables) -> str:
     largest = max((grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid), default=0)
+    most = max(h.nodes for h in tables.hypotheses)
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
     return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
 #ifndef SELFCAL_MODEL_H
@@ -54,6 +55,9 @@ def _header(model: Model, tables: Tables) -> str:
 
 #if SELFCAL_GRID_MAX < {largest} || SELFCAL_AXES_MAX < {axes} || SELFCAL_HYPOTHESES_MAX < {hypotheses}
 #error "SELFCAL_GRID_MAX, SELFCAL_AXES_MAX or SELFCAL_HYPOTHESES_MAX is too small for this model"
+#endif
+#if SELFCAL_HYPOTHESIS_NODES_MAX < {most}
+#error "SELFCAL_HYPOTHESIS_NODES_MAX is too small for this model"
 #endif
 
 extern const selfcal_model_t selfcal_model;
