@@ -1,8 +1,10 @@
 /* libFuzzer on the public interface: the input is a model and a list of calls with their arguments.
  *
- * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, selfcal_check() content, counters not running
- * backwards, reports that are probability laws. A twin, once restored from a snapshot, gets the same calls and must stay equal
- * bit for bit. Small grids and batches, so that an execution is fast; see the Makefile. */
+ * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, counters not running backwards, reports that are
+ * probability laws. After every LOOK_EVERY-th, and wherever the state is about to be replaced: selfcal_check() content (what is
+ * broken stays broken). A twin, once restored from a snapshot, gets the same calls and must stay equal bit for bit.
+ * An execution is fast: small grids and batches (see the Makefile), and by a hash of the input only some executions make whole
+ * reports, save snapshots, or push long records. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -10,7 +12,7 @@
 
 #include "selfcal.h"
 
-enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, PUSHES_MAX = 200 };
+enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 4 };
 #define MORE SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX)
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
 
@@ -240,12 +242,15 @@ static bool grown(uint32_t before_, uint32_t now) {
     return now >= before_;
 }
 
-static void check_bank(void) {
+static void check_state(void) {
+    HOLDS(tampered || selfcal_check(&bank.self) == SELFCAL_OK);
+}
+
+static void check_counters(void) {
     const selfcal_counters_t now = *selfcal_counters(&bank.self);
     if (tampered) {
         return;
     }
-    HOLDS(selfcal_check(&bank.self) == SELFCAL_OK);
     HOLDS(now.samples >= before.samples && now.missing >= before.missing && grown(before.gaps, now.gaps) &&
           grown(before.blocks_lost, now.blocks_lost) && grown(before.blocks_part, now.blocks_part) &&
           grown(before.blocks_moving, now.blocks_moving));
@@ -519,6 +524,7 @@ static void restore_mutated(input_t *in) {
         return;
     }
     snapshots--;
+    check_state();
     if (save(&bank, &store) != SELFCAL_OK) {
         HOLDS(tampered);
         return;
@@ -615,9 +621,11 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         return 0;
     }
     twinned = tampered = reporting = has_telemetry = has_gate = false;
-    pushes = PUSHES_MAX;
-    snapshots = 2;
-    steps = hash(data, size) % 16U == 0U ? STEPS_MAX : 16U;
+    const uint32_t chance = hash(data, size);
+    pushes = chance % 8U == 0U ? 200U : 64U;
+    snapshots = chance / 8U % 4U == 0U ? 2U : 0U;
+    const bool whole = chance / 32U % 32U == 0U;
+    steps = whole ? STEPS_MAX : 8U;
     memset(&before, 0, sizeof before);
     count_before = 0;
     for (unsigned call = 0; call < CALLS_MAX && in.at < in.end; call++) {
@@ -643,9 +651,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 18: set_values(&in); break;
         default: push_moderate(&in); break;
         }
-        check_bank();
+        check_counters();
+        if (call % LOOK_EVERY == LOOK_EVERY - 1U) {
+            check_state();
+        }
     }
-    HOLDS(steps > 0U || !reporting || hash(data, size) % 16U != 0U); /* no report is endless */
+    check_state();
+    HOLDS(steps > 0U || !reporting || !whole); /* no report is endless */
     if (twinned) {
         equal_banks(&bank, &twin);
     }
