@@ -15,6 +15,9 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
 #endif
 
+/* No drift's variance per interval is greater, see LN_RHO_MAX. */
+#define Q_MAX R(1e12)
+
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
 #define SLACK R(1e-5)
 
@@ -174,9 +177,11 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     /* the kernels choose which nodes run first */
     const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
-    if (!within(node->beta, R(0.0), R(1.0)) || !(node->q >= R(0.0)) || !isfinite(node->q) || !(node->p_inf >= R(0.0)) ||
-        !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
-        node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
+    /* P' = phi^2 r P/(r + P) + q: q <= P at any time, and with r = 1 P' < 1 + q */
+    if (!within(node->beta, R(0.0), R(1.0)) || !within(node->q, R(0.0), Q_MAX) ||
+        !within(node->p_inf, node->q * (R(1.0) - SLACK), (R(1.0) + node->q) * (R(1.0) + SLACK)) ||
+        !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) || node->p_inf + node->d < node->q - SLACK * node->p_inf ||
+        !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
         (node->level ? node->d != R(0.0) || node->e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {

@@ -53,6 +53,9 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
 
 /* bank.c */
+/* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
+ * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
+#define LN_RHO_MAX R(13.8)
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* `count` bank intervals without a sample. */
