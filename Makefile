@@ -77,8 +77,8 @@ TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
-# The integer kernels: the formats by a test of their own, the rest as the bank in float.
-TESTS_FIXED := $(foreach test,fixed bank snapshot check,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
+# The integer builds: the formats by a test of their own, the rest as in float.
+TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py

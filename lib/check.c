@@ -76,6 +76,20 @@ static bool batches_are_sound(const selfcal_t *self) {
     return batch_is_sound(self, gathered) && batch_is_sound(self, waits);
 }
 
+/* A block's sums, see averager.c. */
+#ifdef SELFCAL_FIXED
+static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
+    const selfcal_block_t *sums = &self->sums[axis];
+    const int64_t most = (int64_t)self->used << 30;
+    return sums->sum_sq >= 0 && sums->sum_sq <= most && sums->sum <= most && sums->sum >= -most && sums->first <= 1L << 26 &&
+           sums->first >= -(1L << 26) && sums->shift <= 15U && sums->exponent >= -151 && sums->exponent <= 100;
+}
+#else
+static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
+    return isfinite(self->first[axis]) && isfinite(self->sum[axis]) && self->sum_sq[axis] >= R(0.0) && isfinite(self->sum_sq[axis]);
+}
+#endif
+
 static bool averager_is_sound(const selfcal_t *self) {
     const selfcal_counters_t *count = &self->counters;
     const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
@@ -92,8 +106,7 @@ static bool averager_is_sound(const selfcal_t *self) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&
-            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !isfinite(self->first[axis]) ||
-             !isfinite(self->sum[axis]) || !(self->sum_sq[axis] >= R(0.0)) || !isfinite(self->sum_sq[axis]) ||
+            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !sums_are_sound(self, axis) ||
              !(self->within[axis] >= 0.0) || !isfinite(self->within[axis]))) {
             return false;
         }

@@ -30,32 +30,9 @@
 
 /* --------------------------------------------------------------------------------------------------- numbers from float */
 
-/* value * 2^shift, rounded to nearest; held at +-INT32_MAX. Bit by bit: a tenth of what software floating point takes. */
-static int32_t to_fixed(float value, int shift) {
-    uint32_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    const int exponent = (int)((bits >> 23) & 0xFFU);
-    if (exponent == 0) {
-        return 0; /* zero, or denormal */
-    }
-    const uint32_t mantissa = (bits & 0x7FFFFFU) | 0x800000U;
-    const int left = exponent - 150 + shift; /* value = mantissa 2^(exponent - 150) */
-    uint32_t magnitude = INT32_MAX;
-    if (left < -24) {
-        magnitude = 0;
-    } else if (left < 0) {
-        magnitude = (mantissa + (1U << (-left - 1))) >> -left;
-    } else if (left <= 7) {
-        magnitude = mantissa << left;
-    }
-    return (bits >> 31) != 0U ? -(int32_t)magnitude : (int32_t)magnitude;
-}
-
 /* The shift with which a value has `bits` bits before the binary point: 2^(bits - 1) <= |value| 2^shift < 2^bits. At most 62. */
 static int mantissa_shift(float value, int bits) {
-    uint32_t pattern;
-    memcpy(&pattern, &value, sizeof pattern);
-    const int shift = 126 + bits - (int)((pattern >> 23) & 0xFFU);
+    const int shift = 126 + bits - (int)((float_bits(value) >> 23) & 0xFFU);
     return shift < 62 ? shift : 62;
 }
 

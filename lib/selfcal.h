@@ -325,6 +325,15 @@ typedef struct {
 } selfcal_scale_t;
 
 #define SELFCAL_FIXED_LIMIT (3 * (1L << 25))
+
+/* A block's sums, about its first sample; formats in averager.c. Private. */
+typedef struct {
+    int64_t sum;      /* steps */
+    int64_t sum_sq;   /* (2^shift steps)^2 */
+    int32_t first;    /* the first sample, steps */
+    int16_t exponent; /* a step is 2^exponent unit */
+    uint8_t shift;
+} selfcal_block_t;
 #endif
 
 /* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 72 in the fixed-point one, and 20
@@ -403,8 +412,12 @@ typedef struct {
     selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
     uint32_t block;                          /* samples a bank interval now has */
     selfcal_real_t variance_ratio;           /* r of a whole block */
+#ifdef SELFCAL_FIXED
+    selfcal_block_t sums[SELFCAL_AXES_MAX];
+#else
     float first[SELFCAL_AXES_MAX];           /* this block's first sample: its sums are taken about it */
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX];
+#endif
     uint32_t position, used; /* samples of this block: passed, and usable */
     bool dropped;            /* the rest of it counts for nothing */
     selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
