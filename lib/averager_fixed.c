@@ -79,8 +79,9 @@ void selfcal_block_add(selfcal_block_t *sums, float value) {
         widen(sums, from_first);
     }
     const int32_t part = rounded(from_first, sums->shift);
+    const int32_t square = part * part;
     sums->sum += from_first;
-    sums->sum_sq += part * part;
+    sums->sum_sq += square;
 }
 
 selfcal_real_t selfcal_block_level(const selfcal_block_t *sums, uint32_t used, float origin, selfcal_wide_t *scatter) {

@@ -122,7 +122,7 @@ static bool averager_is_sound(const selfcal_t *self) {
 static bool scales_are_sound(const selfcal_t *self) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_scale_t *scale = &self->scale[axis];
-        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_c < 0) {
+        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_sum < 0) {
             return false;
         }
         for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {

@@ -25,6 +25,8 @@
 /* Readings below this many steps let the step shrink by 2^FINER_BITS. */
 #define FEW_STEPS (1L << 17)
 #define FINER_BITS 4
+/* From this times 2^32 in a sum on the step doubles. */
+#define FULL (1L << 29)
 /* The step grows by 2 to this many at a time: shifts stay within their types. */
 #define MOST_COARSER 30
 
@@ -49,10 +51,22 @@ static int b_bits(const selfcal_node_t *node) {
 
 /* -------------------------------------------------------------------------------------------------------------- scales */
 
+static int32_t larger(int32_t a, int32_t b) {
+    return a > b ? a : b;
+}
+
+/* |sum| in 2^32, rounded down. */
+static inline int32_t high(int64_t sum) {
+    const int32_t bits = (int32_t)(sum >> 32);
+    return bits < 0 ? ~bits : bits;
+}
+
 /* Makes the step of an axis 2^bits times as large (bits < 0: smaller). */
 static void rescale(selfcal_t *self, uint8_t axis, int bits) {
     const size_t axes = self->model->axes;
     const size_t cells = self->model->nodes * axes;
+    selfcal_scale_t *scale = &self->scale[axis];
+    scale->most_y = scale->most_sum = 0;
     for (size_t k = axis; k < cells; k += axes) {
         if (bits > 0) {
             self->x[k] = (self->x[k] + (1 << (bits - 1))) >> bits;
@@ -63,16 +77,14 @@ static void rescale(selfcal_t *self, uint8_t axis, int bits) {
             self->b[k] *= 1 << -bits;
             self->c[k] *= 1 << (-2 * bits);
         }
+        scale->most_sum = larger(scale->most_sum, larger(high(self->b[k]), high(self->c[k])));
     }
-    selfcal_scale_t *scale = &self->scale[axis];
     scale->exponent = (int16_t)(scale->exponent + bits);
     if (bits > 0) {
         scale->coarser++;
     } else {
         scale->finer++;
     }
-    scale->most_y = 0;
-    scale->most_c = bits < 0 ? scale->most_c * (1 << (-2 * bits)) : bits < 16 ? scale->most_c >> (2 * bits) : 0;
 }
 
 /* Whether the axis's drifts and sums leave room for a smaller step. */
@@ -106,7 +118,7 @@ void selfcal_kernel_load(selfcal_t *self) {
         for (uint32_t i = 0; i < batch->count; i++) {
             peak = r_fmax(peak, r_fabs(batch->y[axis][i]));
         }
-        int bits = scale->most_c >= 1L << 29 ? 1 : 0;
+        int bits = scale->most_sum >= FULL ? 1 : 0;
         while (to_fixed(peak, -scale->exponent - bits) > LIMIT) {
             if (++bits == MOST_COARSER) {
                 rescale(self, axis, bits);
@@ -126,11 +138,17 @@ void selfcal_kernel_load(selfcal_t *self) {
     }
 }
 
-static void add_c(selfcal_t *self, size_t k, size_t axis, int64_t c) {
+/* What a span adds to the sums of a cell. */
+static inline void add_sums(selfcal_t *self, size_t k, size_t axis, int64_t b, int64_t c) {
+    self->b[k] += b;
     self->c[k] += c;
-    const int32_t high = (int32_t)(self->c[k] >> 32);
-    if (high > self->scale[axis].most_c) {
-        self->scale[axis].most_c = high;
+    selfcal_scale_t *scale = &self->scale[axis];
+    const int32_t most_b = high(self->b[k]), most_c = (int32_t)(self->c[k] >> 32);
+    if (most_b > scale->most_sum) {
+        scale->most_sum = most_b;
+    }
+    if (most_c > scale->most_sum) {
+        scale->most_sum = most_c;
     }
 }
 
@@ -189,8 +207,7 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
             x += (int32_t)(((int64_t)g[i] * nu - (int64_t)beta * y + half) >> g_shift);
         }
         self->x[k] = x;
-        self->b[k] += scaled(b, u_shift);
-        add_c(self, k, axis, scaled(c, c_shift));
+        add_sums(self, k, axis, scaled(b, u_shift), scaled(c, c_shift));
     }
 }
 
@@ -362,10 +379,8 @@ static void level_node(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
         const level_sums_t sums = run_level(node, self->step[axis], count, &self->x[k]);
-        if (node->u_mantissa != 0) {
-            self->b[k] += scaled(sums.b * node->u_mantissa, node->u_shift);
-        }
-        add_c(self, k, axis, weigh(sums.c, (uint32_t)node->w_mantissa, node->w_shift));
+        const int64_t b = node->u_mantissa != 0 ? scaled(sums.b * node->u_mantissa, node->u_shift) : 0;
+        add_sums(self, k, axis, b, weigh(sums.c, (uint32_t)node->w_mantissa, node->w_shift));
     }
 }
 

@@ -321,7 +321,7 @@ typedef struct {
     int16_t exponent;        /* step of y and drift now: 2^exponent unit */
     uint16_t coarser, finer; /* times the exponent has grown and shrunk */
     int32_t most_y;          /* greatest |y| at this exponent; beyond SELFCAL_FIXED_LIMIT the step grows */
-    int32_t most_c;          /* greatest sum C at this exponent, over 2^32; from 2^29 the step grows */
+    int32_t most_sum;        /* greatest of the sums C and |B| at this exponent, over 2^32; from 2^29 on the step grows */
 } selfcal_scale_t;
 
 #define SELFCAL_FIXED_LIMIT (3 * (1L << 25))

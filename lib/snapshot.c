@@ -83,7 +83,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_scale_t, coarser, U16)  \
     F(selfcal_scale_t, finer, U16)    \
     F(selfcal_scale_t, most_y, U32)   \
-    F(selfcal_scale_t, most_c, U32)
+    F(selfcal_scale_t, most_sum, U32)
 #else
 #define FIXED_BANK_FIELDS(F, PART)
 #define FIXED_NODE_FIELDS(F)
