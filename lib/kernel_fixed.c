@@ -1,17 +1,28 @@
 /* The kernel in integers, for parts without an FPU: every axis of one node through a span.
  *
- * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis. The first batch sets it so that the
- *   white noise seen there is 2^20 to 2^21 steps (a step is 5e-7 to 1e-6 sigma). Where |y| would pass LIMIT = 3 * 2^25 steps (48 to
- *   96 sigma of drift and offset) the step doubles, as often as it takes; where the readings keep below 2^17 steps it shrinks
- *   again by 16. x, B and C are rescaled with it. So nothing saturates; selfcal_scale() tells how often it happened.
- * HEAD-ROOM  x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y, up to the rounding: one step a sample against
- *   the pull of g, less than 2^24 steps for g >= 2^-23. Hence |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28 steps.
+ * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis, chosen by the data since no model
+ *   knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps (one is 5e-7 to 1e-6 sigma).
+ *   Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the step doubles, as often as it takes; where
+ *   the readings keep below 2^17 steps it shrinks again by 16. x, B and C are rescaled with it. So nothing saturates;
+ *   selfcal_scale() tells how often it happened. What the range and the priors make of it is in the generated
+ *   SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise, sigma <= sqrt(2) range.
+ * HEAD-ROOM  Each function states its own; all rest on
+ *     |y| <= LIMIT < 2^26.6                by selfcal_kernel_load()
+ *     |x| < LIMIT + 2^24                   x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and 0, up to the
+ *                                          rounding: one step a sample against the pull of g, less than 2^24 steps for g >= 2^-23
+ *     |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28
+ *     u/s < 2^(11 - b_bits), 1/s <= 2^10   s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
+ *     a span has 16 samples at most.
+ *   None of it depends on the length of the record: sums that fill up make room for themselves (SUMS).
+ *   tests/c/fixed/test_fixed.c drives each there under UBSan.
  * GUARD BITS  Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move each
- *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6. Rounding a square's argument to 4 steps, the
- *   most that is done, adds 4^2/12 steps^2 to it on the average: 2^-39 of sigma^2, and the same for all nodes.
- * SUMS  int64. B in 2^-(6 + b_bits) steps, b_bits by the node's greatest u/s: |B| < n 2^34 if nu sat at its bound, in real records
- *   n 2^28. C in 2^16 steps^2: n 2^40 at the bound, n 2^26 in real records; from 2^61 on the step doubles, which makes C four times
- *   smaller. So B holds 5 * 10^8 samples whatever is read, C any number.
+ *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has grown, that much more.
+ *   Rounding a square's argument to 4 steps, the most that is done, adds 4^2/12 steps^2 to it on the average: 2^-39 of sigma^2,
+ *   and the same for all nodes.
+ * SUMS  int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in 2^16 steps^2:
+ *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once |B| or C has
+ *   reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is never: C takes 2^35 samples,
+ *   and the count is 32 bits. How long a record keeps its accuracy is another matter: GUARD BITS, selfcal.h at SELFCAL_FIXED.
  *
  * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for all.
  * >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
@@ -43,7 +54,7 @@ static inline int64_t scaled(int64_t value, uint32_t shift) {
     return ((value >> (shift - 1U)) + 1) >> 1;
 }
 
-/* u/s <= 2^-b_bits: u <= 1, and s >= 1 + P, where P never falls below its limit; on a random walk's way up, below q. */
+/* u/s < 2^(1 - b_bits) with whole blocks: u <= 1, and s >= 1 + P, where P >= q (bank.c) and p_inf <= 1 + q. */
 static int b_bits(const selfcal_node_t *node) {
     const selfcal_real_t p = node->beta > R(0.0) ? node->p_inf : node->q;
     return -mantissa_shift(R(1.0) + p, 1);
@@ -61,7 +72,8 @@ static inline int32_t high(int64_t sum) {
     return bits < 0 ? ~bits : bits;
 }
 
-/* Makes the step of an axis 2^bits times as large (bits < 0: smaller). */
+/* Makes the step of an axis 2^bits times as large, 1 to 30, or smaller by FINER_BITS: may_be_finer() has seen to the room. x is
+ * rounded to nearest, B and C lose less than one of their units. */
 static void rescale(selfcal_t *self, uint8_t axis, int bits) {
     const size_t axes = self->model->axes;
     const size_t cells = self->model->nodes * axes;
@@ -109,6 +121,7 @@ const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis) {
     return &self->scale[axis];
 }
 
+/* Rounds y to steps, after making the step so coarse that |y| <= LIMIT and that a full sum has room again. */
 void selfcal_kernel_load(selfcal_t *self) {
     const selfcal_batch_t *batch = waiting(self);
     self->step_from = self->step_to = 0U;
@@ -167,11 +180,13 @@ static float greatest(const float v[SELFCAL_BATCH], span_t span) {
     return most;
 }
 
-/* 32-bit products. Per sample g, u/s, 1/s and beta with mantissas below 2^30. One shift a span for g and beta and one for
- * u/s; 1/s has its own, since it grows a millionfold in the first samples of some nodes:
+/* 32-bit products, in 64 bits; x is rounded to nearest, and so are the span's sums. Per sample g, u/s, 1/s and beta with mantissas
+ * below 2^30. One shift a span for g and beta and one for u/s; 1/s has its own, since it grows a millionfold in the first samples of
+ * some nodes:
  *   g nu - beta y   < 2^59
  *   sum u/s nu      < 16 * 2^30 * 2^28 = 2^62
- *   sum (nu/s) nu   < 16 * 2^29 * 2^28 = 2^61, nu/s rounded to its 29th bit */
+ *   sum (nu/s) nu   < 16 * 2^29 * 2^28 = 2^61, nu/s rounded to its 29th bit
+ * u_shift >= 28 + b_bits - 11 + 29 - 29 - 6 - b_bits = 11; c_shift >= 28 - 10 + 29 - 29 - 29 + 16 = 5. */
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     const span_t span = gains->span;
     const selfcal_node_t *node = &self->node[j];
@@ -258,7 +273,7 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
 /* g nu is rounded down here; that leaves half a step too much in nu, which every second d makes up for. */
 #define FLOORED true
 
-/* Sums over up to 16 samples of
+/* 16-bit products, in 32 bits; nu^2 is summed over nu rounded down to 4 steps. Sums over up to 16 samples of
  *   nu/4 2^30, hi^2 < 16 * (2^27.6 / 2^14)^2 < 2^32, |hi lo| < 2^30, lo^2 2^28;
  *   nu/4 = 2^12 hi + lo, (nu/4)^2 = 2^24 hi^2 + 2^13 hi lo + lo^2: nothing is rounded. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
@@ -293,7 +308,8 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
     return (int32_t)(((int64_t)mantissa * v + ((int64_t)1 << (shift + 13U))) >> (shift + 14U));
 }
 
-/* Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62), nu^2 < 2^60. */
+/* 32-bit products, in 64 bits; g nu is rounded to nearest. Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62),
+ * nu^2 < 2^60. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
     const int32_t g = node->g_mantissa;
     const uint32_t shift = node->g_shift;
