@@ -142,7 +142,7 @@ def test_double_against_the_textbook_at_a_million() -> None:
 @pytest.mark.parametrize("most", [1e-3, 0.5, 1e3, 1e9])
 @pytest.mark.parametrize("period", [1, 2, 8])
 def test_no_reading_makes_a_step_coarser_than_codegen_says(most: float, period: int) -> None:
-    """First batches from end to end of the range, N's prior up to `most`: the step is within 2 of the bound, or finer."""
+    """First batches from end to end of the range, N up to `most`: the step is within 2 of the bound, or finer."""
     tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
     axis = tables.axes[0]
     limits = {"ln_min": (math.log(1e-6), *axis.ln_min[1:]), "ln_max": (math.log(most), *axis.ln_max[1:])}

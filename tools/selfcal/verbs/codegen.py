@@ -53,9 +53,9 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_AXES {axes}U
 #define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
 #define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
-/* With SELFCAL_FIXED no record overflows (lib/kernel_fixed.c). The coarsest step of each axis that readings within its
- * range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where sigma_v
- * is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
+/* With SELFCAL_FIXED no record overflows (lib/kernel_fixed.c). The coarsest step of each axis that readings within
+ * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
+ * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
 #define SELFCAL_MODEL_EXPONENTS {{{", ".join(str(coarsest_exponent(axis, tables.dt_s)) for axis in tables.axes)}}}
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
@@ -72,7 +72,7 @@ extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 
 
 def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
-    """Bound of `selfcal_scale_t.exponent`: lib/kernel_fixed.c sets it by the first batch's noise, then by the greatest |y|.
+    """Bound of `selfcal_scale_t.exponent`: lib/kernel_fixed.c sets it by the first batch's noise, then by |y|.
 
     Bank samples less the first reach 2 range; so do differences, which pass for noise of 2 range / sqrt(2) within the
     prior's limits.
