@@ -15,7 +15,8 @@
  *      gathered, and while the next ones are, some nodes run over them at every push.
  *   4. When a report is wanted: selfcal_report_begin(), then selfcal_report_step() until it no longer says SELFCAL_BUSY.
  *      Samples may be pushed in between, as long as selfcal_room() says that there is room.
- *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only.
+ *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only, and relies on exp, expm1, log, log1p and sqrt of
+ *   either width being within 2 units in the last place (newlib's and glibc's are within 1.3).
  *
  * THREADS AND INTERRUPTS
  *   No global state. One selfcal_t belongs to one context at a time; the caller locks when two share it.
