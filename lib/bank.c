@@ -63,7 +63,8 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
 }
 
 static bool valid_model(const selfcal_model_t *model) {
-    if ((model->forgetting != NULL && !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s)) ||
+    if ((model->forgetting != NULL &&
+         (model->forgetting->code == NULL || !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
         !(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {

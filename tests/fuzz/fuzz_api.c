@@ -46,6 +46,7 @@ static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
 static selfcal_model_t model;
 static selfcal_regressors_t regressors;
+static selfcal_forgetting_t forgetting;
 static float reference[SELFCAL_REGRESSORS_MAX], coefficient_sd[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
 static float values[SELFCAL_REGRESSORS_MAX]; /* of the regressors, as they come with the next sample */
 
@@ -173,11 +174,16 @@ static void make_model(input_t *in) {
         }
         model.regressors = &regressors;
     }
+    if ((limits >> 4 & 3U) == 3U) {
+        forgetting.code = &selfcal_forgetting_code;
+        forgetting.half_life_s = ldexpf(model.dt_s, 3 + 3 * (limits >> 6)); /* 8 to 4096 bank intervals */
+        model.forgetting = &forgetting;
+    }
     if (shape >> 5 != 7U) {
         return;
     }
     /* something is wrong with this one */
-    switch (byte(in) % 20U) {
+    switch (byte(in) % 22U) {
     case 0: model.dt_s = any_float(in); break;
     case 1: model.block = (uint32_t)bits(in, 4); break;
     case 2: model.axes = byte(in); break;
@@ -197,6 +203,8 @@ static void make_model(input_t *in) {
     case 16: regressors.reference = NULL; break;
     case 17: reference[0] = any_float(in); break;
     case 18: coefficient_sd[0] = any_float(in); break;
+    case 19: forgetting.half_life_s = any_float(in); break;
+    case 20: forgetting.code = NULL; break;
     default: hypothesis_table[0].ln_probability = any_float(in); break;
     }
 }
@@ -422,7 +430,8 @@ static void report_steps(unsigned wanted) {
     selfcal_status_t status = SELFCAL_BUSY;
     for (; reporting && wanted > 0U && steps > 0U && status == SELFCAL_BUSY; wanted--, steps--) {
         status = selfcal_report_step(&work, &report);
-        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN || status == SELFCAL_AXIS_RETIRED);
+        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN || status == SELFCAL_AXIS_RETIRED ||
+              (status == SELFCAL_TOO_SHORT && model.forgetting != NULL));
         HOLDS(!twinned || selfcal_report_step(&twin_work, &twin_report) == status);
     }
     if (status != SELFCAL_BUSY) {
