@@ -6,7 +6,7 @@
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
-#   make fuzz [RUNS=n | SECONDS=n]   random calls of the library under sanitizers, 10^7 executions
+#   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]   random calls of the library under sanitizers, 10^7 executions
 #   make firmware [ACCEPT=1]    build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above a target's budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
@@ -77,8 +77,8 @@ TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
-# The integer kernels: the formats by a test of their own, the rest as the bank in float.
-TESTS_FIXED := $(foreach test,fixed bank snapshot check,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
+# The integer builds: the formats by a test of their own, the rest as in float.
+TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -89,7 +89,7 @@ soak: setup
 # Each line that the tests print is a row: what, its errors. SELFCAL_DRAWS and SELFCAL_LENGTHS widen the report's.
 tolerances: setup
 	$(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_bank.py tests/py/test_report.py \
-	    tests/py/test_regressors.py tests/py/test_long.py tests/py/test_identify.py -k "not two_rates"
+	    tests/py/test_regressors.py tests/py/test_long.py tests/py/test_identify.py tests/py/test_math.py -k "not two_rates"
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
@@ -124,22 +124,25 @@ $(eval $(call C_TESTS,fixed32))
 
 # --------------------------------------------------------------------------------------------------------------- fuzz
 
-# Small grids and batches: an execution is some 0.1 ms. trace-cmp finds magic numbers, which the harness has none of.
+# Small grids and batches: an execution is some 0.15 ms. trace-cmp finds magic numbers, which the harness has none of.
 .PHONY: fuzz
-FUZZ := $(BUILD)/fuzz
+KERNEL ?= float
+FUZZ := $(BUILD)/fuzz/$(KERNEL)
 FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_GRID_MAX=6 -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 \
-              -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
+              -DSELFCAL_SIGMA_CELLS=8 -DSELFCAL_HISTOGRAM=32 -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
 RUNS ?= 10000000
 
-# RUNS executions, or SECONDS seconds, from what was found before on. What fails is left in build/fuzz: run build/fuzz/fuzz_api on it.
+# RUNS executions, or SECONDS seconds, from what was found before on. What fails is left in build/fuzz/KERNEL: run fuzz_api there on it.
 fuzz: $(FUZZ)/fuzz_api
 	@mkdir -p $(FUZZ)/corpus
 	ASAN_OPTIONS=quarantine_size_mb=1:detect_leaks=0 $(FUZZ)/fuzz_api -max_len=400 -timeout=20 -artifact_prefix=$(FUZZ)/ -print_final_stats=1 \
-	    -verbosity=0 $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
+	    -entropic=0 -verbosity=0 $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
 
-$(FUZZ)/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
+# -march=native: fused multiply-adds are no calls.
+$(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
 	@mkdir -p $(@D)
-	clang -std=c99 -O2 -g -ffp-contract=off -Ilib $(FUZZ_SIZES) '-DSELFCAL_ASSERT(condition)=((condition) ? (void)0 : __builtin_trap())' \
+	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib $(FUZZ_SIZES) $(patsubst fixed%,-DSELFCAL_FIXED=%,$(filter fixed%,$*)) \
+	    '-DSELFCAL_ASSERT(condition)=((condition) ? (void)0 : __builtin_trap())' \
 	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all \
 	    $(filter %.c,$^) -lm -o $@
 

@@ -9,12 +9,64 @@
  * So C = sum nu^2/s <= 2^(32 + 84 + 10) = 2^126 < FLT_MAX = 2^128, and B = sum u nu/s is less (|u| <= 1). */
 #include "internal.h"
 
+/* ------------------------------------------------------------------------------------------------------ a block's sums
+ * start_sums(), add_sample(), and block_level(): mean of the block less the origin; `scatter`: sum of squares about that mean. */
+
+#ifdef SELFCAL_FIXED /* averager_fixed.c */
+
+static void start_sums(selfcal_t *self) {
+    memset(self->sums, 0, sizeof self->sums);
+}
+
+static void add_sample(selfcal_t *self, const float sample[], uint32_t live) {
+    selfcal_block_t *sums = self->sums;
+    for (; live != 0U; live >>= 1, sums++, sample++) {
+        if ((live & 1U) != 0U) {
+            (self->used == 0U ? selfcal_block_open : selfcal_block_add)(sums, *sample);
+        }
+    }
+}
+
+static selfcal_real_t block_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter) {
+    return selfcal_block_level(&self->sums[axis], self->used, self->origin[axis], scatter);
+}
+
+#else
+
+static void start_sums(selfcal_t *self) {
+    memset(self->sum, 0, sizeof self->sum);
+    memset(self->sum_sq, 0, sizeof self->sum_sq);
+}
+
+static void add_sample(selfcal_t *self, const float sample[], uint32_t live) {
+    const uint8_t axes = self->model->axes;
+    if (self->used == 0U) {
+        memcpy(self->first, sample, axes * sizeof sample[0]);
+    }
+    for (uint8_t axis = 0; axis < axes; axis++) {
+        if ((live >> axis & 1U) != 0U) {
+            const selfcal_real_t from_first = (selfcal_real_t)sample[axis] - (selfcal_real_t)self->first[axis];
+            self->sum[axis] += from_first;
+            self->sum_sq[axis] = r_fma(from_first, from_first, self->sum_sq[axis]);
+        }
+    }
+}
+
+static selfcal_real_t block_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter) {
+    const selfcal_real_t mean = self->sum[axis] / (selfcal_real_t)self->used;
+    *scatter = (selfcal_wide_t)r_fmax(r_fma(-self->sum[axis], mean, self->sum_sq[axis]), R(0.0));
+    return (selfcal_real_t)(self->first[axis] - self->origin[axis]) + mean;
+}
+
+#endif
+
+/* -------------------------------------------------------------------------------------------------------------- blocks */
+
 static void start_block(selfcal_t *self) {
     self->position = 0;
     self->used = 0;
     self->dropped = false;
-    memset(self->sum, 0, sizeof self->sum);
-    memset(self->sum_sq, 0, sizeof self->sum_sq);
+    start_sums(self);
 }
 
 bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
@@ -43,13 +95,13 @@ static void close_block(selfcal_t *self) {
             y[axis] = R(0.0); /* harmless to its filters, unseen by the others */
             continue;
         }
-        const selfcal_real_t mean = self->sum[axis] / (selfcal_real_t)self->used;
-        const selfcal_real_t level = (selfcal_real_t)(self->first[axis] - self->origin[axis]) + mean;
+        selfcal_wide_t scatter;
+        const selfcal_real_t level = block_level(self, axis, &scatter);
         if (first) {
             self->offset[axis] = level;
         }
         y[axis] = level - self->offset[axis];
-        self->within[axis] += (selfcal_wide_t)r_fmax(r_fma(-self->sum[axis], mean, self->sum_sq[axis]), R(0.0));
+        self->within[axis] += scatter;
     }
     self->within_dof += self->used - 1U;
     if (self->used < block) {
@@ -135,23 +187,29 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
     return SELFCAL_OK;
 }
 
-/* Counts what is wrong with a sample; a bit for each axis at fault. */
+/* Bits of a float without its sign: they order as the numbers do, infinity and not-a-number at the top. */
+#define MAGNITUDE 0x7FFFFFFFU
+#define INFINITE 0x7F800000U
+
+/* Counts what is wrong with a sample; a bit for each axis at fault. By the bits of the values, since a comparison in software
+ * floating point is a call. */
 static uint32_t faults(selfcal_t *self, const float sample[]) {
     uint32_t bad = 0;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_axis_t *limits = &self->model->axis[axis];
-        const float value = sample[axis];
-        if (!isfinite(value)) {
-            self->counters.not_finite[axis]++;
+        const uint32_t value = float_bits(sample[axis]), last = float_bits(self->last[axis]), range = float_bits(limits->range);
+        const uint32_t magnitude = value & MAGNITUDE;
+        if (magnitude >= float_bits(SELFCAL_SAMPLE_MAX) || (range - 1U < INFINITE && magnitude >= range)) { /* range > 0 */
             bad |= 1U << axis;
-            continue;
-        }
-        if ((limits->range > 0.0F && fabsf(value) >= limits->range) || fabsf(value) >= SELFCAL_SAMPLE_MAX) {
+            if (magnitude >= INFINITE) {
+                self->counters.not_finite[axis]++;
+                continue;
+            }
             self->counters.saturated[axis]++;
-            bad |= 1U << axis;
         }
-        self->equal[axis] = value == self->last[axis] ? self->equal[axis] + 1U : 1U;
-        self->last[axis] = value;
+        const bool equal = value == last || ((value | last) & MAGNITUDE) == 0U; /* -0 is 0 */
+        self->equal[axis] = equal ? self->equal[axis] + 1U : 1U;
+        self->last[axis] = sample[axis];
         if (limits->stuck_limit > 0U && self->equal[axis] >= limits->stuck_limit) {
             self->counters.stuck[axis]++;
             bad |= 1U << axis;
@@ -219,17 +277,7 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
             self->origin[axis] = selfcal_retired(self, axis) ? 0.0F : sample[axis];
         }
     }
-    if (self->used == 0U) {
-        memcpy(self->first, sample, axes * sizeof sample[0]);
-    }
-    for (uint8_t axis = 0; axis < axes; axis++) {
-        if (selfcal_retired(self, axis)) {
-            continue;
-        }
-        const selfcal_real_t from_first = (selfcal_real_t)sample[axis] - (selfcal_real_t)self->first[axis];
-        self->sum[axis] += from_first;
-        self->sum_sq[axis] = r_fma(from_first, from_first, self->sum_sq[axis]);
-    }
+    add_sample(self, sample, live);
     if (self->columns != NULL) {
         self->model->regressors->code->add(self, regressors);
     }

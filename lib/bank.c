@@ -35,10 +35,6 @@
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
-/* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
- * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
-#define LN_RHO_MAX R(13.8)
-
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
 }
@@ -67,7 +63,8 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
 }
 
 static bool valid_model(const selfcal_model_t *model) {
-    if ((model->forgetting != NULL && !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s)) ||
+    if ((model->forgetting != NULL &&
+         (model->forgetting->code == NULL || !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
         !(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {

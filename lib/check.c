@@ -15,6 +15,9 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
 #endif
 
+/* No drift's variance per interval is greater, see LN_RHO_MAX. */
+#define Q_MAX R(1e12)
+
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
 #define SLACK R(1e-5)
 
@@ -73,6 +76,20 @@ static bool batches_are_sound(const selfcal_t *self) {
     return batch_is_sound(self, gathered) && batch_is_sound(self, waits);
 }
 
+/* A block's sums, see averager.c. */
+#ifdef SELFCAL_FIXED
+static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
+    const selfcal_block_t *sums = &self->sums[axis];
+    const int64_t most = (int64_t)self->used << 30;
+    return sums->sum_sq >= 0 && sums->sum_sq <= most && sums->sum <= most && sums->sum >= -most && sums->first <= 1L << 26 &&
+           sums->first >= -(1L << 26) && sums->shift <= 15U && sums->exponent >= -151 && sums->exponent <= 100;
+}
+#else
+static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
+    return isfinite(self->first[axis]) && isfinite(self->sum[axis]) && self->sum_sq[axis] >= R(0.0) && isfinite(self->sum_sq[axis]);
+}
+#endif
+
 static bool averager_is_sound(const selfcal_t *self) {
     const selfcal_counters_t *count = &self->counters;
     const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
@@ -89,8 +106,7 @@ static bool averager_is_sound(const selfcal_t *self) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&
-            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !isfinite(self->first[axis]) ||
-             !isfinite(self->sum[axis]) || !(self->sum_sq[axis] >= R(0.0)) || !isfinite(self->sum_sq[axis]) ||
+            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !sums_are_sound(self, axis) ||
              !(self->within[axis] >= 0.0) || !isfinite(self->within[axis]))) {
             return false;
         }
@@ -106,7 +122,7 @@ static bool averager_is_sound(const selfcal_t *self) {
 static bool scales_are_sound(const selfcal_t *self) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_scale_t *scale = &self->scale[axis];
-        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_c < 0) {
+        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_sum < 0) {
             return false;
         }
         for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
@@ -174,9 +190,11 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     /* the kernels choose which nodes run first */
     const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
-    if (!within(node->beta, R(0.0), R(1.0)) || !(node->q >= R(0.0)) || !isfinite(node->q) || !(node->p_inf >= R(0.0)) ||
-        !isfinite(node->p_inf) || !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) ||
-        node->d < -(R(1.0) + SLACK) * node->p_inf || !within(node->u_inf, R(0.0), R(1.0)) ||
+    /* P' = phi^2 r P/(r + P) + q: q <= P at any time, and with r = 1 P' < 1 + q */
+    if (!within(node->beta, R(0.0), R(1.0)) || !within(node->q, R(0.0), Q_MAX) ||
+        !within(node->p_inf, node->q * (R(1.0) - SLACK), (R(1.0) + node->q) * (R(1.0) + SLACK)) ||
+        !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) || node->p_inf + node->d < node->q - SLACK * node->p_inf ||
+        !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
         (node->level ? node->d != R(0.0) || node->e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {

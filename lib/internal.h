@@ -47,12 +47,44 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
     return a > b ? a : b;
 }
 
+/* By value, so that a compiler that fears odd addresses copies no bytes. */
+static inline uint32_t float_bits(float value) {
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+#ifdef SELFCAL_FIXED
+/* value * 2^shift, rounded to nearest; held at +-INT32_MAX. Bit by bit: a tenth of what software floating point takes. */
+static inline int32_t to_fixed(float value, int shift) {
+    const uint32_t bits = float_bits(value);
+    const int exponent = (int)((bits >> 23) & 0xFFU);
+    if (exponent == 0) {
+        return 0; /* zero, or denormal */
+    }
+    const uint32_t mantissa = (bits & 0x7FFFFFU) | 0x800000U;
+    const int left = exponent - 150 + shift; /* value = mantissa 2^(exponent - 150) */
+    uint32_t magnitude = INT32_MAX;
+    if (left < -24) {
+        magnitude = 0;
+    } else if (left < 0) {
+        magnitude = (mantissa + (1U << (-left - 1))) >> -left;
+    } else if (left <= 7) {
+        magnitude = mantissa << left;
+    }
+    return (bits >> 31) != 0U ? -(int32_t)magnitude : (int32_t)magnitude;
+}
+#endif
+
 #define SELFCAL_LN_2PI 1.8378770664093454836
 
 /* C99 has no _Static_assert. `name` says what holds. */
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
 
 /* bank.c */
+/* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
+ * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
+#define LN_RHO_MAX R(13.8)
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* `count` bank intervals without a sample. */
@@ -101,6 +133,13 @@ struct selfcal_forgetting_code {
     /* All sums of node `j` fade to self->keep. */
     void (*fade)(selfcal_t *self, size_t j);
 };
+#ifdef SELFCAL_FIXED
+/* averager_fixed.c: one axis of a block, cleared before. Its first sample; another, finite as all are. */
+void selfcal_block_open(selfcal_block_t *sums, float value);
+void selfcal_block_add(selfcal_block_t *sums, float value);
+/* Mean of its `used` samples less `origin`; `scatter`: sum of squares about the mean. */
+selfcal_real_t selfcal_block_level(const selfcal_block_t *sums, uint32_t used, float origin, selfcal_wide_t *scatter);
+#endif
 
 /* regressors.c, for a model with regressors. */
 typedef struct gains gains_t; /* kernel.h */

@@ -1,17 +1,28 @@
 /* The kernel in integers, for parts without an FPU: every axis of one node through a span.
  *
- * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis. The first batch sets it so that the
- *   white noise seen there is 2^20 to 2^21 steps (a step is 5e-7 to 1e-6 sigma). Where |y| would pass LIMIT = 3 * 2^25 steps (48 to
- *   96 sigma of drift and offset) the step doubles, as often as it takes; where the readings keep below 2^17 steps it shrinks
- *   again by 16. x, B and C are rescaled with it. So nothing saturates; selfcal_scale() tells how often it happened.
- * HEAD-ROOM  x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y, up to the rounding: one step a sample against
- *   the pull of g, less than 2^24 steps for g >= 2^-23. Hence |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28 steps.
+ * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis, chosen by the data since no model
+ *   knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps (one is 5e-7 to 1e-6 sigma).
+ *   Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the step doubles, as often as it takes; where
+ *   the readings keep below 2^17 steps it shrinks again by 16. x, B and C are rescaled with it. So nothing saturates;
+ *   selfcal_scale() tells how often it happened. What the range and the priors make of it is in the generated
+ *   SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise, sigma <= sqrt(2) range.
+ * HEAD-ROOM  Each function states its own; all rest on
+ *     |y| <= LIMIT < 2^26.6                by selfcal_kernel_load()
+ *     |x| < LIMIT + 2^24                   x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and 0, up to the
+ *                                          rounding: one step a sample against the pull of g, less than 2^24 steps for g >= 2^-23
+ *     |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28
+ *     u/s < 2^(11 - b_bits), 1/s <= 2^10   s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
+ *     a span has 16 samples at most.
+ *   None of it depends on the length of the record: sums that fill up make room for themselves (SUMS).
+ *   tests/c/fixed/test_fixed.c drives each there under UBSan.
  * GUARD BITS  Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move each
- *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6. Rounding a square's argument to 4 steps, the
- *   most that is done, adds 4^2/12 steps^2 to it on the average: 2^-39 of sigma^2, and the same for all nodes.
- * SUMS  int64. B in 2^-(6 + b_bits) steps, b_bits by the node's greatest u/s: |B| < n 2^34 if nu sat at its bound, in real records
- *   n 2^28. C in 2^16 steps^2: n 2^40 at the bound, n 2^26 in real records; from 2^61 on the step doubles, which makes C four times
- *   smaller. So B holds 5 * 10^8 samples whatever is read, C any number.
+ *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has grown, that much more.
+ *   Rounding a square's argument to 4 steps, the most that is done, adds 4^2/12 steps^2 to it on the average: 2^-39 of sigma^2,
+ *   and the same for all nodes.
+ * SUMS  int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in 2^16 steps^2:
+ *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once |B| or C has
+ *   reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is never: C takes 2^35 samples,
+ *   and the count is 32 bits. How long a record keeps its accuracy is another matter: GUARD BITS, selfcal.h at SELFCAL_FIXED.
  *
  * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for all.
  * >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
@@ -25,37 +36,16 @@
 /* Readings below this many steps let the step shrink by 2^FINER_BITS. */
 #define FEW_STEPS (1L << 17)
 #define FINER_BITS 4
+/* From this times 2^32 in a sum on the step doubles. */
+#define FULL (1L << 29)
 /* The step grows by 2 to this many at a time: shifts stay within their types. */
 #define MOST_COARSER 30
 
 /* --------------------------------------------------------------------------------------------------- numbers from float */
 
-/* value * 2^shift, rounded to nearest; held at +-INT32_MAX. Bit by bit: a tenth of what software floating point takes. */
-static int32_t to_fixed(float value, int shift) {
-    uint32_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    const int exponent = (int)((bits >> 23) & 0xFFU);
-    if (exponent == 0) {
-        return 0; /* zero, or denormal */
-    }
-    const uint32_t mantissa = (bits & 0x7FFFFFU) | 0x800000U;
-    const int left = exponent - 150 + shift; /* value = mantissa 2^(exponent - 150) */
-    uint32_t magnitude = INT32_MAX;
-    if (left < -24) {
-        magnitude = 0;
-    } else if (left < 0) {
-        magnitude = (mantissa + (1U << (-left - 1))) >> -left;
-    } else if (left <= 7) {
-        magnitude = mantissa << left;
-    }
-    return (bits >> 31) != 0U ? -(int32_t)magnitude : (int32_t)magnitude;
-}
-
 /* The shift with which a value has `bits` bits before the binary point: 2^(bits - 1) <= |value| 2^shift < 2^bits. At most 62. */
 static int mantissa_shift(float value, int bits) {
-    uint32_t pattern;
-    memcpy(&pattern, &value, sizeof pattern);
-    const int shift = 126 + bits - (int)((pattern >> 23) & 0xFFU);
+    const int shift = 126 + bits - (int)((float_bits(value) >> 23) & 0xFFU);
     return shift < 62 ? shift : 62;
 }
 
@@ -64,7 +54,7 @@ static inline int64_t scaled(int64_t value, uint32_t shift) {
     return ((value >> (shift - 1U)) + 1) >> 1;
 }
 
-/* u/s <= 2^-b_bits: u <= 1, and s >= 1 + P, where P never falls below its limit; on a random walk's way up, below q. */
+/* u/s < 2^(1 - b_bits) with whole blocks: u <= 1, and s >= 1 + P, where P >= q (bank.c) and p_inf <= 1 + q. */
 static int b_bits(const selfcal_node_t *node) {
     const selfcal_real_t p = node->beta > R(0.0) ? node->p_inf : node->q;
     return -mantissa_shift(R(1.0) + p, 1);
@@ -72,10 +62,23 @@ static int b_bits(const selfcal_node_t *node) {
 
 /* -------------------------------------------------------------------------------------------------------------- scales */
 
-/* Makes the step of an axis 2^bits times as large (bits < 0: smaller). */
+static int32_t larger(int32_t a, int32_t b) {
+    return a > b ? a : b;
+}
+
+/* |sum| in 2^32, rounded down. */
+static inline int32_t high(int64_t sum) {
+    const int32_t bits = (int32_t)(sum >> 32);
+    return bits < 0 ? ~bits : bits;
+}
+
+/* Makes the step of an axis 2^bits times as large, 1 to 30, or smaller by FINER_BITS: may_be_finer() has seen to the room. x is
+ * rounded to nearest, B and C lose less than one of their units. */
 static void rescale(selfcal_t *self, uint8_t axis, int bits) {
     const size_t axes = self->model->axes;
     const size_t cells = self->model->nodes * axes;
+    selfcal_scale_t *scale = &self->scale[axis];
+    scale->most_y = scale->most_sum = 0;
     for (size_t k = axis; k < cells; k += axes) {
         if (bits > 0) {
             self->x[k] = (self->x[k] + (1 << (bits - 1))) >> bits;
@@ -86,16 +89,14 @@ static void rescale(selfcal_t *self, uint8_t axis, int bits) {
             self->b[k] *= 1 << -bits;
             self->c[k] *= 1 << (-2 * bits);
         }
+        scale->most_sum = larger(scale->most_sum, larger(high(self->b[k]), high(self->c[k])));
     }
-    selfcal_scale_t *scale = &self->scale[axis];
     scale->exponent = (int16_t)(scale->exponent + bits);
     if (bits > 0) {
         scale->coarser++;
     } else {
         scale->finer++;
     }
-    scale->most_y = 0;
-    scale->most_c = bits < 0 ? scale->most_c * (1 << (-2 * bits)) : bits < 16 ? scale->most_c >> (2 * bits) : 0;
 }
 
 /* Whether the axis's drifts and sums leave room for a smaller step. */
@@ -120,6 +121,7 @@ const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis) {
     return &self->scale[axis];
 }
 
+/* Rounds y to steps, after making the step so coarse that |y| <= LIMIT and that a full sum has room again. */
 void selfcal_kernel_load(selfcal_t *self) {
     const selfcal_batch_t *batch = waiting(self);
     self->step_from = self->step_to = 0U;
@@ -129,7 +131,7 @@ void selfcal_kernel_load(selfcal_t *self) {
         for (uint32_t i = 0; i < batch->count; i++) {
             peak = r_fmax(peak, r_fabs(batch->y[axis][i]));
         }
-        int bits = scale->most_c >= 1L << 29 ? 1 : 0;
+        int bits = scale->most_sum >= FULL ? 1 : 0;
         while (to_fixed(peak, -scale->exponent - bits) > LIMIT) {
             if (++bits == MOST_COARSER) {
                 rescale(self, axis, bits);
@@ -149,11 +151,17 @@ void selfcal_kernel_load(selfcal_t *self) {
     }
 }
 
-static void add_c(selfcal_t *self, size_t k, size_t axis, int64_t c) {
+/* What a span adds to the sums of a cell. */
+static inline void add_sums(selfcal_t *self, size_t k, size_t axis, int64_t b, int64_t c) {
+    self->b[k] += b;
     self->c[k] += c;
-    const int32_t high = (int32_t)(self->c[k] >> 32);
-    if (high > self->scale[axis].most_c) {
-        self->scale[axis].most_c = high;
+    selfcal_scale_t *scale = &self->scale[axis];
+    const int32_t most_b = high(self->b[k]), most_c = (int32_t)(self->c[k] >> 32);
+    if (most_b > scale->most_sum) {
+        scale->most_sum = most_b;
+    }
+    if (most_c > scale->most_sum) {
+        scale->most_sum = most_c;
     }
 }
 
@@ -172,11 +180,13 @@ static float greatest(const float v[SELFCAL_BATCH], span_t span) {
     return most;
 }
 
-/* 32-bit products. Per sample g, u/s, 1/s and beta with mantissas below 2^30. One shift a span for g and beta and one for
- * u/s; 1/s has its own, since it grows a millionfold in the first samples of some nodes:
+/* 32-bit products, in 64 bits; x is rounded to nearest, and so are the span's sums. Per sample g, u/s, 1/s and beta with mantissas
+ * below 2^30. One shift a span for g and beta and one for u/s; 1/s has its own, since it grows a millionfold in the first samples of
+ * some nodes:
  *   g nu - beta y   < 2^59
  *   sum u/s nu      < 16 * 2^30 * 2^28 = 2^62
- *   sum (nu/s) nu   < 16 * 2^29 * 2^28 = 2^61, nu/s rounded to its 29th bit */
+ *   sum (nu/s) nu   < 16 * 2^29 * 2^28 = 2^61, nu/s rounded to its 29th bit
+ * u_shift >= 28 + b_bits - 11 + 29 - 29 - 6 - b_bits = 11; c_shift >= 28 - 10 + 29 - 29 - 29 + 16 = 5. */
 void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     const span_t span = gains->span;
     const selfcal_node_t *node = &self->node[j];
@@ -212,8 +222,7 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
             x += (int32_t)(((int64_t)g[i] * nu - (int64_t)beta * y + half) >> g_shift);
         }
         self->x[k] = x;
-        self->b[k] += scaled(b, u_shift);
-        add_c(self, k, axis, scaled(c, c_shift));
+        add_sums(self, k, axis, scaled(b, u_shift), scaled(c, c_shift));
     }
 }
 
@@ -264,7 +273,7 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
 /* g nu is rounded down here; that leaves half a step too much in nu, which every second d makes up for. */
 #define FLOORED true
 
-/* Sums over up to 16 samples of
+/* 16-bit products, in 32 bits; nu^2 is summed over nu rounded down to 4 steps. Sums over up to 16 samples of
  *   nu/4 2^30, hi^2 < 16 * (2^27.6 / 2^14)^2 < 2^32, |hi lo| < 2^30, lo^2 2^28;
  *   nu/4 = 2^12 hi + lo, (nu/4)^2 = 2^24 hi^2 + 2^13 hi lo + lo^2: nothing is rounded. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
@@ -299,7 +308,8 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
     return (int32_t)(((int64_t)mantissa * v + ((int64_t)1 << (shift + 13U))) >> (shift + 14U));
 }
 
-/* Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62), nu^2 < 2^60. */
+/* 32-bit products, in 64 bits; g nu is rounded to nearest. Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62),
+ * nu^2 < 2^60. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
     const int32_t g = node->g_mantissa;
     const uint32_t shift = node->g_shift;
@@ -385,10 +395,8 @@ static void level_node(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
         const level_sums_t sums = run_level(node, self->step[axis], count, &self->x[k]);
-        if (node->u_mantissa != 0) {
-            self->b[k] += scaled(sums.b * node->u_mantissa, node->u_shift);
-        }
-        add_c(self, k, axis, weigh(sums.c, (uint32_t)node->w_mantissa, node->w_shift));
+        const int64_t b = node->u_mantissa != 0 ? scaled(sums.b * node->u_mantissa, node->u_shift) : 0;
+        add_sums(self, k, axis, b, weigh(sums.c, (uint32_t)node->w_mantissa, node->w_shift));
     }
 }
 

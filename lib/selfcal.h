@@ -15,7 +15,8 @@
  *      gathered, and while the next ones are, some nodes run over them at every push.
  *   4. When a report is wanted: selfcal_report_begin(), then selfcal_report_step() until it no longer says SELFCAL_BUSY.
  *      Samples may be pushed in between, as long as selfcal_room() says that there is room.
- *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only.
+ *   Copy the folder lib/ into the product; it needs <string.h> and <math.h> only, and relies on exp, expm1, log, log1p and sqrt of
+ *   either width being within 2 units in the last place (newlib's and glibc's are within 1.3).
  *
  * THREADS AND INTERRUPTS
  *   No global state. One selfcal_t belongs to one context at a time; the caller locks when two share it.
@@ -330,10 +331,19 @@ typedef struct {
     int16_t exponent;        /* step of y and drift now: 2^exponent unit */
     uint16_t coarser, finer; /* times the exponent has grown and shrunk */
     int32_t most_y;          /* greatest |y| at this exponent; beyond SELFCAL_FIXED_LIMIT the step grows */
-    int32_t most_c;          /* greatest sum C at this exponent, over 2^32; from 2^29 the step grows */
+    int32_t most_sum;        /* greatest of the sums C and |B| at this exponent, over 2^32; from 2^29 on the step grows */
 } selfcal_scale_t;
 
 #define SELFCAL_FIXED_LIMIT (3 * (1L << 25))
+
+/* A block's sums, about its first sample; formats in averager.c. Private. */
+typedef struct {
+    int64_t sum;      /* steps */
+    int64_t sum_sq;   /* (2^shift steps)^2 */
+    int32_t first;    /* the first sample, steps */
+    int16_t exponent; /* a step is 2^exponent unit */
+    uint8_t shift;
+} selfcal_block_t;
 #endif
 
 /* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 72 in the fixed-point one, and 20
@@ -412,8 +422,12 @@ typedef struct {
     selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
     uint32_t block;                          /* samples a bank interval now has */
     selfcal_real_t variance_ratio;           /* r of a whole block */
+#ifdef SELFCAL_FIXED
+    selfcal_block_t sums[SELFCAL_AXES_MAX];
+#else
     float first[SELFCAL_AXES_MAX];           /* this block's first sample: its sums are taken about it */
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX];
+#endif
     uint32_t position, used; /* samples of this block: passed, and usable */
     bool dropped;            /* the rest of it counts for nothing */
     selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */

@@ -69,16 +69,29 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, u_shift, U8)     \
     F(selfcal_node_t, w_shift, U8)
 
+#define BLOCK_FIELDS(F, PART) PART(selfcal_t, sums, selfcal_block_t)
+
+#define BLOCK_SUM_FIELDS(F)           \
+    F(selfcal_block_t, sum, U64)      \
+    F(selfcal_block_t, sum_sq, U64)   \
+    F(selfcal_block_t, first, U32)    \
+    F(selfcal_block_t, exponent, U16) \
+    F(selfcal_block_t, shift, U8)
+
 #define SCALE_FIELDS(F)               \
     F(selfcal_scale_t, exponent, U16) \
     F(selfcal_scale_t, coarser, U16)  \
     F(selfcal_scale_t, finer, U16)    \
     F(selfcal_scale_t, most_y, U32)   \
-    F(selfcal_scale_t, most_c, U32)
+    F(selfcal_scale_t, most_sum, U32)
 #else
 #define FIXED_BANK_FIELDS(F, PART)
 #define FIXED_NODE_FIELDS(F)
 #define SCALE_FIELDS(F)
+#define BLOCK_FIELDS(F, PART)   \
+    F(selfcal_t, first, FLOAT)  \
+    F(selfcal_t, sum, REAL)     \
+    F(selfcal_t, sum_sq, REAL)
 #endif
 
 #define BANK_FIELDS(F, PART)                      \
@@ -101,9 +114,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, offset, REAL)                    \
     F(selfcal_t, block, U32)                      \
     F(selfcal_t, variance_ratio, REAL)            \
-    F(selfcal_t, first, FLOAT)                    \
-    F(selfcal_t, sum, REAL)                       \
-    F(selfcal_t, sum_sq, REAL)                    \
+    BLOCK_FIELDS(F, PART)                         \
     F(selfcal_t, position, U32)                   \
     F(selfcal_t, used, U32)                       \
     F(selfcal_t, dropped, BOOL)                   \
@@ -181,6 +192,7 @@ static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
 static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
 #ifdef SELFCAL_FIXED
 static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
+static const field_t block_fields[] = {BLOCK_SUM_FIELDS(ROW)};
 static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
 #else
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
@@ -210,6 +222,9 @@ typedef struct {
 typedef struct {
     SCALE_FIELDS(MIRROR)
 } selfcal_scale_t_mirror;
+typedef struct {
+    BLOCK_SUM_FIELDS(MIRROR)
+} selfcal_block_t_mirror;
 #endif
 /* NOLINTEND(bugprone-sizeof-expression) */
 
@@ -229,7 +244,9 @@ SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeo
 SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
 #ifdef SELFCAL_FIXED
 SCALE_FIELDS(IN_PLACE)
+BLOCK_SUM_FIELDS(IN_PLACE)
 SELFCAL_STATIC_ASSERT(all_of_a_scale, sizeof(selfcal_scale_t) == sizeof(selfcal_scale_t_mirror));
+SELFCAL_STATIC_ASSERT(all_of_a_block, sizeof(selfcal_block_t) == sizeof(selfcal_block_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 8);
 SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == 4);
 #else
@@ -249,7 +266,7 @@ typedef struct {
 } part_t;
 
 #ifdef SELFCAL_FIXED
-enum { PARTS = 13 };
+enum { PARTS = 14 };
 #else
 enum { PARTS = 12 };
 #endif
@@ -271,6 +288,7 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {drift_fields, LENGTH(drift_fields), there ? self->x : NULL, cells, sizeof *self->x},
 #ifdef SELFCAL_FIXED
         {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
+        {block_fields, LENGTH(block_fields), there ? self->sums : NULL, LENGTH(self->sums), sizeof self->sums[0]},
 #endif
         {column_fields, LENGTH(column_fields), more ? columns->column : NULL, p, sizeof *columns->column},
         {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},

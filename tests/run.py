@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build"
 #: s; a suite that takes longer hangs.
 TIMEOUT = {"check": 900, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
-#: s
-FUZZ_SECONDS = 20
+#: s, by kernel
+FUZZ_SECONDS = {"float": 15, "fixed16": 8, "fixed32": 8}
 WORKERS = "2"
 
 
@@ -113,14 +113,17 @@ def bench() -> Count:
 
 
 def fuzz() -> Count:
-    """Random calls of the library for a while, after those that failed it once: one test."""
-    code, output = run(["make", "--silent", "fuzz", f"SECONDS={FUZZ_SECONDS}"], TIMEOUT["fuzz"])
-    runs = re.search(r"number_of_executed_units: (\d+)", output)
-    passed = code == 0 and runs is not None and int(runs[1]) > 0
-    print(f"{'ok    ' if passed else 'FAILED'} fuzz: {runs[1] if runs else 'no'} executions")
-    if not passed:
-        print(output)
-    return Count(passed=1) if passed else Count(failed=1)
+    """Random calls of the library for a while, after those that failed it once: one test a kernel."""
+    total = Count()
+    for kernel, seconds in FUZZ_SECONDS.items():
+        code, output = run(["make", "--silent", "fuzz", f"KERNEL={kernel}", f"SECONDS={seconds}"], TIMEOUT["fuzz"])
+        runs = re.search(r"number_of_executed_units: (\d+)", output)
+        passed = code == 0 and runs is not None and int(runs[1]) > 0
+        print(f"{'ok    ' if passed else 'FAILED'} fuzz {kernel}: {runs[1] if runs else 'no'} executions")
+        if not passed:
+            print(output)
+        total += Count(passed=1) if passed else Count(failed=1)
+    return total
 
 
 def pytest() -> Count:

@@ -147,14 +147,22 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.started = false);
     BROKEN(bank.origin[0] = NAN);
     BROKEN(bank.offset[AXES - 1U] = INFINITY);
-    BROKEN(bank.first[0] = NAN);
     BROKEN(bank.last[0] = NAN);
     BROKEN(bank.variance_ratio = 0.0F);
     BROKEN(bank.dropped = true);
     BROKEN(bank.retired = (1U << AXES) - 1U);
     BROKEN(bank.bad[0] = bank.watched + 1U);
+#ifdef SELFCAL_FIXED
+    BROKEN(bank.sums[0].first = INT32_MIN);
+    BROKEN(bank.sums[0].sum = INT64_MIN);
+    BROKEN(bank.sums[0].sum_sq = -1);
+    BROKEN(bank.sums[0].exponent = 101);
+    BROKEN(bank.sums[0].shift = 16);
+#else
+    BROKEN(bank.first[0] = NAN);
     BROKEN(bank.sum[0] = NAN);
     BROKEN(bank.sum_sq[0] = -1.0F);
+#endif
     BROKEN(bank.within[AXES - 1U] = -1.0);
     BROKEN(bank.within[0] = INFINITY);
     /* counts that do not fit */

@@ -1,8 +1,10 @@
 /* libFuzzer on the public interface: the input is a model and a list of calls with their arguments.
  *
- * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, selfcal_check() content, counters not running
- * backwards, reports that are probability laws. A twin, once restored from a snapshot, gets the same calls and must stay equal
- * bit for bit. Small grids and batches, so that an execution is fast; see the Makefile. */
+ * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, counters not running backwards, reports that are
+ * probability laws. After every LOOK_EVERY-th, and wherever the state is about to be replaced: selfcal_check() content (what is
+ * broken stays broken). A twin, once restored from a snapshot, gets the same calls and must stay equal bit for bit.
+ * An execution is fast: small grids and batches (see the Makefile), and by a hash of the input only some executions make whole
+ * reports, save snapshots, or push long records. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -10,7 +12,7 @@
 
 #include "selfcal.h"
 
-enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, PUSHES_MAX = 200 };
+enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 4 };
 #define MORE SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX)
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
 
@@ -44,6 +46,7 @@ static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
 static selfcal_model_t model;
 static selfcal_regressors_t regressors;
+static selfcal_forgetting_t forgetting;
 static float reference[SELFCAL_REGRESSORS_MAX], coefficient_sd[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
 static float values[SELFCAL_REGRESSORS_MAX]; /* of the regressors, as they come with the next sample */
 
@@ -171,11 +174,16 @@ static void make_model(input_t *in) {
         }
         model.regressors = &regressors;
     }
+    if ((limits >> 4 & 3U) == 3U) {
+        forgetting.code = &selfcal_forgetting_code;
+        forgetting.half_life_s = ldexpf(model.dt_s, 3 + 3 * (limits >> 6)); /* 8 to 4096 bank intervals */
+        model.forgetting = &forgetting;
+    }
     if (shape >> 5 != 7U) {
         return;
     }
     /* something is wrong with this one */
-    switch (byte(in) % 20U) {
+    switch (byte(in) % 22U) {
     case 0: model.dt_s = any_float(in); break;
     case 1: model.block = (uint32_t)bits(in, 4); break;
     case 2: model.axes = byte(in); break;
@@ -195,6 +203,8 @@ static void make_model(input_t *in) {
     case 16: regressors.reference = NULL; break;
     case 17: reference[0] = any_float(in); break;
     case 18: coefficient_sd[0] = any_float(in); break;
+    case 19: forgetting.half_life_s = any_float(in); break;
+    case 20: forgetting.code = NULL; break;
     default: hypothesis_table[0].ln_probability = any_float(in); break;
     }
 }
@@ -240,12 +250,15 @@ static bool grown(uint32_t before_, uint32_t now) {
     return now >= before_;
 }
 
-static void check_bank(void) {
+static void check_state(void) {
+    HOLDS(tampered || selfcal_check(&bank.self) == SELFCAL_OK);
+}
+
+static void check_counters(void) {
     const selfcal_counters_t now = *selfcal_counters(&bank.self);
     if (tampered) {
         return;
     }
-    HOLDS(selfcal_check(&bank.self) == SELFCAL_OK);
     HOLDS(now.samples >= before.samples && now.missing >= before.missing && grown(before.gaps, now.gaps) &&
           grown(before.blocks_lost, now.blocks_lost) && grown(before.blocks_part, now.blocks_part) &&
           grown(before.blocks_moving, now.blocks_moving));
@@ -417,7 +430,8 @@ static void report_steps(unsigned wanted) {
     selfcal_status_t status = SELFCAL_BUSY;
     for (; reporting && wanted > 0U && steps > 0U && status == SELFCAL_BUSY; wanted--, steps--) {
         status = selfcal_report_step(&work, &report);
-        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN || status == SELFCAL_AXIS_RETIRED);
+        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN || status == SELFCAL_AXIS_RETIRED ||
+              (status == SELFCAL_TOO_SHORT && model.forgetting != NULL));
         HOLDS(!twinned || selfcal_report_step(&twin_work, &twin_report) == status);
     }
     if (status != SELFCAL_BUSY) {
@@ -519,6 +533,7 @@ static void restore_mutated(input_t *in) {
         return;
     }
     snapshots--;
+    check_state();
     if (save(&bank, &store) != SELFCAL_OK) {
         HOLDS(tampered);
         return;
@@ -615,9 +630,11 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         return 0;
     }
     twinned = tampered = reporting = has_telemetry = has_gate = false;
-    pushes = PUSHES_MAX;
-    snapshots = 2;
-    steps = hash(data, size) % 16U == 0U ? STEPS_MAX : 16U;
+    const uint32_t chance = hash(data, size);
+    pushes = chance % 8U == 0U ? 200U : 64U;
+    snapshots = chance / 8U % 4U == 0U ? 2U : 0U;
+    const bool whole = chance / 32U % 32U == 0U;
+    steps = whole ? STEPS_MAX : 8U;
     memset(&before, 0, sizeof before);
     count_before = 0;
     for (unsigned call = 0; call < CALLS_MAX && in.at < in.end; call++) {
@@ -643,9 +660,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 18: set_values(&in); break;
         default: push_moderate(&in); break;
         }
-        check_bank();
+        check_counters();
+        if (call % LOOK_EVERY == LOOK_EVERY - 1U) {
+            check_state();
+        }
     }
-    HOLDS(steps > 0U || !reporting || hash(data, size) % 16U != 0U); /* no report is endless */
+    check_state();
+    HOLDS(steps > 0U || !reporting || !whole); /* no report is endless */
     if (twinned) {
         equal_banks(&bank, &twin);
     }

@@ -6,6 +6,7 @@ n = 10^6 against the textbook bank node for node, n = 10^7 float against double 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from typing import Literal
@@ -17,6 +18,7 @@ from selfcal import _reference
 from selfcal.engines.library import Bank
 from selfcal.model import Model
 from selfcal.tables import make_tables
+from selfcal.verbs.codegen import coarsest_exponent
 
 from conftest import worst_difference
 
@@ -135,3 +137,24 @@ def test_double_against_the_textbook_at_a_million() -> None:
         worst = max(worst, abs(bank.raw.log_likelihood(0, j, sigma) - float(theirs[0])))
     print(f"\nn={n:.0e}: d ln p {worst:.2g}")
     assert worst <= 1e-3
+
+
+@pytest.mark.parametrize("most", [1e-3, 0.5, 1e3, 1e9])
+@pytest.mark.parametrize("period", [1, 2, 8])
+def test_no_reading_makes_a_step_coarser_than_codegen_says(most: float, period: int) -> None:
+    """First batches from end to end of the range, N up to `most`: the step is within 2 of the bound, or finer."""
+    tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
+    axis = tables.axes[0]
+    limits = {"ln_min": (math.log(1e-6), *axis.ln_min[1:]), "ln_max": (math.log(most), *axis.ln_max[1:])}
+    axis = dataclasses.replace(axis, **limits)
+    tables = dataclasses.replace(tables, axes=(axis,))
+    bound = coarsest_exponent(axis, tables.dt_s)
+    swing = axis.range * np.where(np.arange(64) // period % 2 == 0, 1.0, -1.0) * (1.0 - 1e-6)
+    found = []
+    for fixed in (16, 32):
+        bank = Bank(tables, fixed=fixed)
+        bank.push(swing.astype(np.float32)[:, None])
+        bank.raw.node(0, 0)  # runs the batches
+        found.append(bank.raw.scale(0)["exponent"])
+    assert found[0] == found[1] <= bound
+    assert period > 1 or found[0] >= bound - 1  # every difference is 2 range only there

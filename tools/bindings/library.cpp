@@ -216,7 +216,7 @@ public:
         d["coarser"] = s->coarser;
         d["finer"] = s->finer;
         d["most_y"] = s->most_y;
-        d["most_c"] = s->most_c;
+        d["most_sum"] = s->most_sum;
         return d;
     }
 #endif

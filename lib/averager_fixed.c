@@ -1,0 +1,99 @@
+/* A block's sums in integers, for parts without an FPU: in software floating point a sample's two cost 600 instructions.
+ *
+ * INPUT SCALING  By each block's first sample: a step of 2^exponent unit makes it 2^25 to 2^26 steps, so that it and every sample of
+ *   a quarter of its size or more are exact and others are rounded to a step, 2^-25 of the first. A sample of ROOM steps or more makes
+ *   the step so much coarser that it is half of ROOM to ROOM.
+ * HEAD-ROOM  |first| <= 2^26 steps, any sample less than ROOM = 2^29, their differences < 9/8 ROOM, a block less than 2^32 samples:
+ *   |sum| < 9/8 2^61. Squares are of differences rounded to 2^shift steps, of which they are 2^15 at most: sum_sq <= 2^62. Nothing
+ *   saturates. (tests/c/fixed/test_block.c drives each there.)
+ * GUARD BITS  The mean is off by a step at most, 2^-28 of the block's largest sample, whose own last place is 2^-24 of it. A square's
+ *   root is off by 2^-15 of the largest difference at most: the mean square by 2^-14 of the largest times the rms difference.
+ *
+ * >> of a negative number must be arithmetic, as in kernel_fixed.c. */
+#include "internal.h"
+
+#ifdef SELFCAL_FIXED
+
+#define FIRST_BITS 26
+#define ROOM_BITS 29
+#define ROOM (1 << ROOM_BITS)
+#define PART_MAX (1 << 15)
+
+/* The exponent with which a value has `bits` bits: 2^(bits - 1) <= |value| 2^-exponent < 2^bits. */
+static int step_exponent(float value, int bits) {
+    const int exponent = (int)((float_bits(value) >> 23) & 0xFFU);
+    return (exponent > 0 ? exponent : 1) - 126 - bits;
+}
+
+/* value / 2^shift to nearest, |value| <= 2^30. */
+static inline int32_t rounded(int32_t value, uint32_t shift) {
+    return (value + (1 << shift >> 1)) >> shift;
+}
+
+/* Kept apart from what every sample runs through, whose registers it would spill. */
+#ifdef __GNUC__
+#define COLD __attribute__((noinline))
+#else
+#define COLD
+#endif
+
+/* Makes the step so coarse that `value` fits; what falls off the sums is less than a step each. */
+COLD static void coarsen(selfcal_block_t *sums, float value) {
+    const int exponent = step_exponent(value, ROOM_BITS), bits = exponent - sums->exponent;
+    SELFCAL_ASSERT(bits > 0);
+    sums->exponent = (int16_t)exponent;
+    sums->first = bits < ROOM_BITS ? rounded(sums->first, (uint32_t)bits) : 0;
+    sums->sum >>= bits < 63 ? bits : 63;
+    const int less = bits - sums->shift;
+    sums->shift = (uint8_t)(less < 0 ? -less : 0);
+    if (less > 0) {
+        sums->sum_sq >>= less < 31 ? 2 * less : 63;
+    }
+}
+
+static inline bool fits(int32_t part) {
+    return part <= PART_MAX && part >= -PART_MAX;
+}
+
+/* Makes the squares' step so coarse that `from_first` fits. */
+COLD static void widen(selfcal_block_t *sums, int32_t from_first) {
+    while (!fits(rounded(from_first, sums->shift))) {
+        sums->shift++;
+        sums->sum_sq >>= 2;
+    }
+}
+
+void selfcal_block_open(selfcal_block_t *sums, float value) {
+    sums->exponent = (int16_t)step_exponent(value, FIRST_BITS);
+    sums->first = to_fixed(value, -sums->exponent);
+}
+
+void selfcal_block_add(selfcal_block_t *sums, float value) {
+    int32_t steps = to_fixed(value, -sums->exponent);
+    if (steps >= ROOM || steps <= -ROOM) {
+        coarsen(sums, value);
+        steps = to_fixed(value, -sums->exponent);
+    }
+    const int32_t from_first = steps - sums->first;
+    if (!fits(rounded(from_first, sums->shift))) {
+        widen(sums, from_first);
+    }
+    const int32_t part = rounded(from_first, sums->shift);
+    const int32_t square = part * part;
+    sums->sum += from_first;
+    sums->sum_sq += square;
+}
+
+selfcal_real_t selfcal_block_level(const selfcal_block_t *sums, uint32_t used, float origin, selfcal_wide_t *scatter) {
+    const selfcal_real_t from_origin = ldexpf((selfcal_real_t)sums->first, sums->exponent) - origin;
+    *scatter = 0.0;
+    if (sums->sum_sq == 0) {
+        return from_origin; /* one sample, or equal ones */
+    }
+    const selfcal_real_t sum = (selfcal_real_t)sums->sum, mean = sum / (selfcal_real_t)used;
+    const selfcal_real_t squares = ldexpf((selfcal_real_t)sums->sum_sq, 2 * sums->shift);
+    *scatter = ldexp((selfcal_wide_t)r_fmax(squares - sum * mean, R(0.0)), 2 * sums->exponent);
+    return from_origin + ldexpf(mean, sums->exponent);
+}
+
+#endif
