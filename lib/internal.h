@@ -52,6 +52,36 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 /* C99 has no _Static_assert. `name` says what holds. */
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
 
+/* What the laws have. */
+static inline bool is_sum(selfcal_law_t law) {
+    return SELFCAL_TERMS_MAX > 1 && law >= SELFCAL_FLICKER;
+}
+
+/* A deviation goes with rho, sigma_m or B; else K, if anything. */
+static inline bool has_deviation(selfcal_law_t law) {
+    return law == SELFCAL_GAUSS_MARKOV || (is_sum(law) && law == SELFCAL_FLICKER);
+}
+
+static inline bool has_walk(selfcal_law_t law) {
+    return law == SELFCAL_RANDOM_WALK || (is_sum(law) && law == SELFCAL_MOVING_AVERAGE);
+}
+
+static inline bool has_alpha(selfcal_law_t law) {
+    return law == SELFCAL_GAUSS_MARKOV || is_sum(law);
+}
+
+/* Priors of an axis under a hypothesis. */
+static inline const selfcal_prior_t *priors_of(const selfcal_model_t *model, const selfcal_hypothesis_t *hypothesis, uint8_t axis) {
+#if SELFCAL_TERMS_MAX > 1
+    if (hypothesis->prior != NULL) {
+        return &hypothesis->prior[(size_t)axis * SELFCAL_PARAMETERS];
+    }
+#else
+    (void)hypothesis;
+#endif
+    return model->axis[axis].prior;
+}
+
 /* bank.c */
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
@@ -129,6 +159,25 @@ struct selfcal_regressors_code {
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);
 };
+
+#if SELFCAL_TERMS_MAX > 1
+/* terms.c, for the nodes of sums: what bank.c does for the others. */
+struct span; /* kernel.h */
+size_t selfcal_terms_nodes(const selfcal_model_t *model);
+void selfcal_terms_init(selfcal_t *self, unsigned char *memory);
+bool selfcal_terms_sound(const selfcal_t *self);
+/* Node `j` belongs to a sum. */
+static inline bool selfcal_is_term_node(const selfcal_node_t *node) {
+    return node->c == R(0.0); /* never of another law */
+}
+void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place);
+void selfcal_terms_run(selfcal_t *self, size_t j, const struct span *span);
+void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count);
+/* All but the node's place. */
+void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
+/* The drift of each term at the last interval over one series: "1" is 0, regressor k is 1 + k, axis a is 1 + count + a. */
+void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
+#endif
 
 /* Regressors that an axis has, a bit each. */
 uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);

@@ -43,14 +43,18 @@ static const selfcal_axis_t *axis_of(const selfcal_work_t *work) {
     return &work->bank->model->axis[work->axis];
 }
 
+static const selfcal_prior_t *prior_of(const selfcal_work_t *work) {
+    return priors_of(work->bank->model, hypothesis_of(work), work->axis);
+}
+
 /* The drift parameter that goes with rho. */
 static selfcal_parameter_t drift_parameter(selfcal_law_t law) {
-    return law == SELFCAL_GAUSS_MARKOV ? SELFCAL_SIGMA_M : SELFCAL_K;
+    return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
 }
 
 /* ln(parameter) - ln(rho) - ln(sigma_v): K sqrt(dt) = sigma_w = rho sigma_v, sigma_m = rho sigma_v. */
 static selfcal_real_t drift_shift(const selfcal_work_t *work) {
-    return hypothesis_of(work)->law == SELFCAL_RANDOM_WALK ? R(-0.5) * r_log((selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+    return has_walk(hypothesis_of(work)->law) ? R(-0.5) * r_log((selfcal_real_t)work->bank->model->dt_s) : R(0.0);
 }
 
 /* ------------------------------------------------------------------------------------------------------------ spline */
@@ -169,7 +173,7 @@ static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth
     expectation_t result = {R(0.0), R(0.0)};
     const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
     const float dt = work->bank->model->dt_s;
-    if (hypothesis_of(work)->rho == NULL) {
+    if (hypothesis_of(work)->rho == NULL || is_sum(hypothesis_of(work)->law)) {
         return result;
     }
     if (truth->wide) {
@@ -349,7 +353,7 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
 /* The widest box that the priors permit. */
 static void first_box(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);
     for (int d = 0; d < 2; d++) {
         work->limit_lo[d] = R(0.0);
@@ -450,8 +454,8 @@ static void cell_parameters(const selfcal_work_t *work, const row_t *row, const 
 }
 
 static bool has_parameter(selfcal_law_t law, unsigned parameter) {
-    return parameter == SELFCAL_N || (parameter == SELFCAL_K && law == SELFCAL_RANDOM_WALK) ||
-           ((parameter == SELFCAL_SIGMA_M || parameter == SELFCAL_ALPHA) && law == SELFCAL_GAUSS_MARKOV);
+    return parameter == SELFCAL_N || (parameter == SELFCAL_K && has_walk(law)) ||
+           (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && has_alpha(law));
 }
 
 /* ---------------------------------------------------------------------------------------------------- search of the box */
@@ -477,7 +481,7 @@ static bool reachable(const selfcal_work_t *work, const selfcal_prior_t *prior, 
 
 static void step_scan(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     row_t row;
     make_row(work, &row);
@@ -551,7 +555,7 @@ static void begin_sum(selfcal_work_t *work) {
     memset(work->field, 0, sizeof work->field);
     memset(work->histogram, 0, sizeof work->histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-        const selfcal_prior_t *prior = &axis_of(work)->prior[p];
+        const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
         work->range_hi[p] = r_fmin(work->range_hi[p], (selfcal_real_t)prior->ln_max);
     }
@@ -610,7 +614,7 @@ typedef struct {
 static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t fall) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
-    const selfcal_prior_t *n_prior = &axis_of(work)->prior[SELFCAL_N], *drift_prior = &axis_of(work)->prior[drift];
+    const selfcal_prior_t *n_prior = &prior_of(work)[SELFCAL_N], *drift_prior = &prior_of(work)[drift];
     const bool has_drift = hypothesis->rho != NULL;
     /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
      * noise, sigma_v falls as rho rises and their product stands still. */
@@ -658,7 +662,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
 /* Some cells of a row. */
 static void step_sum(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
@@ -757,7 +761,7 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
 }
 
 static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
-    const selfcal_prior_t *prior = &axis_of(work)->prior[p];
+    const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_wide_t centre = exp((selfcal_wide_t)work->best_ln[p]);
     const selfcal_wide_t mean = work->first[p] / work->mass;
     const selfcal_wide_t variance = fmax(work->second[p] / work->mass - mean * mean, 0.0);
@@ -908,7 +912,7 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
                              log(work->mass * (selfcal_wide_t)work->width[0] * (selfcal_wide_t)work->width[1]);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         if (has_parameter(hypothesis_of(work)->law, p)) {
-            posterior->ln_evidence += ln_prior_density(&axis_of(work)->prior[p]);
+            posterior->ln_evidence += ln_prior_density(&prior_of(work)[p]);
         }
     }
     finish_bias(work, posterior);

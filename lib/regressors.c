@@ -130,34 +130,7 @@ static void hand_over(selfcal_t *self) {
     }
 }
 
-/* One series through a span. */
-typedef struct {
-    selfcal_real_t nu[SELFCAL_BATCH];
-    selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
-} innovations_t;
-
-#ifdef SELFCAL_FIXED
-/* The integer kernels know no columns: valid_regressors() lets none in. */
-static void run(selfcal_t *self, size_t j, const gains_t *gains) {
-    (void)self, (void)j, (void)gains;
-    SELFCAL_ASSERT(false);
-}
-
-static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
-    (void)self, (void)j, (void)less;
-    SELFCAL_ASSERT(false);
-}
-#else
-/* a + b = sum + error (Knuth). */
-static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
-    const selfcal_real_t sum = a + b, part = sum - a;
-    const selfcal_sum_t result = {sum, (a - (sum - part)) + (b - part)};
-    return result;
-}
-
-/* Sum of nu of one over s times nu of the other, to twice the digits (Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26 (2005) 1955-1988,
- * algorithm 5.3), added to `sum`. */
-static void add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
+void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
     selfcal_sum_t value = {R(0.0), R(0.0)};
     const uint32_t count = gains->span.to - gains->span.from;
     for (uint32_t i = 0; i < count; i++) {
@@ -172,6 +145,18 @@ static void add_products(selfcal_sum_t *sum, const gains_t *gains, const innovat
     sum_add(sum, product, rest);
 }
 
+#ifdef SELFCAL_FIXED
+/* The integer kernels know no columns: valid_regressors() lets none in. */
+static void run(selfcal_t *self, size_t j, const gains_t *gains) {
+    (void)self, (void)j, (void)gains;
+    SELFCAL_ASSERT(false);
+}
+
+static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
+    (void)self, (void)j, (void)less;
+    SELFCAL_ASSERT(false);
+}
+#else
 /* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What is rounded
  * off each step is a part of its change, and the change is small where the filter is slow. */
 static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x,
@@ -198,7 +183,7 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
         selfcal_sum_t *x = &self->columns->x[j * (p + 1U) + k];
         *x = filter(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x, &column[k]);
         for (size_t l = 0; l <= k; l++) {
-            add_products(a++, gains, &column[l], &column[k]);
+            selfcal_add_products(a++, gains, &column[l], &column[k]);
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
@@ -206,29 +191,22 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
         x = filter(self, j, gains, waiting(self)->y[at - j * axes], x, &reading);
         self->x[at] = x.hi;
         self->columns->low[at] = x.lo;
-        add_products(&self->c[at], gains, &reading, &reading);
-        add_products(&self->b[at], gains, &column[0], &reading);
+        selfcal_add_products(&self->c[at], gains, &reading, &reading);
+        selfcal_add_products(&self->b[at], gains, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
-            add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
+            selfcal_add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
         }
     }
-}
-
-static selfcal_sum_t split(selfcal_wide_t value) {
-    selfcal_sum_t sum;
-    sum.hi = (selfcal_real_t)value;
-    sum.lo = (selfcal_real_t)(value - (selfcal_wide_t)sum.hi);
-    return sum;
 }
 
 static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     const size_t rows = columns_of(self) + 1U, axes = self->model->axes;
     for (size_t k = j * rows; k < (j + 1U) * rows; k++) {
-        self->columns->x[k] = split(sum_value(self->columns->x[k]) * (1.0 - less));
+        self->columns->x[k] = make_sum(sum_value(self->columns->x[k]) * (1.0 - less));
     }
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
         const selfcal_sum_t x = {self->x[k], self->columns->low[k]};
-        const selfcal_sum_t left = split(sum_value(x) * (1.0 - less));
+        const selfcal_sum_t left = make_sum(sum_value(x) * (1.0 - less));
         self->x[k] = left.hi;
         self->columns->low[k] = left.lo;
     }
@@ -309,6 +287,18 @@ uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis) {
     return mask;
 }
 
+/* The node's drift at the last interval over "1" (0) or a column, from 1 on: the prediction over phi. */
+static selfcal_wide_t column_drift(const selfcal_t *self, uint16_t index, size_t series) {
+#if SELFCAL_TERMS_MAX > 1
+    if (selfcal_is_term_node(&self->node[index])) {
+        selfcal_wide_t drift[SELFCAL_TERMS_MAX];
+        selfcal_terms_drift(self, index, series, drift);
+        return drift[0] + drift[1] + drift[2];
+    }
+#endif
+    return sum_value(self->columns->x[index * (columns_of(self) + 1U) + series]) / (1.0 - (selfcal_wide_t)self->node[index].beta);
+}
+
 /* From the sums as they are; axis, node and mask fit the bank. */
 static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uint8_t mask, normal_t *normal) {
     memset(normal, 0, sizeof *normal);
@@ -320,7 +310,6 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->left[0] = normal->node.bias_left;
     normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
     normal->first[0] = selfcal_offset(self, axis);
-    const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;
     const selfcal_sum_t *a = p > 0U ? &self->columns->a[index * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
     if (p > 0U) {
@@ -340,7 +329,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
         const size_t at = (size_t)index * self->model->axes + axis;
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
-        normal->left[row] = normal->last[row] - sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->left[row] = normal->last[row] - column_drift(self, index, k + 1U);
         normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
         normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
                              (selfcal_wide_t)self->model->regressors->reference[k];

@@ -25,7 +25,9 @@
  *       N        white noise density        unit/sqrt(Hz)   two-sided; the Allan deviation at 1 s
  *       K        random-walk density        unit/s/sqrt(Hz) = unit/sqrt(s) of drift per second
  *       sigma_m  Gauss-Markov deviation     unit
- *       alpha    Gauss-Markov bandwidth     1/s
+ *       alpha    Gauss-Markov bandwidth     1/s            flicker: that of the middle term
+ *       B        flicker coefficient        unit           Allan deviation 0.664 B on its plateau
+ *       spectral_ratio                      1              white noise: amplitude at 0 Hz over that at 1/(2 dt)
  *   Per bank interval dt: sigma_v = N/sqrt(dt), random-walk step sigma_w = K*sqrt(dt).
  *
  * THREE KINDS OF TROUBLE
@@ -132,6 +134,15 @@ extern "C" {
 #error "SELFCAL_REGRESSORS_MAX must be 1 to 6"
 #endif
 
+/* Drift terms, or states, of one law at most: 1 for the paper's laws, 3 for those that are sums as well (selfcal_law_t from
+ * SELFCAL_FLICKER on; to be set for the application too). With 1 their code is compiled out, and their models are refused. */
+#ifndef SELFCAL_TERMS_MAX
+#define SELFCAL_TERMS_MAX 1
+#endif
+#if SELFCAL_TERMS_MAX != 1 && SELFCAL_TERMS_MAX != 3
+#error "SELFCAL_TERMS_MAX must be 1 or 3"
+#endif
+
 #ifndef SELFCAL_ASSERT
 #define SELFCAL_ASSERT(condition) ((void)0)
 #endif
@@ -186,10 +197,24 @@ typedef enum {
     SELFCAL_CONSTANT = 0,     /* x_i = 0 */
     SELFCAL_RANDOM_WALK = 1,  /* x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                            (23) */
     SELFCAL_GAUSS_MARKOV = 2, /* x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-alpha dt) */
-    SELFCAL_LAWS = 3
+    /* Sums, with SELFCAL_TERMS_MAX of 3. */
+    SELFCAL_FLICKER = 3, /* three Gauss-Markov terms of deviation B sqrt(ln(10)/pi), bandwidths alpha/10, alpha, 10 alpha: a two-sided
+                            spectrum of B^2 / (2 pi f) within 12 % where 2 pi f is between the outer ones */
+    SELFCAL_MOVING_AVERAGE = 4, /* random walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, sigma_v^2): N is
+                                   the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta) */
+    SELFCAL_LAWS = 5
 } selfcal_law_t;
 
-typedef enum { SELFCAL_N = 0, SELFCAL_K = 1, SELFCAL_SIGMA_M = 2, SELFCAL_ALPHA = 3, SELFCAL_PARAMETERS = 4 } selfcal_parameter_t;
+/* Two share a place where no law has both. */
+typedef enum {
+    SELFCAL_N = 0,
+    SELFCAL_K = 1,
+    SELFCAL_SIGMA_M = 2,
+    SELFCAL_B = 2,
+    SELFCAL_ALPHA = 3,
+    SELFCAL_SPECTRAL_RATIO = 3,
+    SELFCAL_PARAMETERS = 4
+} selfcal_parameter_t;
 
 /* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
 typedef struct {
@@ -212,14 +237,17 @@ typedef struct {
 } selfcal_grid_t;
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
- * sigma_w / sigma_v or sigma_m / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
+ * sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
  * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way. Where the nodes lie decides
  * how well the likelihood is interpolated, not the prior. */
 typedef struct {
     selfcal_law_t law;
     float ln_probability;        /* prior */
     const selfcal_grid_t *rho;   /* NULL for SELFCAL_CONSTANT */
-    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV */
+    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV and the sums; of spectral_ratio where the law has that */
+#if SELFCAL_TERMS_MAX > 1
+    const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
+#endif
 } selfcal_hypothesis_t;
 
 typedef struct selfcal_regressors_code selfcal_regressors_code_t;
@@ -369,9 +397,47 @@ typedef struct {
                                                     sizeof(selfcal_sum_t) + \
                                                 (size_t)(axes) * sizeof(selfcal_real_t)))
 
+#if SELFCAL_TERMS_MAX > 1
+/* The gain side of a node of a sum, relative to sigma_v; states are scaled so that the reading is their sum and white noise. Private, as
+ * selfcal_terms_t. */
+typedef struct {
+    selfcal_wide_t p[SELFCAL_TERMS_MAX * (SELFCAL_TERMS_MAX + 1) / 2]; /* predicted covariance of the states, lower half */
+    selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX];      /* 1 - pole, and variance added per interval, of each */
+    selfcal_real_t theta;                                              /* of a moving average, whose part e_(i-1) is the last state */
+    bool steady;                                                       /* p has converged */
+} selfcal_term_node_t;
+
+typedef struct {
+    selfcal_term_node_t *node; /* [nodes of sums] */
+    selfcal_sum_t *x;          /* [those][1 + regressors + axes][SELFCAL_TERMS_MAX]: predicted states over "1", the columns, the readings */
+#ifdef SELFCAL_FIXED
+    selfcal_sum_t *bc;         /* [those][axes][2]: sums B and C of the readings */
+#endif
+} selfcal_terms_t;
+
+/* Bytes beyond SELFCAL_SIZE and SELFCAL_REGRESSORS_SIZE for a model with `nodes` nodes of sums, 0 for none. For each in the float build
+ * 104 + 24 p, and per axis 24. */
+#ifdef SELFCAL_FIXED
+#define SELFCAL_TERMS_SUMS (SELFCAL_TERMS_MAX + 2U)
+#else
+#define SELFCAL_TERMS_SUMS SELFCAL_TERMS_MAX
+#endif
+#define SELFCAL_TERMS_SIZE(nodes, axes, p) \
+    ((size_t)(nodes) == 0U ? (size_t)0U \
+                           : 7U + sizeof(selfcal_terms_t) + \
+                                 (size_t)(nodes) * (sizeof(selfcal_term_node_t) + \
+                                                    (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + (size_t)(axes) * SELFCAL_TERMS_SUMS) * \
+                                                        sizeof(selfcal_sum_t)))
+#else
+#define SELFCAL_TERMS_SIZE(nodes, axes, p) ((size_t)0U)
+#endif
+
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
+#if SELFCAL_TERMS_MAX > 1
+    selfcal_terms_t *terms;  /* of the sums; NULL: there are none */
+#endif
     selfcal_columns_t *columns; /* of the regressors; NULL: there are none */
     selfcal_node_t *node;    /* [nodes] */
     selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
@@ -419,7 +485,7 @@ typedef struct {
     selfcal_counters_t counters;
 } selfcal_t;
 
-/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
+/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE + SELFCAL_TERMS_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
@@ -520,7 +586,7 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 /* selfcal_save() writes this many bytes at a time, and the rest at last. */
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
-/* No snapshot of a model without regressors is longer, with them by no more than SELFCAL_REGRESSORS_SIZE: for a flash slot or a
+/* No snapshot of a model without regressors and sums is longer, with them by no more than SELFCAL_REGRESSORS_SIZE and SELFCAL_TERMS_SIZE: for a flash slot or a
  * buffer laid out by the compiler. */
 #define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
 

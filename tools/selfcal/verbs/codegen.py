@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from selfcal.errors import UserError
@@ -49,18 +49,25 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_AXES {axes}U
 #define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
 #define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
+#define SELFCAL_MODEL_TERM_NODES {tables.term_nodes}U
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
 
 #if SELFCAL_GRID_MAX < {largest} || SELFCAL_AXES_MAX < {axes} || SELFCAL_HYPOTHESES_MAX < {hypotheses}
 #error "SELFCAL_GRID_MAX, SELFCAL_AXES_MAX or SELFCAL_HYPOTHESES_MAX is too small for this model"
 #endif
-
+{_terms(tables)}
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 
 #endif
 """
+
+
+def _terms(tables: Tables) -> str:
+    if not tables.term_nodes:
+        return ""
+    return '#if SELFCAL_TERMS_MAX < 3\n#error "set SELFCAL_TERMS_MAX to 3: this model has laws that are sums"\n#endif\n'
 
 
 def _source(model: Model, tables: Tables) -> str:
@@ -70,6 +77,11 @@ def _source(model: Model, tables: Tables) -> str:
     parts += ['#include "selfcal_model.h"', ""]
     parts += [_grid(grids[nodes]) for nodes in sizes]
     parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
+    for h in tables.hypotheses:
+        if h.priors:
+            named = zip(h.priors, tables.axes, strict=True)
+            rows = (f"    {_priors(priors)}, /* {axis.name} */" for priors, axis in named)
+            parts += [f"static const selfcal_prior_t priors_of_{h.name}[] = {{", *rows, "};", ""]
     hypotheses = (_hypothesis(h) for h in tables.hypotheses)
     parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
     parts += _regressors(tables)
@@ -107,11 +119,12 @@ def _grid(grid: Grid) -> str:
     )
 
 
+def _priors(priors: Iterable[tuple[float, float, bool]]) -> str:
+    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}" for lo, hi, uniform in priors)
+
+
 def _axis(axis: AxisTable) -> str:
-    priors = ", ".join(
-        f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}"
-        for lo, hi, uniform in zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True)
-    )
+    priors = _priors(zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True))
     readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
     return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
 
@@ -138,5 +151,7 @@ def _regressors(tables: Tables) -> list[str]:
 
 def _hypothesis(hypothesis: HypothesisTable) -> str:
     law = f"SELFCAL_{list(LAWS)[hypothesis.law].upper()}"
-    grids = ", ".join(f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
-    return f"    {{{law}, {_f(hypothesis.ln_probability)}, {grids}}},"
+    rho, alpha = (f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
+    prior = f", .prior = priors_of_{hypothesis.name}" if hypothesis.priors else ""
+    chance = _f(hypothesis.ln_probability)
+    return f"    {{.law = {law}, .ln_probability = {chance}, .rho = {rho}, .alpha = {alpha}{prior}}},"
