@@ -39,6 +39,9 @@
  * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
 #define LN_RHO_MAX R(13.8)
 
+/* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
+#define LN_RATIO_MAX 6.91F
+
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
 }
@@ -95,6 +98,12 @@ static bool valid_model(const selfcal_model_t *model) {
 #if SELFCAL_TERMS_MAX > 1
         if (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes)) {
             return false;
+        }
+        for (uint8_t a = 0; hypothesis->law == SELFCAL_MOVING_AVERAGE && a < model->axes; a++) {
+            const selfcal_prior_t *ratio = &priors_of(model, hypothesis, a)[SELFCAL_SPECTRAL_RATIO];
+            if (ratio->ln_min < -LN_RATIO_MAX || ratio->ln_max > LN_RATIO_MAX) {
+                return false;
+            }
         }
 #endif
         if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) || rho != (hypothesis->rho != NULL) ||

@@ -52,6 +52,11 @@ static inline selfcal_real_t r_fmax(selfcal_real_t a, selfcal_real_t b) {
 /* C99 has no _Static_assert. `name` says what holds. */
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
 
+/* Where a pair (a, b) of terms, b <= a, lies. */
+static inline size_t term_pair(size_t a, size_t b) {
+    return a * (a + 1U) / 2U + b;
+}
+
 /* What the laws have. */
 static inline bool is_sum(selfcal_law_t law) {
     return SELFCAL_TERMS_MAX > 1 && law >= SELFCAL_FLICKER;
@@ -119,9 +124,10 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
 
 /* What is read now at one node, given sigma_v: its mean less the offset, the drift's part of that, and its variance over sigma_v^2
  * without that of the drift given the bias (and the coefficients): as it is now, and with d of the drift gone
- * own[0] + 2 d own[1] + d^2 own[2]. */
+ * own[0] + 2 d own[1] + d^2 own[2]. With several terms, d_a of each gone, that is own[0] + 2 sum d_a own[1 + a] + sum d_a d_b own[..]: all
+ * pairs, as selfcal_decay_t has them. */
 typedef struct {
-    selfcal_wide_t mean, drift, own[3];
+    selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
 
 /* forgetting.c, for a model that forgets. */
@@ -161,6 +167,7 @@ struct selfcal_regressors_code {
 };
 
 #if SELFCAL_TERMS_MAX > 1
+#define SELFCAL_FLICKER_TERM 0.7329355988794278 /* ln(10)/pi: variance of one of its terms over B^2 */
 /* terms.c, for the nodes of sums: what bank.c does for the others. */
 struct span; /* kernel.h */
 size_t selfcal_terms_nodes(const selfcal_model_t *model);
@@ -175,7 +182,10 @@ void selfcal_terms_run(selfcal_t *self, size_t j, const struct span *span);
 void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count);
 /* All but the node's place. */
 void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
-/* The drift of each term at the last interval over one series: "1" is 0, regressor k is 1 + k, axis a is 1 + count + a. */
+/* Covariance of the terms of the drift at the last interval, given x0, over sigma_v^2. */
+void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]);
+/* The drift of each term at the last interval over one series: "1" is 0, regressor k is 1 + k, and the readings of an axis. */
+size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis);
 void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
 #endif
 

@@ -432,6 +432,10 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     const selfcal_t *bank = work->bank;
     const selfcal_real_t z = (cell->ln_rho - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
     cell->off_grid = z < R(0.0) || z > (selfcal_real_t)(hypothesis->rho->nodes - 1U);
+    if (is_sum(hypothesis->law)) { /* of which there is none: beyond the last node the drift hides the white noise, sigma_v rho stays */
+        const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
+        cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
+    }
     const expectation_t e = expectation(work, &work->truth, cell->ln_rho, row->ln_alpha);
     cell->profile += e.profile;
     cell->ln_sigma += e.ln_sigma;
@@ -827,6 +831,24 @@ static void cardinal_weights(const selfcal_work_t *work, const selfcal_real_t of
     }
 }
 
+#if SELFCAL_TERMS_MAX > 1
+/* What of `now` belongs to the terms of a node of flicker, x0 given with its variance. */
+static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance, selfcal_wide_t bias_left,
+                      selfcal_now_t *now) {
+    const size_t index = (size_t)work->first_node + k;
+    selfcal_wide_t lost[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
+    selfcal_terms_drift(work->bank, index, 0, lost);
+    selfcal_terms_drift(work->bank, index, selfcal_terms_series(work->bank, work->axis), of_reading);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        now->drift[a] = of_reading[a] - x0 * lost[a];
+        now->own[1 + a] = bias_left * lost[a] * variance;
+        for (size_t b = 0; b <= a; b++) {
+            now->own[1 + SELFCAL_TERMS_MAX + term_pair(a, b)] = lost[a] * lost[b] * variance;
+        }
+    }
+}
+#endif
+
 /* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void step_bias(selfcal_work_t *work) {
@@ -847,10 +869,15 @@ static void step_bias(selfcal_work_t *work) {
             const selfcal_wide_t variance = 1.0 / (v.a + prior_precision), lost = 1.0 - v.bias_left;
             const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
             now.mean = v.drift + x0 * v.bias_left;
-            now.drift = now.mean - x0;
+            now.drift[0] = now.mean - x0;
             now.own[0] = v.bias_left * v.bias_left * variance;
             now.own[1] = v.bias_left * lost * variance;
-            now.own[2] = lost * lost * variance;
+            now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
+#if SELFCAL_TERMS_MAX > 1
+            if (v.law == SELFCAL_FLICKER) {
+                now_terms(work, k, x0, variance, v.bias_left, &now);
+            }
+#endif
         }
         if (begins && k == 0U) {
             work->bias_about = now.mean;
@@ -860,16 +887,36 @@ static void step_bias(selfcal_work_t *work) {
         work->bias_first += weighed;
         work->bias_second += weighed * off;
         work->bias_own += (selfcal_wide_t)work->spline[1][k] * (v.drift_var + now.own[0]);
-        if (v.law == SELFCAL_GAUSS_MARKOV) {
+        if (has_deviation(v.law)) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
             const selfcal_wide_t own = (selfcal_wide_t)work->spline[1][k] * best_sq;
-            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift;
-            const selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
-            decay[0] += weighed_fall;
-            decay[1] += 2.0 * (own * (stationary - v.drift_var + now.own[1]) - weighed_fall * off);
-            decay[2] += own * (v.drift_var + now.own[2] - stationary) + weighed_fall * now.drift;
+            selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
+            selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
+            size_t terms = 1;
+#if SELFCAL_TERMS_MAX > 1
+            if (v.law == SELFCAL_FLICKER) {
+                terms = SELFCAL_TERMS_MAX;
+                stationary *= SELFCAL_FLICKER_TERM;
+                selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
+            }
+#endif
+            for (size_t a = 0; a < terms; a++) {
+                const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift[a];
+                selfcal_wide_t with_all = 0.0;
+                for (size_t b = 0; b < terms; b++) {
+                    const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
+                    with_all += spread[pair];
+                    if (b <= a) {
+                        decay[2 * SELFCAL_TERMS_MAX + pair] +=
+                            own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
+                            weighed_fall * now.drift[b];
+                    }
+                }
+                decay[a] += weighed_fall;
+                decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now.own[1 + a]) - weighed_fall * off);
+            }
         }
     }
     work->bias_scale = best_sq;
@@ -884,9 +931,13 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
         const selfcal_wide_t *decay = work->bias_decay[j];
         posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
-        posterior->decay[j].mean = (float)(decay[0] / work->bias_weight);
-        posterior->decay[j].var[0] = (float)((decay[1] + 2.0 * mean * decay[0]) / work->bias_weight);
-        posterior->decay[j].var[1] = (float)(decay[2] / work->bias_weight);
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+            posterior->decay[j].mean[a] = (float)(decay[a] / work->bias_weight);
+            posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias_weight);
+        }
+        for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
+            posterior->decay[j].var_sq[a] = (float)(decay[2 * SELFCAL_TERMS_MAX + a] / work->bias_weight);
+        }
     }
 }
 

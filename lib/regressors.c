@@ -228,6 +228,8 @@ typedef struct {
     selfcal_wide_t first[UNKNOWNS_MAX];    /* offset; first values of the regressors less their references */
     selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
     selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
+    selfcal_wide_t lost[UNKNOWNS_MAX][SELFCAL_TERMS_MAX]; /* what the drift, each term of it, takes of that */
+    selfcal_wide_t drift[SELFCAL_TERMS_MAX]; /* of the readings at the estimate 0 */
     selfcal_wide_t estimate[UNKNOWNS_MAX]; /* A^-1 B; 0 for what cannot be told from those before it */
     selfcal_wide_t rest[UNKNOWNS_MAX];     /* B - A estimate */
     selfcal_wide_t residual;               /* C - B' A^-1 B, that is (C - 2 B' t + t' A t) at the estimate t */
@@ -287,18 +289,6 @@ uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis) {
     return mask;
 }
 
-/* The node's drift at the last interval over "1" (0) or a column, from 1 on: the prediction over phi. */
-static selfcal_wide_t column_drift(const selfcal_t *self, uint16_t index, size_t series) {
-#if SELFCAL_TERMS_MAX > 1
-    if (selfcal_is_term_node(&self->node[index])) {
-        selfcal_wide_t drift[SELFCAL_TERMS_MAX];
-        selfcal_terms_drift(self, index, series, drift);
-        return drift[0] + drift[1] + drift[2];
-    }
-#endif
-    return sum_value(self->columns->x[index * (columns_of(self) + 1U) + series]) / (1.0 - (selfcal_wide_t)self->node[index].beta);
-}
-
 /* From the sums as they are; axis, node and mask fit the bank. */
 static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uint8_t mask, normal_t *normal) {
     memset(normal, 0, sizeof *normal);
@@ -308,9 +298,19 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->b[0] = normal->node.b;
     normal->last[0] = 1.0;
     normal->left[0] = normal->node.bias_left;
+    normal->lost[0][0] = 1.0 - normal->left[0];
+    normal->drift[0] = normal->node.drift;
     normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
     normal->first[0] = selfcal_offset(self, axis);
+    const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;
+#if SELFCAL_TERMS_MAX > 1
+    const bool sum = selfcal_is_term_node(&self->node[index]);
+    if (sum) {
+        selfcal_terms_drift(self, index, 0, normal->lost[0]);
+        selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), normal->drift);
+    }
+#endif
     const selfcal_sum_t *a = p > 0U ? &self->columns->a[index * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
     if (p > 0U) {
         normal->a[0][0] = sum_value(a[0]); /* the same as node.a, to more digits */
@@ -329,7 +329,14 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
         const size_t at = (size_t)index * self->model->axes + axis;
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
-        normal->left[row] = normal->last[row] - column_drift(self, index, k + 1U);
+        normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->left[row] = normal->last[row] - normal->lost[row][0];
+#if SELFCAL_TERMS_MAX > 1
+        if (sum) {
+            selfcal_terms_drift(self, index, k + 1U, normal->lost[row]);
+            normal->left[row] = normal->last[row] - normal->lost[row][0] - normal->lost[row][1] - normal->lost[row][2];
+        }
+#endif
         normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
         normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
                              (selfcal_wide_t)self->model->regressors->reference[k];
@@ -384,7 +391,8 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
     }
     solve(g, order, shift);
     fit->miss = 0.0;
-    fit->now.mean = fit->now.drift = normal->node.drift;
+    fit->now.mean = normal->node.drift;
+    memcpy(fit->now.drift, normal->drift, sizeof fit->now.drift);
     selfcal_wide_t x0_off = 0.0;
     for (uint8_t i = 0; i < order; i++) {
         for (uint8_t j = 0; j <= i; j++) {
@@ -396,7 +404,9 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
         fit->miss += i == 0U ? 0.0 : off * off / (normal->sd[i] * normal->sd[i]);
         fit->mean[i] = normal->estimate[i] + shift[i];
         fit->now.mean += fit->mean[i] * normal->left[i];
-        fit->now.drift += fit->mean[i] * (normal->left[i] - normal->last[i]);
+        for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+            fit->now.drift[t] -= fit->mean[i] * normal->lost[i][t];
+        }
     }
     fit->miss += x0_off * x0_off / p0;
     /* Columns of G^-1. */
@@ -408,10 +418,13 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
         solve(g, order, column);
         fit->var[i] = column[i];
         for (uint8_t j = 0; j < order; j++) {
-            const selfcal_wide_t lost[2] = {normal->last[i] - normal->left[i], normal->last[j] - normal->left[j]};
             fit->now.own[0] += normal->left[i] * column[j] * normal->left[j] / variance;
-            fit->now.own[1] += normal->left[i] * column[j] * lost[1] / variance;
-            fit->now.own[2] += lost[0] * column[j] * lost[1] / variance;
+            for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+                fit->now.own[1 + t] += normal->left[i] * column[j] * normal->lost[j][t] / variance;
+                for (size_t u = 0; u <= t; u++) { /* all i and j: G^-1 is symmetric */
+                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] * normal->lost[j][u] / variance;
+                }
+            }
             fit->share += (j <= i ? normal->a[i][j] : normal->a[j][i]) * column[j] / variance;
         }
     }

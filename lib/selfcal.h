@@ -142,6 +142,7 @@ extern "C" {
 #if SELFCAL_TERMS_MAX != 1 && SELFCAL_TERMS_MAX != 3
 #error "SELFCAL_TERMS_MAX must be 1 or 3"
 #endif
+#define SELFCAL_TERM_PAIRS (SELFCAL_TERMS_MAX * (SELFCAL_TERMS_MAX + 1) / 2)
 
 #ifndef SELFCAL_ASSERT
 #define SELFCAL_ASSERT(condition) ((void)0)
@@ -201,7 +202,7 @@ typedef enum {
     SELFCAL_FLICKER = 3, /* three Gauss-Markov terms of deviation B sqrt(ln(10)/pi), bandwidths alpha/10, alpha, 10 alpha: a two-sided
                             spectrum of B^2 / (2 pi f) within 12 % where 2 pi f is between the outer ones */
     SELFCAL_MOVING_AVERAGE = 4, /* random walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, sigma_v^2): N is
-                                   the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta) */
+                                   the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta), prior within 1e-3 to 1e3 */
     SELFCAL_LAWS = 5
 } selfcal_law_t;
 
@@ -401,7 +402,7 @@ typedef struct {
 /* The gain side of a node of a sum, relative to sigma_v; states are scaled so that the reading is their sum and white noise. Private, as
  * selfcal_terms_t. */
 typedef struct {
-    selfcal_wide_t p[SELFCAL_TERMS_MAX * (SELFCAL_TERMS_MAX + 1) / 2]; /* predicted covariance of the states, lower half */
+    selfcal_wide_t p[SELFCAL_TERM_PAIRS]; /* predicted covariance of the states, lower half */
     selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX];      /* 1 - pole, and variance added per interval, of each */
     selfcal_real_t theta;                                              /* of a moving average, whose part e_(i-1) is the last state */
     bool steady;                                                       /* p has converged */
@@ -623,11 +624,13 @@ typedef struct {
 } selfcal_estimate_t;
 
 /* What a decaying drift does to the bias, for selfcal_predict(): with psi = 1 - e^(-alpha t) of each alpha node, t after the
- * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var[0] + psi^2 var[1]) - f^2. */
+ * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var + psi^2 var_sq) - f^2. Flicker:
+ * the same for each of its terms, of alpha/10, alpha and 10 alpha, with psi psi' var_sq for each pair of them, b <= a at a (a + 1)/2 + b. */
 typedef struct {
     float alpha; /* 1/s */
-    float mean;
-    float var[2];
+    float mean[SELFCAL_TERMS_MAX];
+    float var[SELFCAL_TERMS_MAX];
+    float var_sq[SELFCAL_TERM_PAIRS];
 } selfcal_decay_t;
 
 typedef struct {
@@ -635,7 +638,7 @@ typedef struct {
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
-    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov: of each alpha node; else 0 */
+    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov and flicker: of each alpha node; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {
@@ -695,7 +698,7 @@ typedef struct {
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
-    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][3];                  /* sums of selfcal_decay_t over the nodes of each alpha */
+    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS]; /* sums of selfcal_decay_t over the nodes of each alpha */
 } selfcal_work_t;
 
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples; of a bank that forgets, the first step that looks at
@@ -720,7 +723,8 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
 /* The bias of the report's axis `elapsed_s` after the last bank interval (missing ones told by selfcal_skip() included) that the
  * report rests on, and its standard deviation, mixed over the hypotheses; both in the axis's unit. A reading less `bias` is the
  * corrected reading, at rest or moving. Under the constant law the bias stays; under the random walk its variance grows by
- * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2: exact moments of the
+ * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2, under flicker that of each term:
+ * exact moments of the
  * mixture over the nodes and sigma_v, as far as the report's own are. `model` is the bank's.
  * SELFCAL_BAD_ARGUMENT: null pointer, elapsed_s negative or not finite. O(alpha nodes). */
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd);

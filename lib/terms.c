@@ -24,14 +24,6 @@
 /* Products of s are so far from 0 and infinity that the next s cannot reach either. */
 #define PRODUCT_MAX 1e200
 
-#define LN_10 2.302585092994046
-#define PI 3.141592653589793
-
-/* Where (a, b), b <= a, lies in a lower half. */
-static inline size_t at(size_t a, size_t b) {
-    return a * (a + 1U) / 2U + b;
-}
-
 static size_t order_of(selfcal_law_t law) {
     return law == SELFCAL_FLICKER ? 3U : 2U;
 }
@@ -124,20 +116,20 @@ void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
     selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
     memset(node, 0, sizeof *node);
     if (law == SELFCAL_FLICKER) {
-        const selfcal_wide_t variance = square * LN_10 / PI; /* stationary, of each term */
+        const selfcal_wide_t variance = square * SELFCAL_FLICKER_TERM; /* stationary, of each term */
         selfcal_wide_t alpha_dt = 0.1 * exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s;
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++, alpha_dt *= 10.0) {
             node->beta[a] = (selfcal_real_t)-expm1(-fmin(alpha_dt, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
-            node->p[at(a, a)] = variance;
+            node->p[term_pair(a, a)] = variance;
         }
     } else {
         node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
         node->q[0] = (selfcal_real_t)square;
-        node->p[at(0, 0)] = square; /* x_0 = 0 */
+        node->p[term_pair(0, 0)] = square; /* x_0 = 0 */
         node->beta[1] = R(1.0);
-        node->p[at(1, 1)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
+        node->p[term_pair(1, 1)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
     }
 }
 
@@ -159,7 +151,7 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
     for (size_t a = 0; a < order; a++) {
         gain.kappa[a] = 0.0;
         for (size_t b = 0; b < order; b++) {
-            gain.kappa[a] += node->p[a >= b ? at(a, b) : at(b, a)];
+            gain.kappa[a] += node->p[a >= b ? term_pair(a, b) : term_pair(b, a)];
         }
         gain.s += gain.kappa[a];
     }
@@ -175,7 +167,7 @@ static bool step(selfcal_term_node_t *node, size_t order, selfcal_wide_t r, cons
     bool rests = true;
     for (size_t a = 0; a < order; a++) {
         for (size_t b = 0; b <= a; b++) {
-            selfcal_wide_t *p = &node->p[at(a, b)];
+            selfcal_wide_t *p = &node->p[term_pair(a, b)];
             const selfcal_wide_t before = *p;
             *p = phi_of(node, a) * phi_of(node, b) * before - gain->kappa[a] * gain->kappa[b] * gain->s;
             if (a == b) {
@@ -317,10 +309,10 @@ void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t a = 0; a < order; a++) {
         const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a], theta = (selfcal_wide_t)term->theta;
         for (size_t b = 0; b <= a; b++) {
-            term->p[at(a, b)] *= (1.0 - less[a]) * (1.0 - less[b]);
+            term->p[term_pair(a, b)] *= (1.0 - less[a]) * (1.0 - less[b]);
         }
-        term->p[at(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a]) : intervals * q;
-        term->p[at(a, a)] += a + 1U == order ? theta * theta * white_of(term) : 0.0;
+        term->p[term_pair(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a]) : intervals * q;
+        term->p[term_pair(a, a)] += a + 1U == order ? theta * theta * white_of(term) : 0.0;
     }
     for (size_t series = 0; series < series_of(self); series++) {
         selfcal_sum_t *x = states(self, at_node.index, series);
@@ -332,6 +324,10 @@ void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
 
 /* -------------------------------------------------------------------------------------------------------------- views */
 
+size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis) {
+    return 1U + columns_of(self) + axis;
+}
+
 /* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
 void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
     const term_t at_node = term_of(self, j);
@@ -339,6 +335,19 @@ void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
         const bool is_drift = a < at_node.order && term->beta[a] < R(1.0);
         drift[a] = is_drift ? sum_value(states(self, at_node.index, series)[a]) / phi_of(term, a) : 0.0;
+    }
+}
+
+void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
+    const term_t at_node = term_of(self, j);
+    const selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    memset(spread, 0, SELFCAL_TERM_PAIRS * sizeof spread[0]);
+    for (size_t a = 0; a < at_node.order; a++) {
+        for (size_t b = 0; b <= a && term->beta[a] < R(1.0); b++) {
+            /* P' = phi P(now) phi + Q */
+            const selfcal_wide_t p = term->p[term_pair(a, b)] - (a == b ? (selfcal_wide_t)term->q[a] : 0.0);
+            spread[term_pair(a, b)] = p / (phi_of(term, a) * phi_of(term, b));
+        }
     }
 }
 
@@ -356,17 +365,17 @@ void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, sel
     }
     selfcal_wide_t of_one[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
     selfcal_terms_drift(self, index, 0, of_one);
-    selfcal_terms_drift(self, index, 1U + columns_of(self) + axis, of_reading);
+    selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), of_reading);
     view->drift = 0.0;
     view->bias_left = 1.0;
     view->drift_var = 0.0;
-    for (size_t a = 0; a < at_node.order; a++) {
+    selfcal_wide_t spread[SELFCAL_TERM_PAIRS];
+    selfcal_terms_spread(self, index, spread);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
         view->drift += of_reading[a];
         view->bias_left -= of_one[a];
-        for (size_t b = 0; b <= a && term->beta[a] < R(1.0); b++) {
-            /* P' = phi P(now) phi + Q */
-            const selfcal_wide_t p = term->p[at(a, b)] - (a == b ? (selfcal_wide_t)term->q[a] : 0.0);
-            view->drift_var += (a == b ? 1.0 : 2.0) * p / (phi_of(term, a) * phi_of(term, b));
+        for (size_t b = 0; b <= a; b++) {
+            view->drift_var += (a == b ? 1.0 : 2.0) * spread[term_pair(a, b)];
         }
     }
 }
@@ -401,11 +410,11 @@ bool selfcal_terms_sound(const selfcal_t *self) {
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             if (!(node->beta[a] >= R(0.0)) || !(node->beta[a] <= R(1.0)) || !(node->q[a] >= R(0.0)) || !isfinite(node->q[a]) ||
-                !(node->p[at(a, a)] >= 0.0)) {
+                !(node->p[term_pair(a, a)] >= 0.0)) {
                 return false;
             }
         }
-        for (size_t a = 0; a < sizeof node->p / sizeof node->p[0]; a++) {
+        for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
             if (!isfinite(node->p[a])) {
                 return false;
             }

@@ -32,6 +32,8 @@ PLAIN = tuple(law for law in LAWS if law not in SUMS)
 NODES = (6, 16)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
+#: Limits of spectral_ratio: beyond, 1 + theta or 1 - theta is no longer a float.
+RATIOS = (1e-3, 1e3)
 #: Place of each parameter there; two share one where no law has both.
 PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3}
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
@@ -220,6 +222,8 @@ class _Reader:
             raise self.fail(where, f"unknown law '{law}' (log_uniform or uniform)")
         low = self.number(self.entry(fields, "min", where), f"{where}.min")
         high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
+        if where.endswith(".spectral_ratio") and not (RATIOS[0] <= low and high <= RATIOS[1]):
+            raise self.fail(where, f"must lie within {RATIOS[0]:g} to {RATIOS[1]:g}")
         return Prior(law, min=low, max=high)
 
     def group(self, name: str, tree: Any, laws: Collection[str]) -> Group:
