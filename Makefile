@@ -230,6 +230,8 @@ each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$fai
 check-gcc: $(MODEL)/selfcal_model.c
 	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
 	$(call each,gcc -std=c99 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) $(INCLUDES) -DSELFCAL_REAL_DOUBLE -c -o /dev/null,$(C_ALL))
+	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED=16 -c -o /dev/null,$(wildcard lib/*.c))
 
 check-clang: $(MODEL)/selfcal_model.c
 	$(call each,clang -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
@@ -255,7 +257,7 @@ TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 check-tidy: $(MODEL)/selfcal_model.c
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
-	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16)
+	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16 -DSELFCAL_TERMS_MAX=3)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
 

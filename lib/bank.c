@@ -106,8 +106,8 @@ static bool valid_model(const selfcal_model_t *model) {
             }
         }
 #endif
-        if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) || rho != (hypothesis->rho != NULL) ||
-            alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
+        if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) ||
+            rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
             (alpha && !valid_grid(hypothesis->alpha))) {
             return false;
         }
@@ -271,7 +271,8 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     const size_t regressors = model->regressors != NULL ? model->regressors->count : 0U;
 #if SELFCAL_TERMS_MAX > 1
     const size_t terms = selfcal_terms_nodes(model);
-    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) + SELFCAL_TERMS_SIZE(terms, model->axes, regressors);
+    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) +
+                          SELFCAL_TERMS_SIZE(terms, model->axes, regressors);
 #else
     const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors);
 #endif
@@ -592,7 +593,13 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
 #endif
     view->a = sum_value(node->a) + level_a(node);
     selfcal_wide_t x;
+#ifdef SELFCAL_FIXED
+    void (*const see)(const selfcal_t *, size_t, selfcal_wide_t *, selfcal_wide_t *, selfcal_wide_t *) =
+        self->columns != NULL ? self->model->regressors->code->view : selfcal_kernel_view;
+    see(self, k, &view->b, &view->c, &x);
+#else
     selfcal_kernel_view(self, k, &view->b, &view->c, &x);
+#endif
     view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
     /* The filter holds the prediction for the next interval, phi times the drift now. */
     view->drift = x / phi;

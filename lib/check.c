@@ -15,8 +15,13 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum, SELFCAL_TERMS_SIZE(1, 1, 2) - SELF
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
 SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72); /* 4 (p + 1) (p + 4) */
+#ifdef SELFCAL_FIXED
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 40); /* 8 p + 24 */
+#else
 SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
+#endif
 #endif
 
 /* Room for rounding in quantities that are bounded by 1 or by each other. */

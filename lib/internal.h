@@ -164,6 +164,10 @@ struct selfcal_regressors_code {
     /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);
+#ifdef SELFCAL_FIXED
+    /* selfcal_kernel_view(). */
+    void (*view)(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
+#endif
 };
 
 #if SELFCAL_TERMS_MAX > 1
@@ -180,6 +184,12 @@ static inline bool selfcal_is_term_node(const selfcal_node_t *node) {
 void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place);
 void selfcal_terms_run(selfcal_t *self, size_t j, const struct span *span);
 void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count);
+/* What of D has only been counted comes due. */
+void selfcal_terms_settle(selfcal_t *self, size_t j);
+#ifdef SELFCAL_FIXED
+/* selfcal_kernel_fade() of its own sums. */
+void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
+#endif
 /* All but the node's place. */
 void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 /* Covariance of the terms of the drift at the last interval, given x0, over sigma_v^2. */

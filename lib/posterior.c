@@ -432,7 +432,7 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     const selfcal_t *bank = work->bank;
     const selfcal_real_t z = (cell->ln_rho - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
     cell->off_grid = z < R(0.0) || z > (selfcal_real_t)(hypothesis->rho->nodes - 1U);
-    if (is_sum(hypothesis->law)) { /* of which there is none: beyond the last node the drift hides the white noise, sigma_v rho stays */
+    if (is_sum(hypothesis->law)) { /* without an expectation: up there the drift hides the white noise, sigma_v rho stays */
         const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
         cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
     }
@@ -909,7 +909,7 @@ static void step_bias(selfcal_work_t *work) {
                     const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
                     with_all += spread[pair];
                     if (b <= a) {
-                        decay[2 * SELFCAL_TERMS_MAX + pair] +=
+                        decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
                             own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
                             weighed_fall * now.drift[b];
                     }
@@ -936,7 +936,7 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
             posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias_weight);
         }
         for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
-            posterior->decay[j].var_sq[a] = (float)(decay[2 * SELFCAL_TERMS_MAX + a] / work->bias_weight);
+            posterior->decay[j].var_sq[a] = (float)(decay[(size_t)2 * SELFCAL_TERMS_MAX + a] / work->bias_weight);
         }
     }
 }

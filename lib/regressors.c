@@ -24,10 +24,6 @@ static size_t columns_of(const selfcal_t *self) {
 /* ------------------------------------------------------------------------------------------------------------ bank */
 
 static bool valid_regressors(const selfcal_model_t *model) {
-#ifdef SELFCAL_FIXED
-    (void)model; /* the integer kernels know no columns */
-    return false;
-#else
     const selfcal_regressors_t *regressors = model->regressors;
     if (regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
         regressors->coefficient_sd == NULL) {
@@ -44,7 +40,6 @@ static bool valid_regressors(const selfcal_model_t *model) {
         }
     }
     return true;
-#endif
 }
 
 /* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
@@ -56,24 +51,85 @@ static void init(selfcal_t *self, unsigned char *memory) {
     self->columns->a = (selfcal_sum_t *)(void *)(self->columns->column + p);
     self->columns->b = self->columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U);
     self->columns->x = self->columns->b + nodes * axes * p;
+#ifdef SELFCAL_FIXED
+    self->columns->reading = self->columns->x + nodes * (p + 1U);
+#else
     self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
+#endif
 }
+
+/* What a node keeps of the readings of an axis, `at` = node * axes + axis: sums B of "1" and C, and the predicted drift. */
+typedef struct {
+    selfcal_sum_t *b, *c;
+} reading_t;
+
+#ifdef SELFCAL_FIXED
+static reading_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_t sums = {&self->columns->reading[3U * at], &self->columns->reading[3U * at + 1U]};
+    return sums;
+}
+
+static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
+    return self->columns->reading[3U * at + 2U];
+}
+
+static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->columns->reading[3U * at + 2U] = x;
+}
+
+static void view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
+    const reading_t sums = reading_sums(self, k);
+    *b = sum_value(*sums.b);
+    *c = sum_value(*sums.c);
+    *x = sum_value(reading_drift(self, k));
+}
+#else
+static reading_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_t sums = {&self->b[at], &self->c[at]};
+    return sums;
+}
+
+static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
+    const selfcal_sum_t x = {self->x[at], self->columns->low[at]};
+    return x;
+}
+
+static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->x[at] = x.hi;
+    self->columns->low[at] = x.lo;
+}
+#endif
 
 static bool sound(const selfcal_t *self) {
     const size_t p = columns_of(self), nodes = self->model->nodes, cells = nodes * self->model->axes;
     const selfcal_columns_t *columns = self->columns;
+    const selfcal_sum_t *end = columns->x + nodes * (p + 1U);
     if (columns->column != (const void *)(columns + 1) || columns->a != (const void *)(columns->column + p) ||
-        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p ||
-        columns->low != (const void *)(columns->x + nodes * (p + 1U))) {
+        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p) {
         return false;
     }
-    for (const selfcal_sum_t *sum = columns->a; sum < columns->x + nodes * (p + 1U); sum++) {
-        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
+#ifdef SELFCAL_FIXED
+    if (columns->reading != end) {
+        return false;
+    }
+    end += 3U * cells;
+    for (size_t k = 0; k < cells; k++) {
+        if (!(reading_sums(self, k).c->hi >= R(0.0))) {
             return false;
         }
     }
+#else
+    if (columns->low != (const void *)end) {
+        return false;
+    }
     for (size_t k = 0; k < cells; k++) {
         if (!isfinite(columns->low[k])) {
+            return false;
+        }
+    }
+#endif
+    for (const selfcal_sum_t *sum = columns->a; sum < end; sum++) {
+        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
             return false;
         }
     }
@@ -145,18 +201,6 @@ void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innova
     sum_add(sum, product, rest);
 }
 
-#ifdef SELFCAL_FIXED
-/* The integer kernels know no columns: valid_regressors() lets none in. */
-static void run(selfcal_t *self, size_t j, const gains_t *gains) {
-    (void)self, (void)j, (void)gains;
-    SELFCAL_ASSERT(false);
-}
-
-static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
-    (void)self, (void)j, (void)less;
-    SELFCAL_ASSERT(false);
-}
-#else
 /* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What is rounded
  * off each step is a part of its change, and the change is small where the filter is slow. */
 static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x,
@@ -187,12 +231,10 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
-        selfcal_sum_t x = {self->x[at], self->columns->low[at]};
-        x = filter(self, j, gains, waiting(self)->y[at - j * axes], x, &reading);
-        self->x[at] = x.hi;
-        self->columns->low[at] = x.lo;
-        selfcal_add_products(&self->c[at], gains, &reading, &reading);
-        selfcal_add_products(&self->b[at], gains, &column[0], &reading);
+        const reading_t sums = reading_sums(self, at);
+        set_reading_drift(self, at, filter(self, j, gains, waiting(self)->y[at - j * axes], reading_drift(self, at), &reading));
+        selfcal_add_products(sums.c, gains, &reading, &reading);
+        selfcal_add_products(sums.b, gains, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
             selfcal_add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
         }
@@ -205,13 +247,9 @@ static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
         self->columns->x[k] = make_sum(sum_value(self->columns->x[k]) * (1.0 - less));
     }
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        const selfcal_sum_t x = {self->x[k], self->columns->low[k]};
-        const selfcal_sum_t left = make_sum(sum_value(x) * (1.0 - less));
-        self->x[k] = left.hi;
-        self->columns->low[k] = left.lo;
+        set_reading_drift(self, k, make_sum(sum_value(reading_drift(self, k)) * (1.0 - less)));
     }
 }
-#endif
 
 /* -------------------------------------------------------------------------------------------------- normal equations */
 
@@ -515,6 +553,11 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
+#ifdef SELFCAL_FIXED
+        const reading_t sums = reading_sums(self, at);
+        sum_fade(sums.b, part * part_of_one);
+        sum_fade(sums.c, self->keep);
+#endif
         for (size_t k = 0; k < p; k++) {
             sum_fade(&self->columns->b[at * p + k], part * of[k + 1U]);
         }
@@ -523,4 +566,7 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
     valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, fade, field, now, finish,
+#ifdef SELFCAL_FIXED
+    view,
+#endif
 };

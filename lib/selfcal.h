@@ -256,7 +256,8 @@ extern const selfcal_regressors_code_t selfcal_regressors_code;
 
 /* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step): each adds a constant
  * coefficient times its value to every reading, and every subset of them is a hypothesis of its own. The values come with
- * the samples, selfcal_push_with(); their unit is the application's. Not with SELFCAL_FIXED: SELFCAL_BAD_MODEL. */
+ * the samples, selfcal_push_with(); their unit is the application's. With SELFCAL_FIXED the bank then runs in software
+ * floating point. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code: only a model with regressors links what they take */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
@@ -384,19 +385,30 @@ typedef struct {
     selfcal_sum_t *a;    /* [nodes][rows]: for "1" and each regressor, sums of its innovation times those up to its own, over s */
     selfcal_sum_t *b;    /* [nodes][axes][regressors]: sum of its innovation times nu over s */
     selfcal_sum_t *x;    /* [nodes][1 + regressors]: predicted drift of the zero-bias filter over each column */
+#ifdef SELFCAL_FIXED
+    selfcal_sum_t *reading; /* [nodes][axes][3]: sums B of "1" and C, and x, of the readings: not in integers beside regressors */
+#else
     selfcal_real_t *low; /* [nodes][axes]: low part of x of the readings */
+#endif
 } selfcal_columns_t;
 
 /* Sums of the first p rows of A. */
 #define SELFCAL_REGRESSORS_ROWS(p) ((size_t)(p) * ((size_t)(p) + 1U) / 2U)
 
-/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per axis 8 p + 4. */
+#ifdef SELFCAL_FIXED
+#define SELFCAL_REGRESSORS_READING (3U * sizeof(selfcal_sum_t))
+#else
+#define SELFCAL_REGRESSORS_READING sizeof(selfcal_real_t)
+#endif
+
+/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per axis 8 p + 4;
+ * 8 p + 24 in the fixed-point one. */
 #define SELFCAL_REGRESSORS_SIZE(nodes, axes, p) \
     ((size_t)(p) == 0U ? (size_t)0U \
                        : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) + \
                              (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) * \
                                                     sizeof(selfcal_sum_t) + \
-                                                (size_t)(axes) * sizeof(selfcal_real_t)))
+                                                (size_t)(axes) * SELFCAL_REGRESSORS_READING))
 
 #if SELFCAL_TERMS_MAX > 1
 /* The gain side of a node of a sum, relative to sigma_v; states are scaled so that the reading is their sum and white noise. Private, as
@@ -486,7 +498,8 @@ typedef struct {
     selfcal_counters_t counters;
 } selfcal_t;
 
-/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE + SELFCAL_TERMS_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
+/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE + SELFCAL_TERMS_SIZE bytes, aligned to 8; both stay the caller's
+ * and must outlive the use).
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
@@ -587,8 +600,8 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 /* selfcal_save() writes this many bytes at a time, and the rest at last. */
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
-/* No snapshot of a model without regressors and sums is longer, with them by no more than SELFCAL_REGRESSORS_SIZE and SELFCAL_TERMS_SIZE: for a flash slot or a
- * buffer laid out by the compiler. */
+/* No snapshot of a model without regressors and sums is longer, with them by no more than SELFCAL_REGRESSORS_SIZE and
+ * SELFCAL_TERMS_SIZE: for a flash slot or a buffer laid out by the compiler. */
 #define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
 
 /* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. */
@@ -698,7 +711,8 @@ typedef struct {
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
-    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS]; /* sums of selfcal_decay_t over the nodes of each alpha */
+    /* sums of selfcal_decay_t over the nodes of each alpha */
+    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_work_t;
 
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples; of a bank that forgets, the first step that looks at

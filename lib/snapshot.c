@@ -190,12 +190,13 @@ static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
 #if SELFCAL_TERMS_MAX > 1
 static const field_t term_fields[] = {TERM_FIELDS(ROW)};
 #endif
-static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
+static const field_t sum_fields[] = {{0, 2, KIND_REAL}};
 #ifdef SELFCAL_FIXED
 static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
 static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
 #else
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
+static const field_t real_fields[] = {{0, 1, KIND_REAL}};
 #endif
 
 /* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
@@ -312,7 +313,11 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
         {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
         {sum_fields, 1, more ? columns->x : NULL, used * nodes * (p + 1U), sizeof *columns->x},
+#ifdef SELFCAL_FIXED
+        {sum_fields, 1, more ? columns->reading : NULL, 3U * used * cells, sizeof *columns->reading},
+#else
         {real_fields, 1, more ? columns->low : NULL, used * cells, sizeof *columns->low},
+#endif
 #if SELFCAL_TERMS_MAX > 1
         {term_fields, LENGTH(term_fields), sum ? terms->node : NULL, sums, sizeof *terms->node},
         {sum_fields, 1, sum ? terms->x : NULL, sums * (1U + p + model->axes) * SELFCAL_TERMS_MAX, sizeof *terms->x},

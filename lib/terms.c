@@ -118,11 +118,12 @@ void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
     if (law == SELFCAL_FLICKER) {
         const selfcal_wide_t variance = square * SELFCAL_FLICKER_TERM; /* stationary, of each term */
         selfcal_wide_t alpha_dt = 0.1 * exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s;
-        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++, alpha_dt *= 10.0) {
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             node->beta[a] = (selfcal_real_t)-expm1(-fmin(alpha_dt, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
             node->p[term_pair(a, a)] = variance;
+            alpha_dt *= 10.0;
         }
     } else {
         node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
@@ -183,14 +184,28 @@ static bool step(selfcal_term_node_t *node, size_t order, selfcal_wide_t r, cons
 }
 
 /* The constant s of a converged node goes into D with the count of its samples. */
-static void leave_steady(selfcal_node_t *node, selfcal_term_node_t *term, size_t order) {
+static void settle(selfcal_node_t *node, const selfcal_term_node_t *term, size_t order) {
     if (term->steady) {
         const selfcal_sum_t ln_s = make_sum((selfcal_wide_t)node->steady * log(gain_of(term, order, 1.0).s));
         sum_add(&node->ln_s, ln_s.hi, ln_s.lo);
         node->steady = 0;
-        term->steady = false;
     }
 }
+
+void selfcal_terms_settle(selfcal_t *self, size_t j) {
+    const term_t term = term_of(self, j);
+    settle(&self->node[j], &self->terms->node[term.index], term.order);
+}
+
+#ifdef SELFCAL_FIXED
+void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+    for (size_t axis = 0; axis < self->model->axes; axis++) {
+        const reading_sums_t sums = reading_sums(self, j, term_of(self, j).index, axis);
+        sum_fade(sums.b, keep_b);
+        sum_fade(sums.c, keep_c);
+    }
+}
+#endif
 
 static void gains_steady(const selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
     const gain_t gain = gain_of(term, order, 1.0);
@@ -204,7 +219,8 @@ static void gains_steady(const selfcal_term_node_t *term, size_t order, term_gai
 }
 
 /* What the rounding of 1/s loses on the mean of the span goes into the scale, as in bank.c. */
-static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
+static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term, size_t order,
+                          term_gains_t *gains) {
     const span_t span = gains->sums.span;
     selfcal_wide_t product = 1.0, ln_s = 0.0, short_of = 0.0;
     bool rests = false;
@@ -272,7 +288,7 @@ void selfcal_terms_run(selfcal_t *self, size_t j, const span_t *span) {
         gains_steady(term, order, &gains);
         node->steady += span->to - span->from;
     } else {
-        leave_steady(node, term, order);
+        settle(node, term, order);
         gains_varying(batch, node, term, order, &gains);
     }
     innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
@@ -301,7 +317,8 @@ void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
     const size_t order = at_node.order;
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
     selfcal_term_node_t *term = &self->terms->node[at_node.index];
-    leave_steady(&self->node[j], term, order);
+    settle(&self->node[j], term, order);
+    term->steady = false;
     selfcal_wide_t less[SELFCAL_TERMS_MAX]; /* 1 - phi^count */
     for (size_t a = 0; a < order; a++) {
         less[a] = term->beta[a] < R(1.0) ? -expm1(intervals * log1p(-(selfcal_wide_t)term->beta[a])) : 1.0;

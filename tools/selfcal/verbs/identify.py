@@ -150,8 +150,6 @@ def identify_axis(
         raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
-    if engine == "fixed" and regressors:
-        raise UserError("the fixed-point bank knows no regressors: take --engine library, or a model without them")
     choices = choices_of(regressors)
     results: list[AxisResult] = []
     z = blocks.z - np.array([column.reference for column in tables.regressors])
