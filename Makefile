@@ -89,7 +89,7 @@ soak: setup
 # Each line that the tests print is a row: what, its errors. SELFCAL_DRAWS and SELFCAL_LENGTHS widen the report's.
 tolerances: setup
 	$(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_bank.py tests/py/test_report.py \
-	    tests/py/test_regressors.py tests/py/test_long.py tests/py/test_identify.py -k "not two_rates"
+	    tests/py/test_regressors.py tests/py/test_sums.py tests/py/test_long.py tests/py/test_identify.py -k "not two_rates"
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty

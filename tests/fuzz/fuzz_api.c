@@ -255,8 +255,8 @@ static void equal_banks(const bank_t *one, const bank_t *two) {
     HOLDS(memcmp(one->memory, two->memory, SELFCAL_SIZE(model.nodes, model.axes)) == 0);
     if (model.regressors != NULL) {
         const uint8_t *a = (const void *)one->self.columns->column, *b = (const void *)two->self.columns->column;
-        const size_t cells = (size_t)model.nodes * model.axes;
-        HOLDS(memcmp(a, b, (size_t)((const uint8_t *)(one->self.columns->low + cells) - a)) == 0);
+        const size_t all = SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U - sizeof(selfcal_columns_t);
+        HOLDS(memcmp(a, b, all) == 0);
     }
 #if SELFCAL_TERMS_MAX > 1
     if (one->self.terms != NULL) {

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +20,14 @@ from test_forgetting import weights
 from selfcal import _reference
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import identify_axis
+from selfcal.errors import UserError
 from selfcal.model import DEFAULT, LAWS, SUMS, Model
 from selfcal.tables import RegressorTable, Tables, make_grid, make_tables
+from selfcal.verbs.codegen import codegen
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.verbs.replay import replay
 
-from conftest import worst_difference
+from conftest import ROOT, worst_difference
 
 LN_P_DOUBLE, PROBABILITY_DOUBLE = 1e-3, 1e-6
 #: |dP| and |d mean| / sd of each build.
@@ -329,3 +334,43 @@ def test_the_reference_engine_answers_alike(law: str) -> None:
     assert sd <= 0.03
     assert ours.bias_mean == pytest.approx(theirs.bias_mean, abs=0.05 * theirs.bias_sd)
     assert ours.bias_sd == pytest.approx(theirs.bias_sd, rel=0.03)
+
+
+# ----------------------------------------------------------------------------------------------------- model and tables
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("      B: {law: log_uniform, min: 5.0e-4, max: 0.5}\n", "", "groups.gyro.priors: 'B' is missing"),
+        ("min: 0.2, max: 5.0", "min: 1.0e-4, max: 5.0", "spectral_ratio: must lie within 0.001 to 1000"),
+        (", moving_average: [16, 12]", "", "nodes.host: 'moving_average' is missing"),
+        ("flicker: [16, 16]", "flicker: 16", "nodes.host.flicker: must be [rho nodes, alpha nodes]"),
+        ("moving_average: [16, 12]", "moving_average: [16, 4]", "must be a whole number from 6 to 16, not 4"),
+    ],
+)
+def test_a_model_file_that_does_not_fit(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    text = MODEL.path.read_text()
+    assert old in text
+    path = tmp_path / "model.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(UserError) as error:
+        Model.load(path)
+    assert complaint in str(error.value)
+
+
+def test_tables_for_the_firmware_compile_with_the_macro_alone(tmp_path: Path) -> None:
+    """Warnings are errors, as `make check` has them; without SELFCAL_TERMS_MAX one clear #error."""
+    codegen(MODEL.path, tmp_path)
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-DSELFCAL_HYPOTHESES_MAX=5"]
+    files = ["-c", str(tmp_path / "selfcal_model.c"), "-o", str(tmp_path / "model.o")]
+    command = ["cc", *flags, f"-I{ROOT / 'lib'}", *files]
+    assert subprocess.run([*command, "-DSELFCAL_TERMS_MAX=3"], check=False).returncode == 0
+    refused = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert refused.returncode != 0
+    assert "set SELFCAL_TERMS_MAX to 3" in refused.stderr
+
+
+def test_the_firmware_does_not_take_them() -> None:
+    with pytest.raises(UserError, match="telemetry has no items for flicker and moving_average"):
+        replay(ROOT / "tests" / "data" / "simulated_adis16405.npz", model=MODEL.path)
