@@ -89,7 +89,7 @@ soak: setup
 # Each line that the tests print is a row: what, its errors. SELFCAL_DRAWS and SELFCAL_LENGTHS widen the report's.
 tolerances: setup
 	$(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_bank.py tests/py/test_report.py \
-	    tests/py/test_regressors.py tests/py/test_long.py tests/py/test_identify.py tests/py/test_math.py -k "not two_rates"
+	    tests/py/test_regressors.py tests/py/test_sums.py tests/py/test_long.py tests/py/test_identify.py tests/py/test_math.py -k "not two_rates"
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
@@ -128,7 +128,7 @@ $(eval $(call C_TESTS,fixed32))
 .PHONY: fuzz
 KERNEL ?= float
 FUZZ := $(BUILD)/fuzz/$(KERNEL)
-FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_GRID_MAX=6 -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 \
+FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_TERMS_MAX=3 -DSELFCAL_HYPOTHESES_MAX=5 -DSELFCAL_GRID_MAX=6 -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 \
               -DSELFCAL_SIGMA_CELLS=8 -DSELFCAL_HISTOGRAM=32 -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
 RUNS ?= 10000000
 
@@ -233,6 +233,8 @@ each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$fai
 check-gcc: $(MODEL)/selfcal_model.c
 	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
 	$(call each,gcc -std=c99 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) $(INCLUDES) -DSELFCAL_REAL_DOUBLE -c -o /dev/null,$(C_ALL))
+	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED=16 -c -o /dev/null,$(wildcard lib/*.c))
 
 check-clang: $(MODEL)/selfcal_model.c
 	$(call each,clang -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
@@ -258,7 +260,7 @@ TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 check-tidy: $(MODEL)/selfcal_model.c
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
-	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16)
+	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16 -DSELFCAL_TERMS_MAX=3)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
 

@@ -14,7 +14,7 @@ namespace {
 constexpr double pi = 3.14159265358979323846;
 
 // What a stream of random numbers is for. Axis streams are numbered axis * 16 + purpose.
-enum Purpose : std::uint64_t { white, drift, flicker, outliers, motion, temperature, supply, missing, intervals };
+enum Purpose : std::uint64_t { white, drift, flicker, outliers, motion, temperature, supply, missing, intervals, earlier };
 
 Random stream(std::uint64_t seed, std::size_t axis, Purpose purpose) { return Random(seed, axis * 16 + purpose); }
 
@@ -163,14 +163,30 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
     const double dt_s = 1.0 / scene.rate_hz;
     Random random = stream(scene.seed, index, drift);
     std::vector<double> out(scene.samples, 0.0);
-    if (axis.law == Law::random_walk) {
+    if (axis.law == Law::random_walk || axis.law == Law::moving_average) {
         double x = 0.0;
         std::generate(out.begin(), out.end(), [&] { return x += axis.K * std::sqrt(dt_s) * random.normal(); });
     } else if (axis.law == Law::gauss_markov) {
         GaussMarkov x(axis.sigma_m, axis.alpha, dt_s, random);
         std::generate(out.begin(), out.end(), [&] { return x.next(); });
+    } else if (axis.law == Law::flicker) {
+        for (const double factor : {0.1, 1.0, 10.0}) {
+            GaussMarkov x(axis.B * std::sqrt(std::log(10.0) / pi), factor * axis.alpha, dt_s, random);
+            for (double &value : out) {
+                value += x.next();
+            }
+        }
     }
     return out;
+}
+
+// White noise e becomes (e_i + theta e_(i - block)) / (1 + theta): so the means of `block` samples are a moving average of theirs.
+void average(std::vector<double> &noise, double spectral_ratio, double sd, std::size_t block, Random random) {
+    const double theta = (spectral_ratio - 1.0) / (spectral_ratio + 1.0);
+    for (std::size_t i = noise.size(); i-- > 0;) {
+        const double before = i >= block ? noise[i - block] : sd * random.normal();
+        noise[i] = (noise[i] + theta * before) / (1.0 + theta);
+    }
 }
 
 // Adds everything of one axis but what comes from other channels and the read-out.
@@ -180,6 +196,9 @@ void add_noise_and_effects(const Scene &scene, std::size_t index, const Axis &ax
     std::vector<double> noise = white_noise(scene, stream(scene.seed, index, white));
     if (axis.noise_lag1 != 0.0) {
         colour(noise, axis.noise_lag1);
+    }
+    if (axis.law == Law::moving_average) {
+        average(noise, axis.spectral_ratio, std::sqrt(scene.rate_hz), scene.bank_block, stream(scene.seed, index, earlier));
     }
     Random outlier = stream(scene.seed, index, outliers);
     Random shake = stream(scene.seed, index, motion);

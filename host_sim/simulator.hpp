@@ -22,7 +22,9 @@ struct Axis {
     double N = 0.0;       // unit/sqrt(Hz)
     double K = 0.0;       // unit/s/sqrt(Hz), random walk
     double sigma_m = 0.0; // unit, Gauss-Markov
-    double alpha = 0.0;   // 1/s, Gauss-Markov
+    double alpha = 0.0;   // 1/s, Gauss-Markov and flicker
+    double B = 0.0;       // unit, flicker: the law of three terms, not the effect below
+    double spectral_ratio = 1.0; // moving average
     double range = 0.0;   // unit, readings are clipped to +-range; 0: none
     double lsb = 0.0;     // unit, readings are whole multiples of it; 0: none
 
@@ -49,6 +51,7 @@ struct Scene {
     std::size_t samples = 0;
     std::size_t block = 1;       // sensor samples per recorded one
     std::size_t filter_taps = 1; // of each boxcar
+    std::size_t bank_block = 1;  // recorded samples a bank interval, whose means a moving average is stated of
     std::size_t missing = 0;     // missing_samples: dropped in runs of 1 to 20, never the first or the last
     std::size_t motion_intervals = 0; // motion: this many, 2 to 10 s long
 };

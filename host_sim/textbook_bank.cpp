@@ -18,7 +18,8 @@ constexpr double pi = 3.14159265358979323846;
 struct Drift {
     Eigen::MatrixXd transition, step, start;
     Eigen::RowVectorXd output, level;
-    double white; // variance of the white noise beside it
+    double white;            // variance of the white noise beside it
+    double innovation = 0.0; // of the state 1, times r_i, in place of that: variance of a moving average's e_i
 };
 
 Drift drift_of(const Node &node, double dt_s) {
@@ -34,6 +35,7 @@ Drift drift_of(const Node &node, double dt_s) {
         drift.start(i, i) = deviation * deviation;
         drift.step(i, i) = -deviation * deviation * std::expm1(-2.0 * alpha * dt_s);
     };
+    double theta = 0.0;
     switch (node.law) {
     case Law::constant:
         break;
@@ -49,10 +51,12 @@ Drift drift_of(const Node &node, double dt_s) {
         }
         break;
     case Law::moving_average:
-        drift.transition << 0.0, 0.0, 1.0, 0.0;
-        drift.step(0, 0) = drift.start(0, 0) = drift.white;
-        drift.output << 1.0, node.drift;
-        drift.level.setZero();
+        random_walk(0, node.drift);
+        drift.transition.bottomRightCorner(2, 2) << 0.0, 0.0, 1.0, 0.0; // e_i is new, e_(i-1) was e_i
+        drift.start(1, 1) = drift.innovation = drift.white;
+        theta = (node.alpha - 1.0) / (node.alpha + 1.0);
+        drift.output << 1.0, 1.0 / (1.0 + theta), theta / (1.0 + theta);
+        drift.level << 1.0, 0.0, 0.0;
         drift.white = 0.0;
         break;
     case Law::walk_and_markov:
@@ -76,6 +80,7 @@ template <int size> class Filter {
         const Eigen::Index bias = drift.output.size();
         const Eigen::Index n = bias + 1 + static_cast<Eigen::Index>(record.regressors);
         r_ = drift.white;
+        innovation_ = drift.innovation;
         transition_ = Square::Identity(n, n);
         transition_.topLeftCorner(bias, bias) = drift.transition;
         step_ = Square::Zero(n, n);
@@ -98,8 +103,13 @@ template <int size> class Filter {
 
     // Sample i of the record. Returns nu / sqrt(s), NaN where it is missing.
     double sample(std::size_t i) {
+        const bool missing = std::isnan(record_.y[i]);
+        const double r = record_.r == nullptr || missing ? 1.0 : record_.r[i];
+        if (innovation_ > 0.0) {
+            step_(1, 1) = r * innovation_;
+        }
         predict();
-        if (std::isnan(record_.y[i])) {
+        if (missing) {
             return nan;
         }
         const Eigen::Index first = h_.size() - static_cast<Eigen::Index>(record_.regressors);
@@ -107,7 +117,7 @@ template <int size> class Filter {
             const Eigen::Index at = first + static_cast<Eigen::Index>(k);
             h_(at) = now_(at) = record_.z[i * record_.regressors + k];
         }
-        return update(record_.y[i], record_.r == nullptr ? 1.0 : record_.r[i]);
+        return update(record_.y[i], r);
     }
 
     Filtered state() const { return {ln_p_, mean_, covariance_, now_ * mean_, now_ * covariance_ * now_.transpose()}; }
@@ -132,7 +142,7 @@ template <int size> class Filter {
     }
 
     const Record &record_;
-    double r_;
+    double r_, innovation_;
     double ln_p_ = 0.0;
     Square transition_, step_, covariance_;
     Vector mean_;
@@ -203,8 +213,8 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
 std::size_t order(Law law) {
     switch (law) {
     case Law::flicker:
-        return 3;
     case Law::moving_average:
+        return 3;
     case Law::walk_and_markov:
         return 2;
     default:

@@ -23,7 +23,8 @@ namespace selfcal_reference {
 //   flicker: three Gauss-Markov terms of one deviation, bandwidths alpha/10, alpha and 10 alpha. With the deviation
 //     B sqrt(ln 10 / pi) their two-sided spectrum is B^2 / (2 pi f) within 12 % for f from alpha/10 to 10 alpha over 2 pi,
 //     2.3 % above it in the middle; the Allan deviation of such noise is 0.664 B (sqrt(2 ln 2 / pi)).
-//   moving_average: white noise e_i + theta e_(i-1), e_i ~ N(0, sigma_v^2), instead of v_i; x_i = 0. Takes no factors r.
+//   moving_average: x_i as under random_walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, r_i sigma_v^2) (r = 1
+//     where a sample is missing). Stated by (1 + theta) / (1 - theta), the spectrum's amplitude at 0 Hz over that at 1/(2 dt).
 //   walk_and_markov: the sum of the laws 1 and 2.
 enum class Law { constant = 0, random_walk = 1, gauss_markov = 2, flicker = 3, moving_average = 4, walk_and_markov = 5 };
 constexpr std::size_t laws = 6;
@@ -33,13 +34,13 @@ constexpr std::size_t regressors_max = 6;
 // One value theta^kj of the parameters of hypothesis k.
 struct Node {
     Law law;
-    double drift;   // random walk: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; flicker: B, unit; moving average: theta
-    double alpha;   // Gauss-Markov and flicker, 1/s
+    double drift;   // random walk and moving average: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; flicker: B, unit
+    double alpha;   // Gauss-Markov and flicker, 1/s; moving average: the ratio of amplitudes
     double sigma_v; // unit, per sample
     double walk = 0.0; // K beside Gauss-Markov, unit/s/sqrt(Hz)
 };
 
-// States of x_i: 1 but for flicker (3), moving average (2: e_i, e_(i-1)) and walk and Markov (2).
+// States of x_i: 1 but for flicker (3), moving average (3: the walk, e_i, e_(i-1)) and walk and Markov (2).
 std::size_t order(Law law);
 
 // One axis of a recording. A sample that is NaN is missing: the filter predicts over it.

@@ -35,8 +35,20 @@
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
+/* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
+#define LN_RATIO_MAX 6.91F
+
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
+}
+
+static bool valid_priors(const selfcal_prior_t prior[], size_t axes) {
+    for (size_t p = 0; p < axes * SELFCAL_PARAMETERS; p++) {
+        if (!valid_prior(&prior[p])) {
+            return false;
+        }
+    }
+    return true;
 }
 
 static bool valid_grid(const selfcal_grid_t *grid) {
@@ -71,12 +83,7 @@ static bool valid_model(const selfcal_model_t *model) {
         return false;
     }
     for (uint8_t a = 0; a < model->axes; a++) {
-        for (int p = 0; p < SELFCAL_PARAMETERS; p++) {
-            if (!valid_prior(&model->axis[a].prior[p])) {
-                return false;
-            }
-        }
-        if (!(model->axis[a].bias_sd > 0.0F) || !isfinite(model->axis[a].bias_sd)) {
+        if (!valid_priors(model->axis[a].prior, 1) || !(model->axis[a].bias_sd > 0.0F) || !isfinite(model->axis[a].bias_sd)) {
             return false;
         }
     }
@@ -84,9 +91,20 @@ static bool valid_model(const selfcal_model_t *model) {
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
         const bool rho = hypothesis->law != SELFCAL_CONSTANT;
-        const bool alpha = hypothesis->law == SELFCAL_GAUSS_MARKOV;
-        if ((unsigned)hypothesis->law >= SELFCAL_LAWS || rho != (hypothesis->rho != NULL) ||
-            alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
+        const bool alpha = has_alpha(hypothesis->law);
+#if SELFCAL_TERMS_MAX > 1
+        if (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes)) {
+            return false;
+        }
+        for (uint8_t a = 0; hypothesis->law == SELFCAL_MOVING_AVERAGE && a < model->axes; a++) {
+            const selfcal_prior_t *ratio = &priors_of(model, hypothesis, a)[SELFCAL_SPECTRAL_RATIO];
+            if (ratio->ln_min < -LN_RATIO_MAX || ratio->ln_max > LN_RATIO_MAX) {
+                return false;
+            }
+        }
+#endif
+        if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) ||
+            rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
             (alpha && !valid_grid(hypothesis->alpha)) || hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
             return false;
         }
@@ -101,6 +119,13 @@ static void init_node(selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
     selfcal_node_t *node = &self->node[index];
+#if SELFCAL_TERMS_MAX > 1
+    if (is_sum(law)) {
+        memset(node, 0, sizeof *node);
+        selfcal_terms_start(self, index, place);
+        return;
+    }
+#endif
     const selfcal_wide_t variance = law != SELFCAL_CONSTANT ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
     selfcal_wide_t beta = 0.0;
     if (law == SELFCAL_GAUSS_MARKOV) {
@@ -175,6 +200,12 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     return range;
 }
 
+/* ln of sqrt(E D_i^2 / 2) over sigma_v for a moving average: E D_i^2 / 2 = sigma_v^2 (1 - theta + theta^2) / (1 + theta)^2, which in
+ * the spectral ratio is sigma_v^2 (1 + 3 / ratio^2) / 4. */
+static inline selfcal_real_t ln_difference_gain(selfcal_real_t ln_ratio) {
+    return R(0.5) * r_log(r_fma(R(0.75), r_exp(R(-2.0) * ln_ratio), R(0.25)));
+}
+
 /* Places the rho nodes of every hypothesis for the axes' white noise. */
 static void place_nodes(selfcal_t *self) {
     const selfcal_model_t *model = self->model;
@@ -193,13 +224,18 @@ static void place_nodes(selfcal_t *self) {
             if (selfcal_retired(self, axis)) {
                 continue; /* dead before the first batch: it must not draw the nodes away from the others */
             }
-            const selfcal_prior_t *prior = model->axis[axis].prior;
-            const bool markov = hypothesis->law == SELFCAL_GAUSS_MARKOV;
+            const selfcal_prior_t *prior = priors_of(model, hypothesis, axis);
+            const bool markov = has_deviation(hypothesis->law);
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
-            rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - sigma[axis].hi - R(0.5));
-            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - sigma[axis].lo + R(0.5));
+            ln_range_t ln_sigma = sigma[axis];
+            if (is_sum(hypothesis->law) && hypothesis->law == SELFCAL_MOVING_AVERAGE) {
+                ln_sigma.hi -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_max);
+                ln_sigma.lo -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_min);
+            }
+            rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - ln_sigma.hi - R(0.5));
+            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - ln_sigma.lo + R(0.5));
             alpha_lo = r_fmin(alpha_lo, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min);
             alpha_hi = r_fmax(alpha_hi, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max);
         }
@@ -230,7 +266,13 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     }
     const size_t used = SELFCAL_SIZE(model->nodes, model->axes);
     const size_t regressors = model->regressors != NULL ? model->regressors->count : 0U;
+#if SELFCAL_TERMS_MAX > 1
+    const size_t terms = selfcal_terms_nodes(model);
+    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) +
+                          SELFCAL_TERMS_SIZE(terms, model->axes, regressors);
+#else
     const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors);
+#endif
     if (size < needed || ((uintptr_t)memory & 7U) != 0U) {
         return SELFCAL_BAD_MEMORY;
     }
@@ -247,6 +289,11 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     if (regressors > 0U) {
         model->regressors->code->init(self, (unsigned char *)memory + used);
     }
+#if SELFCAL_TERMS_MAX > 1
+    if (terms > 0U) {
+        selfcal_terms_init(self, (unsigned char *)memory + used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors));
+    }
+#endif
     selfcal_bank_pace(self, model->block);
     return SELFCAL_OK;
 }
@@ -344,6 +391,12 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     for (size_t i = from; i < to; i++) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
+#if SELFCAL_TERMS_MAX > 1
+        if (selfcal_is_term_node(node)) {
+            selfcal_terms_run(self, j, &span);
+            continue;
+        }
+#endif
         if (whole && node->level) {
             node->steady += span.to - span.from;
             continue;
@@ -377,6 +430,12 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     for (size_t i = from; i < to; i++) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
+#if SELFCAL_TERMS_MAX > 1
+        if (selfcal_is_term_node(node)) {
+            selfcal_terms_gap(self, j, count);
+            continue;
+        }
+#endif
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
@@ -523,9 +582,21 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
     view->law = self->model->hypothesis[place.hypothesis].law;
     view->ln_rho = (selfcal_wide_t)place.ln_rho;
     view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
+#if SELFCAL_TERMS_MAX > 1
+    if (is_sum(view->law)) {
+        selfcal_terms_view(self, axis, index, view);
+        return;
+    }
+#endif
     view->a = sum_value(node->a) + level_a(node);
     selfcal_wide_t x;
+#ifdef SELFCAL_FIXED
+    void (*const see)(const selfcal_t *, size_t, selfcal_wide_t *, selfcal_wide_t *, selfcal_wide_t *) =
+        self->columns != NULL ? self->model->regressors->code->view : selfcal_kernel_view;
+    see(self, k, &view->b, &view->c, &x);
+#else
     selfcal_kernel_view(self, k, &view->b, &view->c, &x);
+#endif
     view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
     /* The filter holds the prediction for the next interval, phi times the drift now. */
     view->drift = x / phi;

@@ -7,12 +7,21 @@ SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 72);
 #elif !defined(SELFCAL_REAL_DOUBLE)
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
 #endif
+#if SELFCAL_TERMS_MAX > 1 && !defined(SELFCAL_REAL_DOUBLE) && !defined(SELFCAL_FIXED)
+SELFCAL_STATIC_ASSERT(bytes_a_node_of_a_sum, SELFCAL_TERMS_SIZE(2, 0, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 104 + 24 * 2);
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum, SELFCAL_TERMS_SIZE(1, 1, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 24);
+#endif
 #ifndef SELFCAL_REAL_DOUBLE
 SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
 SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72); /* 4 (p + 1) (p + 4) */
+#ifdef SELFCAL_FIXED
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
+                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 40); /* 8 p + 24 */
+#else
 SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
                       SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
+#endif
 #endif
 
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
@@ -186,6 +195,16 @@ static bool regressors_are_sound(const selfcal_t *self) {
     return (self->columns == NULL) == (regressors == NULL) && (regressors == NULL || regressors->code->sound(self));
 }
 
+/* Likewise of the laws that are sums. */
+static bool terms_are_sound(const selfcal_t *self) {
+#if SELFCAL_TERMS_MAX > 1
+    return (self->terms == NULL) == (selfcal_terms_nodes(self->model) == 0U) && (self->terms == NULL || selfcal_terms_sound(self));
+#else
+    (void)self;
+    return true;
+#endif
+}
+
 static bool node_is_sound(const selfcal_t *self, size_t j) {
     const selfcal_node_t *node = &self->node[j];
     /* the kernels choose which nodes run first */
@@ -221,7 +240,7 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
-        !regressors_are_sound(self)) {
+        !regressors_are_sound(self) || !terms_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     if (self->n > 0U && !grid_is_sound(self)) {

@@ -7,17 +7,27 @@ typedef struct {
 
 static moments_t predict_law(selfcal_law_t law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
     moments_t now = {(selfcal_real_t)posterior->bias_mean, (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
-    if (law == SELFCAL_RANDOM_WALK) {
+    if (has_walk(law)) {
         const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
         const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
         now.var = r_fma(r_fma(mean, mean, sd * sd), elapsed_s, now.var);
-    } else if (law == SELFCAL_GAUSS_MARKOV) {
+    } else if (has_deviation(law)) {
         selfcal_real_t fall = R(0.0), growth = R(0.0);
         for (unsigned j = 0; j < SELFCAL_GRID_MAX; j++) {
             const selfcal_decay_t *decay = &posterior->decay[j];
-            const selfcal_real_t psi = -r_expm1(-(selfcal_real_t)decay->alpha * elapsed_s);
-            fall = r_fma(psi, (selfcal_real_t)decay->mean, fall);
-            growth = r_fma(psi, r_fma(psi, (selfcal_real_t)decay->var[1], (selfcal_real_t)decay->var[0]), growth);
+            selfcal_real_t psi[SELFCAL_TERMS_MAX];
+            for (unsigned a = 0; a < SELFCAL_TERMS_MAX; a++) { /* of terms that a law has not, all else is 0 */
+                static const selfcal_real_t faster[] = {R(0.1), R(1.0), R(10.0)};
+                const selfcal_real_t alpha = (selfcal_real_t)decay->alpha * (is_sum(law) ? faster[a] : R(1.0));
+                psi[a] = -r_expm1(-alpha * elapsed_s);
+                fall = r_fma(psi[a], (selfcal_real_t)decay->mean[a], fall);
+                selfcal_real_t with = (selfcal_real_t)decay->var[a];
+                for (unsigned b = 0; b <= a; b++) {
+                    const selfcal_real_t both = (selfcal_real_t)decay->var_sq[term_pair(a, b)];
+                    with = r_fma(b < a ? R(2.0) * psi[b] : psi[b], both, with);
+                }
+                growth = r_fma(psi[a], with, growth);
+            }
         }
         now.mean -= fall;
         now.var = r_fmax(now.var + r_fma(-fall, fall, growth), R(0.0));

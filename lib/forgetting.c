@@ -20,6 +20,11 @@ static selfcal_wide_t part_kept(selfcal_t *self) {
  * the sums remain those of some record (positive definite). */
 static void fade(selfcal_t *self, size_t j) {
     selfcal_node_t *node = &self->node[j];
+#if SELFCAL_TERMS_MAX > 1
+    if (selfcal_is_term_node(node)) {
+        selfcal_terms_settle(self, j);
+    }
+#endif
     const selfcal_wide_t a = sum_value(node->a) + level_a(node), part = sqrt(self->keep);
     const selfcal_wide_t part_of_one = self->keep * a > SELFCAL_KEPT_MIN ? part : 1.0;
     node->a = make_sum(part_of_one * part_of_one * a);
@@ -27,6 +32,11 @@ static void fade(selfcal_t *self, size_t j) {
     node->steady = 0;
     node->level_from = 0;
     selfcal_kernel_fade(self, j, part * part_of_one, self->keep);
+#if SELFCAL_TERMS_MAX > 1 && defined(SELFCAL_FIXED)
+    if (selfcal_is_term_node(node)) {
+        selfcal_terms_fade(self, j, part * part_of_one, self->keep);
+    }
+#endif
     if (self->columns != NULL) {
         self->model->regressors->code->fade(self, j, part, part_of_one);
     }

@@ -81,6 +81,41 @@ static inline int32_t to_fixed(float value, int shift) {
 /* C99 has no _Static_assert. `name` says what holds. */
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
 
+/* Where a pair (a, b) of terms, b <= a, lies. */
+static inline size_t term_pair(size_t a, size_t b) {
+    return a * (a + 1U) / 2U + b;
+}
+
+/* What the laws have. */
+static inline bool is_sum(selfcal_law_t law) {
+    return SELFCAL_TERMS_MAX > 1 && law >= SELFCAL_FLICKER;
+}
+
+/* A deviation goes with rho, sigma_m or B; else K, if anything. */
+static inline bool has_deviation(selfcal_law_t law) {
+    return law == SELFCAL_GAUSS_MARKOV || (is_sum(law) && law == SELFCAL_FLICKER);
+}
+
+static inline bool has_walk(selfcal_law_t law) {
+    return law == SELFCAL_RANDOM_WALK || (is_sum(law) && law == SELFCAL_MOVING_AVERAGE);
+}
+
+static inline bool has_alpha(selfcal_law_t law) {
+    return law == SELFCAL_GAUSS_MARKOV || is_sum(law);
+}
+
+/* Priors of an axis under a hypothesis. */
+static inline const selfcal_prior_t *priors_of(const selfcal_model_t *model, const selfcal_hypothesis_t *hypothesis, uint8_t axis) {
+#if SELFCAL_TERMS_MAX > 1
+    if (hypothesis->prior != NULL) {
+        return &hypothesis->prior[(size_t)axis * SELFCAL_PARAMETERS];
+    }
+#else
+    (void)hypothesis;
+#endif
+    return model->axis[axis].prior;
+}
+
 /* bank.c */
 /* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
  * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
@@ -121,9 +156,10 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
 
 /* What is read now at one node, given sigma_v: its mean less the offset, the drift's part of that, and its variance over sigma_v^2
  * without that of the drift given the bias (and the coefficients): as it is now, and with d of the drift gone
- * own[0] + 2 d own[1] + d^2 own[2]. */
+ * own[0] + 2 d own[1] + d^2 own[2]. With several terms, d_a of each gone, that is own[0] + 2 sum d_a own[1 + a] + sum d_a d_b own[..]: all
+ * pairs, as selfcal_decay_t has them. */
 typedef struct {
-    selfcal_wide_t mean, drift, own[3];
+    selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
 
 /* forgetting.c, for a model that forgets. */
@@ -167,7 +203,40 @@ struct selfcal_regressors_code {
     /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);
+#ifdef SELFCAL_FIXED
+    /* selfcal_kernel_view(). */
+    void (*view)(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
+#endif
 };
+
+#if SELFCAL_TERMS_MAX > 1
+#define SELFCAL_FLICKER_TERM 0.7329355988794278 /* ln(10)/pi: variance of one of its terms over B^2 */
+/* terms.c, for the nodes of sums: what bank.c does for the others. */
+struct span; /* kernel.h */
+size_t selfcal_terms_nodes(const selfcal_model_t *model);
+void selfcal_terms_init(selfcal_t *self, unsigned char *memory);
+bool selfcal_terms_sound(const selfcal_t *self);
+/* Node `j` belongs to a sum. */
+static inline bool selfcal_is_term_node(const selfcal_node_t *node) {
+    return node->c == R(0.0); /* never of another law */
+}
+void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place);
+void selfcal_terms_run(selfcal_t *self, size_t j, const struct span *span);
+void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count);
+/* What of D has only been counted comes due. */
+void selfcal_terms_settle(selfcal_t *self, size_t j);
+#ifdef SELFCAL_FIXED
+/* selfcal_kernel_fade() of its own sums. */
+void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
+#endif
+/* All but the node's place. */
+void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
+/* Covariance of the terms of the drift at the last interval, given x0, over sigma_v^2. */
+void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]);
+/* The drift of each term at the last interval over one series: "1" is 0, regressor k is 1 + k, and the readings of an axis. */
+size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis);
+void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
+#endif
 
 /* Regressors that an axis has, a bit each. */
 uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);

@@ -6,7 +6,7 @@
 #include "internal.h"
 
 /* Part of the batch without a gap inside. */
-typedef struct {
+typedef struct span {
     uint32_t from, to;
 } span_t;
 
@@ -106,6 +106,25 @@ static inline selfcal_sum_t make_sum(selfcal_wide_t value) {
 static inline void sum_fade(selfcal_sum_t *sum, selfcal_wide_t keep) {
     *sum = make_sum(keep * sum_value(*sum));
 }
+
+/* ---------------------------------------------------------------------------------------- innovations of several series */
+
+/* One series through a span. */
+typedef struct {
+    selfcal_real_t nu[SELFCAL_BATCH];
+    selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
+} innovations_t;
+
+/* a + b = sum + error (Knuth). */
+static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
+    const selfcal_real_t sum = a + b, part = sum - a;
+    const selfcal_sum_t result = {sum, (a - (sum - part)) + (b - part)};
+    return result;
+}
+
+/* Sum of nu of one over s times nu of the other, to twice the digits (Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26 (2005) 1955-1988,
+ * algorithm 5.3), added to `sum`. */
+void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other);
 
 /* ------------------------------------------------------------------------------------------------- converged nodes */
 

@@ -44,14 +44,18 @@ static const selfcal_axis_t *axis_of(const selfcal_work_t *work) {
     return &work->bank->model->axis[work->axis];
 }
 
+static const selfcal_prior_t *prior_of(const selfcal_work_t *work) {
+    return priors_of(work->bank->model, hypothesis_of(work), work->axis);
+}
+
 /* The drift parameter that goes with rho. */
 static selfcal_parameter_t drift_parameter(selfcal_law_t law) {
-    return law == SELFCAL_GAUSS_MARKOV ? SELFCAL_SIGMA_M : SELFCAL_K;
+    return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
 }
 
 /* ln(parameter) - ln(rho) - ln(sigma_v): K sqrt(dt) = sigma_w = rho sigma_v, sigma_m = rho sigma_v. */
 static selfcal_real_t drift_shift(const selfcal_work_t *work) {
-    return hypothesis_of(work)->law == SELFCAL_RANDOM_WALK ? R(-0.5) * r_log((selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+    return has_walk(hypothesis_of(work)->law) ? R(-0.5) * r_log((selfcal_real_t)work->bank->model->dt_s) : R(0.0);
 }
 
 /* ------------------------------------------------------------------------------------------------------------ spline */
@@ -157,7 +161,7 @@ static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth
     expectation_t result = {R(0.0), R(0.0)};
     const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
     const float dt = work->bank->model->dt_s;
-    if (hypothesis_of(work)->rho == NULL) {
+    if (hypothesis_of(work)->rho == NULL || is_sum(hypothesis_of(work)->law)) {
         return result;
     }
     if (truth->wide) {
@@ -354,7 +358,7 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
 /* The widest box that the priors permit. */
 static void first_box(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);
     for (int d = 0; d < 2; d++) {
         work->limit_lo[d] = R(0.0);
@@ -433,6 +437,10 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     const selfcal_t *bank = work->bank;
     const selfcal_real_t z = (cell->ln_rho - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
     cell->off_grid = z < R(0.0) || z > (selfcal_real_t)(hypothesis->rho->nodes - 1U);
+    if (is_sum(hypothesis->law)) { /* without an expectation: up there the drift hides the white noise, sigma_v rho stays */
+        const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
+        cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
+    }
     const expectation_t e = expectation(work, &work->truth, cell->ln_rho, row->ln_alpha);
     cell->profile += e.profile;
     cell->ln_sigma += e.ln_sigma;
@@ -455,8 +463,8 @@ static void cell_parameters(const selfcal_work_t *work, const row_t *row, const 
 }
 
 static bool has_parameter(selfcal_law_t law, unsigned parameter) {
-    return parameter == SELFCAL_N || (parameter == SELFCAL_K && law == SELFCAL_RANDOM_WALK) ||
-           ((parameter == SELFCAL_SIGMA_M || parameter == SELFCAL_ALPHA) && law == SELFCAL_GAUSS_MARKOV);
+    return parameter == SELFCAL_N || (parameter == SELFCAL_K && has_walk(law)) ||
+           (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && has_alpha(law));
 }
 
 /* ---------------------------------------------------------------------------------------------------- search of the box */
@@ -482,7 +490,7 @@ static bool reachable(const selfcal_work_t *work, const selfcal_prior_t *prior, 
 
 static void step_scan(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     row_t row;
     make_row(work, &row);
@@ -556,7 +564,7 @@ static void begin_sum(selfcal_work_t *work) {
     memset(work->field, 0, sizeof work->field);
     memset(work->histogram, 0, sizeof work->histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-        const selfcal_prior_t *prior = &axis_of(work)->prior[p];
+        const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
         work->range_hi[p] = r_fmin(work->range_hi[p], (selfcal_real_t)prior->ln_max);
     }
@@ -615,7 +623,7 @@ typedef struct {
 static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t fall) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
-    const selfcal_prior_t *n_prior = &axis_of(work)->prior[SELFCAL_N], *drift_prior = &axis_of(work)->prior[drift];
+    const selfcal_prior_t *n_prior = &prior_of(work)[SELFCAL_N], *drift_prior = &prior_of(work)[drift];
     const bool has_drift = hypothesis->rho != NULL;
     /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
      * noise, sigma_v falls as rho rises and their product stands still. */
@@ -663,7 +671,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
 /* Some cells of a row. */
 static void step_sum(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = axis_of(work)->prior;
+    const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
@@ -762,7 +770,7 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
 }
 
 static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
-    const selfcal_prior_t *prior = &axis_of(work)->prior[p];
+    const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_wide_t centre = exp((selfcal_wide_t)work->best_ln[p]);
     const selfcal_wide_t mean = work->first[p] / work->mass;
     const selfcal_wide_t variance = fmax(work->second[p] / work->mass - mean * mean, 0.0);
@@ -800,6 +808,24 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     estimate->flags = flags;
 }
 
+#if SELFCAL_TERMS_MAX > 1
+/* What of `now` belongs to the terms of a node of flicker, x0 given with its variance. */
+static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance, selfcal_wide_t bias_left,
+                      selfcal_now_t *now) {
+    const size_t index = (size_t)work->first_node + k;
+    selfcal_wide_t lost[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
+    selfcal_terms_drift(work->bank, index, 0, lost);
+    selfcal_terms_drift(work->bank, index, selfcal_terms_series(work->bank, work->axis), of_reading);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        now->drift[a] = of_reading[a] - x0 * lost[a];
+        now->own[1 + a] = bias_left * lost[a] * variance;
+        for (size_t b = 0; b <= a; b++) {
+            now->own[1 + SELFCAL_TERMS_MAX + term_pair(a, b)] = lost[a] * lost[b] * variance;
+        }
+    }
+}
+#endif
+
 /* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void step_bias(selfcal_work_t *work) {
@@ -820,10 +846,15 @@ static void step_bias(selfcal_work_t *work) {
             const selfcal_wide_t variance = 1.0 / (v.a + prior_precision), lost = 1.0 - v.bias_left;
             const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
             now.mean = v.drift + x0 * v.bias_left;
-            now.drift = now.mean - x0;
+            now.drift[0] = now.mean - x0;
             now.own[0] = v.bias_left * v.bias_left * variance;
             now.own[1] = v.bias_left * lost * variance;
-            now.own[2] = lost * lost * variance;
+            now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
+#if SELFCAL_TERMS_MAX > 1
+            if (v.law == SELFCAL_FLICKER) {
+                now_terms(work, k, x0, variance, v.bias_left, &now);
+            }
+#endif
         }
         if (begins && k == 0U) {
             work->bias_about = now.mean;
@@ -833,16 +864,36 @@ static void step_bias(selfcal_work_t *work) {
         work->bias_first += weighed;
         work->bias_second += weighed * off;
         work->bias_own += (selfcal_wide_t)work->spline[1][k] * (v.drift_var + now.own[0]);
-        if (v.law == SELFCAL_GAUSS_MARKOV) {
+        if (has_deviation(v.law)) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
             const selfcal_wide_t own = (selfcal_wide_t)work->spline[1][k] * best_sq;
-            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift;
-            const selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
-            decay[0] += weighed_fall;
-            decay[1] += 2.0 * (own * (stationary - v.drift_var + now.own[1]) - weighed_fall * off);
-            decay[2] += own * (v.drift_var + now.own[2] - stationary) + weighed_fall * now.drift;
+            selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
+            selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
+            size_t terms = 1;
+#if SELFCAL_TERMS_MAX > 1
+            if (v.law == SELFCAL_FLICKER) {
+                terms = SELFCAL_TERMS_MAX;
+                stationary *= SELFCAL_FLICKER_TERM;
+                selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
+            }
+#endif
+            for (size_t a = 0; a < terms; a++) {
+                const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift[a];
+                selfcal_wide_t with_all = 0.0;
+                for (size_t b = 0; b < terms; b++) {
+                    const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
+                    with_all += spread[pair];
+                    if (b <= a) {
+                        decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
+                            own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
+                            weighed_fall * now.drift[b];
+                    }
+                }
+                decay[a] += weighed_fall;
+                decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now.own[1 + a]) - weighed_fall * off);
+            }
         }
     }
     work->bias_scale = best_sq;
@@ -857,9 +908,13 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
         const selfcal_wide_t *decay = work->bias_decay[j];
         posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
-        posterior->decay[j].mean = (float)(decay[0] / work->bias_weight);
-        posterior->decay[j].var[0] = (float)((decay[1] + 2.0 * mean * decay[0]) / work->bias_weight);
-        posterior->decay[j].var[1] = (float)(decay[2] / work->bias_weight);
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+            posterior->decay[j].mean[a] = (float)(decay[a] / work->bias_weight);
+            posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias_weight);
+        }
+        for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
+            posterior->decay[j].var_sq[a] = (float)(decay[(size_t)2 * SELFCAL_TERMS_MAX + a] / work->bias_weight);
+        }
     }
 }
 
@@ -885,7 +940,7 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
                              log(work->mass * (selfcal_wide_t)work->width[0] * (selfcal_wide_t)work->width[1]);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         if (has_parameter(hypothesis_of(work)->law, p)) {
-            posterior->ln_evidence += ln_prior_density(&axis_of(work)->prior[p]);
+            posterior->ln_evidence += ln_prior_density(&prior_of(work)[p]);
         }
     }
     finish_bias(work, posterior);

@@ -24,10 +24,6 @@ static size_t columns_of(const selfcal_t *self) {
 /* ------------------------------------------------------------------------------------------------------------ bank */
 
 static bool valid_regressors(const selfcal_model_t *model) {
-#ifdef SELFCAL_FIXED
-    (void)model; /* the integer kernels know no columns */
-    return false;
-#else
     const selfcal_regressors_t *regressors = model->regressors;
     if (regressors->count == 0U || regressors->count > SELFCAL_REGRESSORS_MAX || regressors->reference == NULL ||
         regressors->coefficient_sd == NULL) {
@@ -44,7 +40,6 @@ static bool valid_regressors(const selfcal_model_t *model) {
         }
     }
     return true;
-#endif
 }
 
 /* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
@@ -56,24 +51,85 @@ static void init(selfcal_t *self, unsigned char *memory) {
     self->columns->a = (selfcal_sum_t *)(void *)(self->columns->column + p);
     self->columns->b = self->columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U);
     self->columns->x = self->columns->b + nodes * axes * p;
+#ifdef SELFCAL_FIXED
+    self->columns->reading = self->columns->x + nodes * (p + 1U);
+#else
     self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
+#endif
 }
+
+/* What a node keeps of the readings of an axis, `at` = node * axes + axis: sums B of "1" and C, and the predicted drift. */
+typedef struct {
+    selfcal_sum_t *b, *c;
+} reading_t;
+
+#ifdef SELFCAL_FIXED
+static reading_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_t sums = {&self->columns->reading[3U * at], &self->columns->reading[3U * at + 1U]};
+    return sums;
+}
+
+static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
+    return self->columns->reading[3U * at + 2U];
+}
+
+static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->columns->reading[3U * at + 2U] = x;
+}
+
+static void view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
+    const reading_t sums = reading_sums(self, k);
+    *b = sum_value(*sums.b);
+    *c = sum_value(*sums.c);
+    *x = sum_value(reading_drift(self, k));
+}
+#else
+static reading_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_t sums = {&self->b[at], &self->c[at]};
+    return sums;
+}
+
+static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
+    const selfcal_sum_t x = {self->x[at], self->columns->low[at]};
+    return x;
+}
+
+static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->x[at] = x.hi;
+    self->columns->low[at] = x.lo;
+}
+#endif
 
 static bool sound(const selfcal_t *self) {
     const size_t p = columns_of(self), nodes = self->model->nodes, cells = nodes * self->model->axes;
     const selfcal_columns_t *columns = self->columns;
+    const selfcal_sum_t *end = columns->x + nodes * (p + 1U);
     if (columns->column != (const void *)(columns + 1) || columns->a != (const void *)(columns->column + p) ||
-        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p ||
-        columns->low != (const void *)(columns->x + nodes * (p + 1U))) {
+        columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p) {
         return false;
     }
-    for (const selfcal_sum_t *sum = columns->a; sum < columns->x + nodes * (p + 1U); sum++) {
-        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
+#ifdef SELFCAL_FIXED
+    if (columns->reading != end) {
+        return false;
+    }
+    end += 3U * cells;
+    for (size_t k = 0; k < cells; k++) {
+        if (!(reading_sums(self, k).c->hi >= R(0.0))) {
             return false;
         }
     }
+#else
+    if (columns->low != (const void *)end) {
+        return false;
+    }
     for (size_t k = 0; k < cells; k++) {
         if (!isfinite(columns->low[k])) {
+            return false;
+        }
+    }
+#endif
+    for (const selfcal_sum_t *sum = columns->a; sum < end; sum++) {
+        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
             return false;
         }
     }
@@ -130,34 +186,7 @@ static void hand_over(selfcal_t *self) {
     }
 }
 
-/* One series through a span. */
-typedef struct {
-    selfcal_real_t nu[SELFCAL_BATCH];
-    selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
-} innovations_t;
-
-#ifdef SELFCAL_FIXED
-/* The integer kernels know no columns: valid_regressors() lets none in. */
-static void run(selfcal_t *self, size_t j, const gains_t *gains) {
-    (void)self, (void)j, (void)gains;
-    SELFCAL_ASSERT(false);
-}
-
-static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
-    (void)self, (void)j, (void)less;
-    SELFCAL_ASSERT(false);
-}
-#else
-/* a + b = sum + error (Knuth). */
-static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
-    const selfcal_real_t sum = a + b, part = sum - a;
-    const selfcal_sum_t result = {sum, (a - (sum - part)) + (b - part)};
-    return result;
-}
-
-/* Sum of nu of one over s times nu of the other, to twice the digits (Ogita, Rump & Oishi, SIAM J. Sci. Comput. 26 (2005) 1955-1988,
- * algorithm 5.3), added to `sum`. */
-static void add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
+void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
     selfcal_sum_t value = {R(0.0), R(0.0)};
     const uint32_t count = gains->span.to - gains->span.from;
     for (uint32_t i = 0; i < count; i++) {
@@ -198,42 +227,29 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
         selfcal_sum_t *x = &self->columns->x[j * (p + 1U) + k];
         *x = filter(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x, &column[k]);
         for (size_t l = 0; l <= k; l++) {
-            add_products(a++, gains, &column[l], &column[k]);
+            selfcal_add_products(a++, gains, &column[l], &column[k]);
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
-        selfcal_sum_t x = {self->x[at], self->columns->low[at]};
-        x = filter(self, j, gains, waiting(self)->y[at - j * axes], x, &reading);
-        self->x[at] = x.hi;
-        self->columns->low[at] = x.lo;
-        add_products(&self->c[at], gains, &reading, &reading);
-        add_products(&self->b[at], gains, &column[0], &reading);
+        const reading_t sums = reading_sums(self, at);
+        set_reading_drift(self, at, filter(self, j, gains, waiting(self)->y[at - j * axes], reading_drift(self, at), &reading));
+        selfcal_add_products(sums.c, gains, &reading, &reading);
+        selfcal_add_products(sums.b, gains, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
-            add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
+            selfcal_add_products(&self->columns->b[at * p + k], gains, &column[k + 1U], &reading);
         }
     }
-}
-
-static selfcal_sum_t split(selfcal_wide_t value) {
-    selfcal_sum_t sum;
-    sum.hi = (selfcal_real_t)value;
-    sum.lo = (selfcal_real_t)(value - (selfcal_wide_t)sum.hi);
-    return sum;
 }
 
 static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     const size_t rows = columns_of(self) + 1U, axes = self->model->axes;
     for (size_t k = j * rows; k < (j + 1U) * rows; k++) {
-        self->columns->x[k] = split(sum_value(self->columns->x[k]) * (1.0 - less));
+        self->columns->x[k] = make_sum(sum_value(self->columns->x[k]) * (1.0 - less));
     }
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        const selfcal_sum_t x = {self->x[k], self->columns->low[k]};
-        const selfcal_sum_t left = split(sum_value(x) * (1.0 - less));
-        self->x[k] = left.hi;
-        self->columns->low[k] = left.lo;
+        set_reading_drift(self, k, make_sum(sum_value(reading_drift(self, k)) * (1.0 - less)));
     }
 }
-#endif
 
 /* -------------------------------------------------------------------------------------------------- normal equations */
 
@@ -250,6 +266,8 @@ typedef struct {
     selfcal_wide_t first[UNKNOWNS_MAX];    /* offset; first values of the regressors less their references */
     selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
     selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
+    selfcal_wide_t lost[UNKNOWNS_MAX][SELFCAL_TERMS_MAX]; /* what the drift, each term of it, takes of that */
+    selfcal_wide_t drift[SELFCAL_TERMS_MAX]; /* of the readings at the estimate 0 */
     selfcal_wide_t estimate[UNKNOWNS_MAX]; /* A^-1 B; 0 for what cannot be told from those before it */
     selfcal_wide_t rest[UNKNOWNS_MAX];     /* B - A estimate */
     selfcal_wide_t residual;               /* C - B' A^-1 B, that is (C - 2 B' t + t' A t) at the estimate t */
@@ -318,10 +336,19 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->b[0] = normal->node.b;
     normal->last[0] = 1.0;
     normal->left[0] = normal->node.bias_left;
+    normal->lost[0][0] = 1.0 - normal->left[0];
+    normal->drift[0] = normal->node.drift;
     normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
     normal->first[0] = selfcal_offset(self, axis);
     const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;
+#if SELFCAL_TERMS_MAX > 1
+    const bool sum = selfcal_is_term_node(&self->node[index]);
+    if (sum) {
+        selfcal_terms_drift(self, index, 0, normal->lost[0]);
+        selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), normal->drift);
+    }
+#endif
     const selfcal_sum_t *a = p > 0U ? &self->columns->a[index * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
     if (p > 0U) {
         normal->a[0][0] = sum_value(a[0]); /* the same as node.a, to more digits */
@@ -340,7 +367,14 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
         const size_t at = (size_t)index * self->model->axes + axis;
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
-        normal->left[row] = normal->last[row] - sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->left[row] = normal->last[row] - normal->lost[row][0];
+#if SELFCAL_TERMS_MAX > 1
+        if (sum) {
+            selfcal_terms_drift(self, index, k + 1U, normal->lost[row]);
+            normal->left[row] = normal->last[row] - normal->lost[row][0] - normal->lost[row][1] - normal->lost[row][2];
+        }
+#endif
         normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
         normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
                              (selfcal_wide_t)self->model->regressors->reference[k];
@@ -395,7 +429,8 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
     }
     solve(g, order, shift);
     fit->miss = 0.0;
-    fit->now.mean = fit->now.drift = normal->node.drift;
+    fit->now.mean = normal->node.drift;
+    memcpy(fit->now.drift, normal->drift, sizeof fit->now.drift);
     selfcal_wide_t x0_off = 0.0;
     for (uint8_t i = 0; i < order; i++) {
         for (uint8_t j = 0; j <= i; j++) {
@@ -407,7 +442,9 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
         fit->miss += i == 0U ? 0.0 : off * off / (normal->sd[i] * normal->sd[i]);
         fit->mean[i] = normal->estimate[i] + shift[i];
         fit->now.mean += fit->mean[i] * normal->left[i];
-        fit->now.drift += fit->mean[i] * (normal->left[i] - normal->last[i]);
+        for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+            fit->now.drift[t] -= fit->mean[i] * normal->lost[i][t];
+        }
     }
     fit->miss += x0_off * x0_off / p0;
     /* Columns of G^-1. */
@@ -419,10 +456,13 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
         solve(g, order, column);
         fit->var[i] = column[i];
         for (uint8_t j = 0; j < order; j++) {
-            const selfcal_wide_t lost[2] = {normal->last[i] - normal->left[i], normal->last[j] - normal->left[j]};
             fit->now.own[0] += normal->left[i] * column[j] * normal->left[j] / variance;
-            fit->now.own[1] += normal->left[i] * column[j] * lost[1] / variance;
-            fit->now.own[2] += lost[0] * column[j] * lost[1] / variance;
+            for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+                fit->now.own[1 + t] += normal->left[i] * column[j] * normal->lost[j][t] / variance;
+                for (size_t u = 0; u <= t; u++) { /* all i and j: G^-1 is symmetric */
+                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] * normal->lost[j][u] / variance;
+                }
+            }
             fit->share += (j <= i ? normal->a[i][j] : normal->a[j][i]) * column[j] / variance;
         }
     }
@@ -513,6 +553,11 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
+#ifdef SELFCAL_FIXED
+        const reading_t sums = reading_sums(self, at);
+        sum_fade(sums.b, part * part_of_one);
+        sum_fade(sums.c, self->keep);
+#endif
         for (size_t k = 0; k < p; k++) {
             sum_fade(&self->columns->b[at * p + k], part * of[k + 1U]);
         }
@@ -521,4 +566,7 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
     valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, fade, field, now, finish,
+#ifdef SELFCAL_FIXED
+    view,
+#endif
 };

@@ -26,7 +26,9 @@
  *       N        white noise density        unit/sqrt(Hz)   two-sided; the Allan deviation at 1 s
  *       K        random-walk density        unit/s/sqrt(Hz) = unit/sqrt(s) of drift per second
  *       sigma_m  Gauss-Markov deviation     unit
- *       alpha    Gauss-Markov bandwidth     1/s
+ *       alpha    Gauss-Markov bandwidth     1/s            flicker: that of the middle term
+ *       B        flicker coefficient        unit           Allan deviation 0.664 B on its plateau
+ *       spectral_ratio                      1              white noise: amplitude at 0 Hz over that at 1/(2 dt)
  *   Per bank interval dt: sigma_v = N/sqrt(dt), random-walk step sigma_w = K*sqrt(dt).
  *
  * THREE KINDS OF TROUBLE
@@ -142,6 +144,16 @@ extern "C" {
 #error "SELFCAL_REGRESSORS_MAX must be 1 to 6"
 #endif
 
+/* Drift terms, or states, of one law at most: 1 for the paper's laws, 3 for those that are sums as well (selfcal_law_t from
+ * SELFCAL_FLICKER on; to be set for the application too). With 1 their code is compiled out, and their models are refused. */
+#ifndef SELFCAL_TERMS_MAX
+#define SELFCAL_TERMS_MAX 1
+#endif
+#if SELFCAL_TERMS_MAX != 1 && SELFCAL_TERMS_MAX != 3
+#error "SELFCAL_TERMS_MAX must be 1 or 3"
+#endif
+#define SELFCAL_TERM_PAIRS (SELFCAL_TERMS_MAX * (SELFCAL_TERMS_MAX + 1) / 2)
+
 #ifndef SELFCAL_ASSERT
 #define SELFCAL_ASSERT(condition) ((void)0)
 #endif
@@ -196,10 +208,24 @@ typedef enum {
     SELFCAL_CONSTANT = 0,     /* x_i = 0 */
     SELFCAL_RANDOM_WALK = 1,  /* x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                            (23) */
     SELFCAL_GAUSS_MARKOV = 2, /* x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-alpha dt) */
-    SELFCAL_LAWS = 3
+    /* Sums, with SELFCAL_TERMS_MAX of 3. */
+    SELFCAL_FLICKER = 3, /* three Gauss-Markov terms of deviation B sqrt(ln(10)/pi), bandwidths alpha/10, alpha, 10 alpha: a two-sided
+                            spectrum of B^2 / (2 pi f) within 12 % where 2 pi f is between the outer ones */
+    SELFCAL_MOVING_AVERAGE = 4, /* random walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, sigma_v^2): N is
+                                   the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta), prior within 1e-3 to 1e3 */
+    SELFCAL_LAWS = 5
 } selfcal_law_t;
 
-typedef enum { SELFCAL_N = 0, SELFCAL_K = 1, SELFCAL_SIGMA_M = 2, SELFCAL_ALPHA = 3, SELFCAL_PARAMETERS = 4 } selfcal_parameter_t;
+/* Two share a place where no law has both. */
+typedef enum {
+    SELFCAL_N = 0,
+    SELFCAL_K = 1,
+    SELFCAL_SIGMA_M = 2,
+    SELFCAL_B = 2,
+    SELFCAL_ALPHA = 3,
+    SELFCAL_SPECTRAL_RATIO = 3,
+    SELFCAL_PARAMETERS = 4
+} selfcal_parameter_t;
 
 /* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
 typedef struct {
@@ -222,14 +248,17 @@ typedef struct {
 } selfcal_grid_t;
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
- * sigma_w / sigma_v or sigma_m / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
+ * sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
  * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way. Where the nodes lie decides
  * how well the likelihood is interpolated, not the prior. */
 typedef struct {
     selfcal_law_t law;
     float ln_probability;        /* prior */
     const selfcal_grid_t *rho;   /* NULL for SELFCAL_CONSTANT */
-    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV */
+    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV and the sums; of spectral_ratio where the law has that */
+#if SELFCAL_TERMS_MAX > 1
+    const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
+#endif
 } selfcal_hypothesis_t;
 
 typedef struct selfcal_regressors_code selfcal_regressors_code_t;
@@ -237,7 +266,8 @@ extern const selfcal_regressors_code_t selfcal_regressors_code;
 
 /* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step): each adds a constant
  * coefficient times its value to every reading, and every subset of them is a hypothesis of its own. The values come with
- * the samples, selfcal_push_with(); their unit is the application's. Not with SELFCAL_FIXED: SELFCAL_BAD_MODEL. */
+ * the samples, selfcal_push_with(); their unit is the application's. With SELFCAL_FIXED the bank then runs in software
+ * floating point. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code: only a model with regressors links what they take */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
@@ -374,23 +404,72 @@ typedef struct {
     selfcal_sum_t *a;    /* [nodes][rows]: for "1" and each regressor, sums of its innovation times those up to its own, over s */
     selfcal_sum_t *b;    /* [nodes][axes][regressors]: sum of its innovation times nu over s */
     selfcal_sum_t *x;    /* [nodes][1 + regressors]: predicted drift of the zero-bias filter over each column */
+#ifdef SELFCAL_FIXED
+    selfcal_sum_t *reading; /* [nodes][axes][3]: sums B of "1" and C, and x, of the readings: not in integers beside regressors */
+#else
     selfcal_real_t *low; /* [nodes][axes]: low part of x of the readings */
+#endif
 } selfcal_columns_t;
 
 /* Sums of the first p rows of A. */
 #define SELFCAL_REGRESSORS_ROWS(p) ((size_t)(p) * ((size_t)(p) + 1U) / 2U)
 
-/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per axis 8 p + 4. */
+#ifdef SELFCAL_FIXED
+#define SELFCAL_REGRESSORS_READING (3U * sizeof(selfcal_sum_t))
+#else
+#define SELFCAL_REGRESSORS_READING sizeof(selfcal_real_t)
+#endif
+
+/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per axis 8 p + 4;
+ * 8 p + 24 in the fixed-point one. */
 #define SELFCAL_REGRESSORS_SIZE(nodes, axes, p) \
     ((size_t)(p) == 0U ? (size_t)0U \
                        : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) + \
                              (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) * \
                                                     sizeof(selfcal_sum_t) + \
-                                                (size_t)(axes) * sizeof(selfcal_real_t)))
+                                                (size_t)(axes) * SELFCAL_REGRESSORS_READING))
+
+#if SELFCAL_TERMS_MAX > 1
+/* The gain side of a node of a sum, relative to sigma_v; states are scaled so that the reading is their sum and white noise. Private, as
+ * selfcal_terms_t. */
+typedef struct {
+    selfcal_wide_t p[SELFCAL_TERM_PAIRS]; /* predicted covariance of the states, lower half */
+    selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX];      /* 1 - pole, and variance added per interval, of each */
+    selfcal_real_t theta;                                              /* of a moving average, whose part e_(i-1) is the last state */
+    bool steady;                                                       /* p has converged */
+} selfcal_term_node_t;
+
+typedef struct {
+    selfcal_term_node_t *node; /* [nodes of sums] */
+    selfcal_sum_t *x;          /* [those][1 + regressors + axes][SELFCAL_TERMS_MAX]: predicted states over "1", the columns, the readings */
+#ifdef SELFCAL_FIXED
+    selfcal_sum_t *bc;         /* [those][axes][2]: sums B and C of the readings */
+#endif
+} selfcal_terms_t;
+
+/* Bytes beyond SELFCAL_SIZE and SELFCAL_REGRESSORS_SIZE for a model with `nodes` nodes of sums, 0 for none. For each in the float build
+ * 104 + 24 p, and per axis 24. */
+#ifdef SELFCAL_FIXED
+#define SELFCAL_TERMS_SUMS (SELFCAL_TERMS_MAX + 2U)
+#else
+#define SELFCAL_TERMS_SUMS SELFCAL_TERMS_MAX
+#endif
+#define SELFCAL_TERMS_SIZE(nodes, axes, p) \
+    ((size_t)(nodes) == 0U ? (size_t)0U \
+                           : 7U + sizeof(selfcal_terms_t) + \
+                                 (size_t)(nodes) * (sizeof(selfcal_term_node_t) + \
+                                                    (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + (size_t)(axes) * SELFCAL_TERMS_SUMS) * \
+                                                        sizeof(selfcal_sum_t)))
+#else
+#define SELFCAL_TERMS_SIZE(nodes, axes, p) ((size_t)0U)
+#endif
 
 /* Private; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
+#if SELFCAL_TERMS_MAX > 1
+    selfcal_terms_t *terms;  /* of the sums; NULL: there are none */
+#endif
     selfcal_columns_t *columns; /* of the regressors; NULL: there are none */
     selfcal_node_t *node;    /* [nodes] */
     selfcal_total_t *b, *c;  /* [nodes][axes]: sums u nu / s and nu^2 / s */
@@ -442,7 +521,8 @@ typedef struct {
     selfcal_counters_t counters;
 } selfcal_t;
 
-/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE bytes, aligned to 8; both stay the caller's and must outlive the use).
+/* Prepares `self` over `memory` (SELFCAL_SIZE + SELFCAL_REGRESSORS_SIZE + SELFCAL_TERMS_SIZE bytes, aligned to 8; both stay the caller's
+ * and must outlive the use).
  * Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY; then `self` is unusable. */
 selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
 
@@ -543,8 +623,8 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 /* selfcal_save() writes this many bytes at a time, and the rest at last. */
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
-/* No snapshot of a model without regressors is longer, with them by no more than SELFCAL_REGRESSORS_SIZE: for a flash slot or a
- * buffer laid out by the compiler. */
+/* No snapshot of a model without regressors and sums is longer, with them by no more than SELFCAL_REGRESSORS_SIZE and
+ * SELFCAL_TERMS_SIZE: for a flash slot or a buffer laid out by the compiler. */
 #define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
 
 /* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. */
@@ -580,11 +660,13 @@ typedef struct {
 } selfcal_estimate_t;
 
 /* What a decaying drift does to the bias, for selfcal_predict(): with psi = 1 - e^(-alpha t) of each alpha node, t after the
- * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var[0] + psi^2 var[1]) - f^2. */
+ * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var + psi^2 var_sq) - f^2. Flicker:
+ * the same for each of its terms, of alpha/10, alpha and 10 alpha, with psi psi' var_sq for each pair of them, b <= a at a (a + 1)/2 + b. */
 typedef struct {
     float alpha; /* 1/s */
-    float mean;
-    float var[2];
+    float mean[SELFCAL_TERMS_MAX];
+    float var[SELFCAL_TERMS_MAX];
+    float var_sq[SELFCAL_TERM_PAIRS];
 } selfcal_decay_t;
 
 typedef struct {
@@ -592,7 +674,7 @@ typedef struct {
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
-    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov: of each alpha node; else 0 */
+    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov and flicker: of each alpha node; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {
@@ -652,7 +734,8 @@ typedef struct {
     selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
-    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][3];                  /* sums of selfcal_decay_t over the nodes of each alpha */
+    /* sums of selfcal_decay_t over the nodes of each alpha */
+    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_work_t;
 
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples; of a bank that forgets, the first step that looks at
@@ -677,7 +760,8 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
 /* The bias of the report's axis `elapsed_s` after the last bank interval (missing ones told by selfcal_skip() included) that the
  * report rests on, and its standard deviation, mixed over the hypotheses; both in the axis's unit. A reading less `bias` is the
  * corrected reading, at rest or moving. Under the constant law the bias stays; under the random walk its variance grows by
- * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2: exact moments of the
+ * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2, under flicker that of each term:
+ * exact moments of the
  * mixture over the nodes and sigma_v, as far as the report's own are. `model` is the bank's.
  * SELFCAL_BAD_ARGUMENT: null pointer, elapsed_s negative or not finite. O(alpha nodes). */
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd);

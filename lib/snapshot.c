@@ -12,7 +12,7 @@
  *       20  4  layout: CRC-32 over kind (1 byte) and count (2 bytes) of every field below, so that a build with other fields or
  *              other maxima of the configuration is told apart without anyone counting up the version
  *       24     selfcal_t, its batches, its counters, every node, b, c, x, number formats, what the
- *              regressors have: the fields below, in their order
+ *              regressors and the sums have: the fields below, in their order
  *     last  4  CRC-32 of all before (IEEE 802.3: reflected polynomial 0xEDB88320, start and final inversion 0xFFFFFFFF)
  * The first 8 bytes and the checksum are where they are in every version.
  *
@@ -172,6 +172,15 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_column_t, offset, REAL)  \
     F(selfcal_column_t, sum, REAL)
 
+#if SELFCAL_TERMS_MAX > 1
+#define TERM_FIELDS(F)                  \
+    F(selfcal_term_node_t, p, WIDE)     \
+    F(selfcal_term_node_t, beta, REAL)  \
+    F(selfcal_term_node_t, q, REAL)     \
+    F(selfcal_term_node_t, theta, REAL) \
+    F(selfcal_term_node_t, steady, BOOL)
+#endif
+
 /* What a part of the bank is made of. */
 typedef struct {
     uint16_t offset, count;
@@ -189,13 +198,17 @@ static const field_t batch_fields[] = {BATCH_FIELDS(ROW)};
 static const field_t counter_fields[] = {COUNTER_FIELDS(ROW)};
 static const field_t node_fields[] = {NODE_FIELDS(ROW)};
 static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
-static const field_t sum_fields[] = {{0, 2, KIND_REAL}}, real_fields[] = {{0, 1, KIND_REAL}};
+#if SELFCAL_TERMS_MAX > 1
+static const field_t term_fields[] = {TERM_FIELDS(ROW)};
+#endif
+static const field_t sum_fields[] = {{0, 2, KIND_REAL}};
 #ifdef SELFCAL_FIXED
 static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
 static const field_t block_fields[] = {BLOCK_SUM_FIELDS(ROW)};
 static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
 #else
 static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
+static const field_t real_fields[] = {{0, 1, KIND_REAL}};
 #endif
 
 /* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
@@ -203,7 +216,11 @@ static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0,
 #define MIRROR(struct_t, member, kind) TYPE_##kind member[COUNT(struct_t, member, kind)];
 #define MIRROR_PART(struct_t, member, type) type member[sizeof(((struct_t *)0)->member) / sizeof(type)];
 typedef struct {
+#if SELFCAL_TERMS_MAX > 1
+    const void *pointer[7]; /* as below, and terms */
+#else
     const void *pointer[6]; /* model, columns, node, b, c, x */
+#endif
     BANK_FIELDS(MIRROR, MIRROR_PART)
 } selfcal_t_mirror;
 typedef struct {
@@ -218,6 +235,11 @@ typedef struct {
 typedef struct {
     COLUMN_FIELDS(MIRROR)
 } selfcal_column_t_mirror;
+#if SELFCAL_TERMS_MAX > 1
+typedef struct {
+    TERM_FIELDS(MIRROR)
+} selfcal_term_node_t_mirror;
+#endif
 #ifdef SELFCAL_FIXED
 typedef struct {
     SCALE_FIELDS(MIRROR)
@@ -241,6 +263,15 @@ SELFCAL_STATIC_ASSERT(all_of_the_counters, sizeof(selfcal_counters_t) == sizeof(
 SELFCAL_STATIC_ASSERT(all_of_a_node, sizeof(selfcal_node_t) == sizeof(selfcal_node_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_a_column, sizeof(selfcal_column_t) == sizeof(selfcal_column_t_mirror));
 SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeof(void *));
+#if SELFCAL_TERMS_MAX > 1
+TERM_FIELDS(IN_PLACE)
+SELFCAL_STATIC_ASSERT(all_of_a_term_node, sizeof(selfcal_term_node_t) == sizeof(selfcal_term_node_t_mirror));
+#ifdef SELFCAL_FIXED
+SELFCAL_STATIC_ASSERT(all_of_the_terms, sizeof(selfcal_terms_t) == 3 * sizeof(void *));
+#else
+SELFCAL_STATIC_ASSERT(all_of_the_terms, sizeof(selfcal_terms_t) == 2 * sizeof(void *));
+#endif
+#endif
 SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
 #ifdef SELFCAL_FIXED
 SCALE_FIELDS(IN_PLACE)
@@ -266,9 +297,9 @@ typedef struct {
 } part_t;
 
 #ifdef SELFCAL_FIXED
-enum { PARTS = 14 };
+enum { PARTS = 14 + (SELFCAL_TERMS_MAX > 1 ? 3 : 0) };
 #else
-enum { PARTS = 12 };
+enum { PARTS = 12 + (SELFCAL_TERMS_MAX > 1 ? 2 : 0) };
 #endif
 
 /* The parts of a bank of `model`; without `self`, their sizes alone. */
@@ -278,6 +309,11 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
     const size_t p = model->regressors != NULL ? model->regressors->count : 0U, used = p > 0U ? 1U : 0U;
     const selfcal_columns_t *columns = there ? self->columns : NULL;
     const bool more = columns != NULL;
+#if SELFCAL_TERMS_MAX > 1
+    const size_t sums = selfcal_terms_nodes(model);
+    const selfcal_terms_t *terms = there ? self->terms : NULL;
+    const bool sum = terms != NULL;
+#endif
     const part_t parts[PARTS] = {
         {bank_fields, LENGTH(bank_fields), self, 1, sizeof *self},
         {batch_fields, LENGTH(batch_fields), there ? self->batch : NULL, LENGTH(self->batch), sizeof self->batch[0]},
@@ -294,7 +330,18 @@ static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t
         {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
         {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
         {sum_fields, 1, more ? columns->x : NULL, used * nodes * (p + 1U), sizeof *columns->x},
+#ifdef SELFCAL_FIXED
+        {sum_fields, 1, more ? columns->reading : NULL, 3U * used * cells, sizeof *columns->reading},
+#else
         {real_fields, 1, more ? columns->low : NULL, used * cells, sizeof *columns->low},
+#endif
+#if SELFCAL_TERMS_MAX > 1
+        {term_fields, LENGTH(term_fields), sum ? terms->node : NULL, sums, sizeof *terms->node},
+        {sum_fields, 1, sum ? terms->x : NULL, sums * (1U + p + model->axes) * SELFCAL_TERMS_MAX, sizeof *terms->x},
+#ifdef SELFCAL_FIXED
+        {sum_fields, 1, sum ? terms->bc : NULL, sums * model->axes * 2U, sizeof *terms->bc},
+#endif
+#endif
     };
     memcpy(part, parts, sizeof parts);
 }

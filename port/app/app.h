@@ -11,8 +11,8 @@
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
-#if SELFCAL_MODEL_REGRESSORS > 0
-#error "this application gives its bank no regressors"
+#if SELFCAL_MODEL_REGRESSORS > 0 || SELFCAL_MODEL_TERM_NODES > 0
+#error "this application gives its bank no regressors, and its telemetry has no items for laws that are sums"
 #endif
 
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */

@@ -13,7 +13,8 @@
 #include "selfcal.h"
 
 enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 4 };
-#define MORE SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX)
+#define MORE (SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
+              SELFCAL_TERMS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX))
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
 
 #define LENGTH(array) (sizeof(array) / sizeof((array)[0]))
@@ -41,6 +42,9 @@ typedef struct {
 } store_t;
 
 static selfcal_axis_t axis_table[SELFCAL_AXES_MAX];
+static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {
+    {-6.9F, -0.7F, false}, {-10.0F, -3.0F, false}, {-7.0F, -1.0F, false}, {-2.0F, 2.0F, false}};
+static selfcal_prior_t moving_average[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
@@ -134,6 +138,7 @@ static void make_model(input_t *in) {
     model.axis = axis_table;
     model.hypothesis = hypothesis_table;
     for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
+        memcpy(moving_average[axis], some_priors, sizeof some_priors);
         selfcal_axis_t *a = &axis_table[axis];
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
             const unsigned set = kind >> 3 & 3U;
@@ -150,13 +155,20 @@ static void make_model(input_t *in) {
         a->range = (limits >> 2 & 1U) != 0U ? 5.0F : 0.0F;
         a->stuck_limit = (limits >> 3 & 1U) != 0U ? 3U : 0U;
     }
+    unsigned laws = (kind & 7U) == 0U ? 7U : kind & 7U;
+    if (SELFCAL_TERMS_MAX > 1) {
+        laws |= (limits >> 4 & 3U) << SELFCAL_FLICKER;
+    }
     for (unsigned law = 0; law < SELFCAL_LAWS; law++) {
-        if ((((kind & 7U) == 0U ? 7U : kind) >> law & 1U) != 0U) {
+        if ((laws >> law & 1U) != 0U) {
             selfcal_hypothesis_t *h = &hypothesis_table[model.hypotheses++];
             h->law = (selfcal_law_t)law;
             h->ln_probability = -1.0F;
             h->rho = law != SELFCAL_CONSTANT ? &grid : NULL;
-            h->alpha = law == SELFCAL_GAUSS_MARKOV ? &grid : NULL;
+            h->alpha = law >= SELFCAL_GAUSS_MARKOV ? &grid : NULL;
+#if SELFCAL_TERMS_MAX > 1
+            h->prior = law == SELFCAL_MOVING_AVERAGE ? &moving_average[0][0] : NULL;
+#endif
             model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
         }
     }
@@ -183,7 +195,7 @@ static void make_model(input_t *in) {
         return;
     }
     /* something is wrong with this one */
-    switch (byte(in) % 22U) {
+    switch (byte(in) % 24U) {
     case 0: model.dt_s = any_float(in); break;
     case 1: model.block = (uint32_t)bits(in, 4); break;
     case 2: model.axes = byte(in); break;
@@ -196,7 +208,7 @@ static void make_model(input_t *in) {
     case 9: axis_table[0].stuck_limit = byte(in); break;
     case 10: axis_table[0].prior[byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
     case 11: axis_table[0].prior[byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
-    case 12: hypothesis_table[0].law = (selfcal_law_t)(byte(in) & 3U); break;
+    case 12: hypothesis_table[0].law = (selfcal_law_t)(byte(in) & 7U); break;
     case 13: hypothesis_table[0].rho = hypothesis_table[0].rho == NULL ? &grid : NULL; break;
     case 14: hypothesis_table[0].alpha = hypothesis_table[0].alpha == NULL ? &grid : NULL; break;
     case 15: regressors.count = byte(in); break;
@@ -205,6 +217,8 @@ static void make_model(input_t *in) {
     case 18: coefficient_sd[0] = any_float(in); break;
     case 19: forgetting.half_life_s = any_float(in); break;
     case 20: forgetting.code = NULL; break;
+    case 21: moving_average[0][byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
+    case 22: moving_average[0][byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
     default: hypothesis_table[0].ln_probability = any_float(in); break;
     }
 }
@@ -234,6 +248,16 @@ static selfcal_status_t restore(bank_t *to, const store_t *store) {
     return selfcal_restore(&to->self, &model, to->memory, sizeof to->memory, store->bytes, store->length);
 }
 
+/* Nodes of the laws that are no sums. */
+static size_t plain_nodes(void) {
+    size_t nodes = 0;
+    for (uint8_t h = 0; h < model.hypotheses; h++) {
+        const selfcal_hypothesis_t *of = &hypothesis_table[h];
+        nodes += of->law >= SELFCAL_FLICKER ? 0U : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
+    }
+    return nodes;
+}
+
 /* All but the pointers; padding is clear in both. */
 static void equal_banks(const bank_t *one, const bank_t *two) {
     const size_t from = offsetof(selfcal_t, n);
@@ -241,9 +265,16 @@ static void equal_banks(const bank_t *one, const bank_t *two) {
     HOLDS(memcmp(one->memory, two->memory, SELFCAL_SIZE(model.nodes, model.axes)) == 0);
     if (model.regressors != NULL) {
         const uint8_t *a = (const void *)one->self.columns->column, *b = (const void *)two->self.columns->column;
-        const size_t cells = (size_t)model.nodes * model.axes;
-        HOLDS(memcmp(a, b, (size_t)((const uint8_t *)(one->self.columns->low + cells) - a)) == 0);
+        const size_t all = SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U - sizeof(selfcal_columns_t);
+        HOLDS(memcmp(a, b, all) == 0);
     }
+#if SELFCAL_TERMS_MAX > 1
+    if (one->self.terms != NULL) {
+        const uint8_t *a = (const void *)one->self.terms->node, *b = (const void *)two->self.terms->node;
+        const size_t nodes = SELFCAL_TERMS_SIZE(1, model.axes, 0) - 7U - sizeof(selfcal_terms_t); /* of one node */
+        HOLDS(memcmp(a, b, nodes * (one->self.model->nodes - plain_nodes())) == 0);
+    }
+#endif
 }
 
 static bool grown(uint32_t before_, uint32_t now) {

@@ -14,7 +14,7 @@ from selfcal import _library32
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import LAWS, NODES, Model, Prior
+from selfcal.model import NODES, PLAIN, Model, Prior
 from selfcal.recording import save
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import REPORT_MIN, block_means, identify
@@ -33,7 +33,7 @@ LN_EVIDENCE = 0.05
 
 
 @pytest.mark.parametrize("n", [10, 100, 1000, 3600])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", PLAIN)
 def test_report_against_the_continuous_reference(law: str, n: int) -> None:
     """The float library's interpolated report against the textbook bank, refined until it settles."""
     worst = np.zeros(4)
@@ -82,7 +82,7 @@ def test_json_follows_the_contract(tmp_path: Path) -> None:
     assert document["schema"] == "selfcal.identify/1"
     assert document["recording"]["samples"] == 400
     gx = document["axes"]["gx"]
-    assert set(gx["hypotheses"]) == set(gx["log_evidence"]) == set(gx["parameters"]) == set(LAWS)
+    assert set(gx["hypotheses"]) == set(gx["log_evidence"]) == set(gx["parameters"]) == set(PLAIN)
     assert sum(gx["hypotheses"].values()) == pytest.approx(1.0, abs=1e-6)
     units = {name: p["unit"] for law in gx["parameters"].values() for name, p in law.items()}
     assert units == {"N": "rad/s/sqrt(Hz)", "K": "rad/s^2/sqrt(Hz)", "sigma_m": "rad/s", "alpha": "1/s"}
@@ -101,7 +101,7 @@ def test_units_change_numbers_and_not_the_answer(tmp_path: Path) -> None:
         save(log, {"gx": (unit, y * factor)}, 1.0, {})
         answers.append(identify(log)["axes"]["gx"])
     deg, rad = answers
-    for law in LAWS:
+    for law in PLAIN:
         assert deg["hypotheses"][law] == pytest.approx(rad["hypotheses"][law], abs=1e-5)  # float32 samples round apart
         shift = rad["log_evidence"][law] - deg["log_evidence"][law]
         assert shift == pytest.approx(-1000 * math.log(math.pi / 180.0), abs=1e-3)
@@ -118,7 +118,7 @@ def test_engines_agree(tmp_path: Path) -> None:
     engines = ("library", "reference", "fixed")
     library, dense, fixed = (identify(log, engine=engine)["axes"]["gx"] for engine in engines)
     assert fixed["hypotheses"] != library["hypotheses"]
-    for law in LAWS:
+    for law in PLAIN:
         assert library["hypotheses"][law] == pytest.approx(dense["hypotheses"][law], abs=2e-3)
         # the same nodes and report; only the sums round apart, by the design's tolerance
         assert fixed["hypotheses"][law] == pytest.approx(library["hypotheses"][law], abs=5e-3)
@@ -180,7 +180,7 @@ def test_slow_records_have_a_bias(tmp_path: Path) -> None:
     log = tmp_path / "slow.csv"
     save(log, {"gx": ("deg/s", 0.3 + 0.04 * rng.standard_normal(2000))}, 0.01, {})
     library, dense = (identify(log, engine=engine)["axes"]["gx"] for engine in ("library", "reference"))
-    for law in LAWS:
+    for law in PLAIN:
         assert library["hypotheses"][law] == pytest.approx(dense["hypotheses"][law], abs=5e-3)
     assert library["bias_now"]["mean"] == pytest.approx(dense["bias_now"]["mean"], abs=0.05 * dense["bias_now"]["sd"])
     assert library["bias_now"]["sd"] == pytest.approx(dense["bias_now"]["sd"], rel=0.03)

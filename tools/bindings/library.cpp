@@ -20,7 +20,9 @@
 namespace nb = nanobind;
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
-using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>>;
+using PriorTuple = std::tuple<double, double, bool>; // ln_min, ln_max, uniform
+using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>,
+                                   std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none: the axes'
 
 using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -53,9 +55,11 @@ public:
             axes_.push_back(axis);
         }
         size_t nodes = 0;
-        for (const auto &[law, ln_probability, rho, alpha] : hypotheses) {
-            selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha)};
-            nodes += size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
+        for (const auto &[law, ln_probability, rho, alpha, priors] : hypotheses) {
+            const selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha), add(priors)};
+            const size_t count = size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
+            nodes += count;
+            term_nodes_ += law >= SELFCAL_FLICKER ? count : 0;
             hypotheses_.push_back(h);
         }
         model_ = {id,
@@ -225,7 +229,8 @@ public:
     double weight() const { return bank_.weight; }
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const {
-        return SELFCAL_SIZE(model_.nodes, model_.axes) + SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size());
+        return SELFCAL_SIZE(model_.nodes, model_.axes) + SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size()) +
+               SELFCAL_TERMS_SIZE(term_nodes_, model_.axes, reference_.size());
     }
 
     bool sound() const { return selfcal_check(&bank_) == SELFCAL_OK; }
@@ -259,6 +264,19 @@ private:
         return &grids_.back()->grid;
     }
 
+    const selfcal_prior_t *add(const std::vector<std::vector<PriorTuple>> &priors) {
+        if (priors.empty())
+            return nullptr;
+        auto &table = priors_.emplace_back(std::make_unique<std::vector<selfcal_prior_t>>());
+        for (const std::vector<PriorTuple> &axis : priors) {
+            if (axis.size() != SELFCAL_PARAMETERS || priors.size() != axes_.size())
+                throw std::invalid_argument("a hypothesis needs one prior a parameter for every axis, or none");
+            for (const auto &[lo, hi, uniform] : axis)
+                table->push_back({static_cast<float>(lo), static_cast<float>(hi), uniform});
+        }
+        return table->data();
+    }
+
     static void check(selfcal_status_t status) {
         switch (status) {
         case SELFCAL_OK:
@@ -289,6 +307,8 @@ private:
     std::vector<selfcal_axis_t> axes_;
     std::vector<selfcal_hypothesis_t> hypotheses_;
     std::vector<std::unique_ptr<Grid>> grids_;
+    std::vector<std::unique_ptr<std::vector<selfcal_prior_t>>> priors_;
+    size_t term_nodes_ = 0;
     std::vector<float> reference_, coefficient_sd_;
     selfcal_regressors_t regressors_{};
     selfcal_forgetting_t forgetting_{};

@@ -79,9 +79,7 @@ sr::Node node(int law, double drift, double alpha, double sigma_v, double walk) 
     if (law < 0 || law >= static_cast<int>(sr::laws))
         throw std::invalid_argument("law must be 0 to " + std::to_string(sr::laws - 1));
     const sr::Node out{static_cast<sr::Law>(law), drift, alpha, sigma_v, walk};
-    if (out.law == sr::Law::moving_average && !(std::abs(drift) <= 1.0))
-        throw std::invalid_argument("theta of a moving average must be -1 to 1");
-    const bool free = out.law == sr::Law::constant || out.law == sr::Law::moving_average;
+    const bool free = out.law == sr::Law::constant;
     const bool needs_alpha = !free && out.law != sr::Law::random_walk;
     if (!(sigma_v > 0.0) || (!free && !(drift >= 0.0)) || (needs_alpha && !(alpha > 0.0)) || !(walk >= 0.0))
         throw std::invalid_argument("sigma_v and alpha must be positive, drift and walk at least 0");
@@ -89,16 +87,13 @@ sr::Node node(int law, double drift, double alpha, double sigma_v, double walk) 
 }
 
 std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vector &alpha, const Vector &sigma_v,
-                                const std::optional<Vector> &walk, bool factors) {
+                                const std::optional<Vector> &walk) {
     const std::size_t m = law.shape(0);
     if (drift.shape(0) != m || alpha.shape(0) != m || sigma_v.shape(0) != m || (walk && walk->shape(0) != m))
         throw std::invalid_argument("law, drift, alpha, sigma_v and walk must have one length");
     std::vector<sr::Node> nodes;
-    for (std::size_t j = 0; j < m; j++) {
+    for (std::size_t j = 0; j < m; j++)
         nodes.push_back(node(law(j), drift(j), alpha(j), sigma_v(j), walk ? (*walk)(j) : 0.0));
-        if (factors && nodes[j].law == sr::Law::moving_average)
-            throw std::invalid_argument("a moving average takes no factors r");
-    }
     return nodes;
 }
 
@@ -108,7 +103,7 @@ std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, dou
                                                const std::optional<Columns> &z,
                                                const std::optional<Vector> &coefficient_sd,
                                                const std::optional<Vector> &walk) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk, r.has_value());
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk);
     for (const sr::Node &one : nodes)
         if (sr::order(one.law) != sr::order(nodes[0].law))
             throw std::invalid_argument("the laws of one call must have as many states each");
@@ -133,7 +128,7 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const L
          const Vector &alpha, const Vector &sigma_v, const std::vector<double> &ln_prior,
          const std::vector<std::size_t> &after, const std::optional<Vector> &r, const std::optional<Columns> &z,
          const std::optional<Vector> &coefficient_sd, const std::optional<Vector> &walk) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk, r.has_value());
+    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk);
     if (ln_prior.size() != nodes.size())
         throw std::invalid_argument("ln_prior must have one value a node");
     for (std::size_t m = 0; m < after.size(); m++)
@@ -167,8 +162,6 @@ Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_s
                    double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
                    const std::optional<Vector> &coefficient_sd, double walk) {
     const sr::Node one = node(law, drift, alpha, sigma_v, walk);
-    if (r && one.law == sr::Law::moving_average)
-        throw std::invalid_argument("a moving average takes no factors r");
     const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     const Array<double> out({rec.n});
     {
@@ -221,6 +214,7 @@ NB_MODULE(_reference, m) {
         .def_rw("samples", &sr::Scene::samples)
         .def_rw("block", &sr::Scene::block)
         .def_rw("filter_taps", &sr::Scene::filter_taps)
+        .def_rw("bank_block", &sr::Scene::bank_block)
         .def_rw("missing", &sr::Scene::missing)
         .def_rw("motion_intervals", &sr::Scene::motion_intervals);
     nb::class_<sr::Axis>(m, "Axis")
@@ -228,8 +222,8 @@ NB_MODULE(_reference, m) {
         .def_prop_rw(
             "law", [](const sr::Axis &axis) { return static_cast<int>(axis.law); },
             [](sr::Axis &axis, int law) {
-                if (law < 0 || law > static_cast<int>(sr::Law::gauss_markov))
-                    throw std::invalid_argument("law must be 0, 1 or 2");
+                if (law < 0 || law > static_cast<int>(sr::Law::moving_average))
+                    throw std::invalid_argument("law must be 0 to 4");
                 axis.law = static_cast<sr::Law>(law);
             })
         .def_rw("bias", &sr::Axis::bias)
@@ -237,6 +231,8 @@ NB_MODULE(_reference, m) {
         .def_rw("K", &sr::Axis::K)
         .def_rw("sigma_m", &sr::Axis::sigma_m)
         .def_rw("alpha", &sr::Axis::alpha)
+        .def_rw("B", &sr::Axis::B)
+        .def_rw("spectral_ratio", &sr::Axis::spectral_ratio)
         .def_rw("range", &sr::Axis::range)
         .def_rw("lsb", &sr::Axis::lsb)
         .def_rw("temperature_coefficient", &sr::Axis::temperature_coefficient)

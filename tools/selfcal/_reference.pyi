@@ -3,12 +3,12 @@
 
 Nodes are arrays of one length m: `law` int32 (0 constant, 1 random walk, 2 Gauss-Markov: the order of model.LAWS;
 beyond the paper's 3 flicker, 4 moving average, 5 random walk and Gauss-Markov: host_sim/textbook_bank.hpp), `drift`
-(K in unit/s/sqrt(Hz), sigma_m or the flicker coefficient B in unit, theta; not used by law 0), `alpha` (1/s, laws 2,
-3 and 5), `sigma_v` (unit, per sample: N / sqrt(dt_s)), and `walk` (K of law 5, default 0). A record is `y` float64[n]
-in its unit, NaN where a sample is missing, every `dt_s`; `r` float64[n] multiplies sigma_v^2, None is 1. The bias x0
-is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where y is, with
-coefficients c normal about 0 with `coefficient_sd` float64[p], in the unit of y per unit of each column. Arguments
-that do not fit raise ValueError. All cores are used, the interpreter's lock is released.
+(K in unit/s/sqrt(Hz), sigma_m or the flicker coefficient B in unit; not used by law 0), `alpha` (1/s, laws 2, 3 and
+5; law 4: the spectral ratio), `sigma_v` (unit, per sample: N / sqrt(dt_s)), and `walk` (K of law 5, default 0). A
+record is `y` float64[n] in its unit, NaN where a sample is missing, every `dt_s`; `r` float64[n] multiplies sigma_v^2,
+None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where
+y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in the unit of y per unit of each column.
+Arguments that do not fit raise ValueError. All cores are used, the interpreter's lock is released.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def run_filters(
 ) -> tuple[_Floats, _Floats, _Floats]:
     """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, d + 1 + p] and
     covariance [m, d + 1 + p, d + 1 + p] of the state (drift, x0, c), where a drift has d = 1 state, under laws 3 to 5
-    three, two and two. The laws of one call must agree in d."""
+    three, three and two. The laws of one call must agree in d."""
 
 def run_bank(
     y: _Floats,
@@ -87,6 +87,7 @@ class Scene:
     samples: int
     block: int
     filter_taps: int
+    bank_block: int
     missing: int
     motion_intervals: int
     def __init__(self) -> None: ...
@@ -98,6 +99,8 @@ class Axis:
     K: float
     sigma_m: float
     alpha: float
+    B: float
+    spectral_ratio: float
     range: float
     lsb: float
     temperature_coefficient: float

@@ -12,10 +12,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from selfcal.model import LAWS
+from selfcal.model import LAWS, SUMS
 from selfcal.wire import AxisReport, Decoder, Link, signal_unit
 
-SHORT = {"constant": "const", "random_walk": "r.walk", "gauss_markov": "G-M"}
+SHORT = {
+    "constant": "const",
+    "random_walk": "r.walk",
+    "gauss_markov": "G-M",
+    "flicker": "flicker",
+    "moving_average": "r.w.+MA",
+}
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 BAR = 6  # characters of a probability bar
 WIDE = 110  # columns of a terminal with room for the bars
@@ -66,7 +72,9 @@ class View:
         wide = self._console.width >= WIDE
         table = Table(box=None, pad_edge=False, padding=(0, 2 if wide else 1, 0, 0))
         table.add_column("axis", no_wrap=True)
-        for law in LAWS:
+        seen = {name for report in self._last.values() for name in report.values}
+        laws = [law for law in LAWS if law not in SUMS or f"{law}_probability" in seen]
+        for law in laws:
             table.add_column(f"P {SHORT[law]}" if wide else SHORT[law], no_wrap=True)
         table.add_column("most probable law: median [5 %, 95 %]", no_wrap=True)
         table.add_column("bias now")
@@ -76,7 +84,7 @@ class View:
             bias = f"{mean}{' ' if wide else NEW_LINE}± {sd} {signal_unit(axis, 'bias_mean')}"
             table.add_row(
                 f"{axis}{NEW_LINE}{_number(report.value('count'), '%.0f')}",
-                *(_bar(report.value(f"{law}_probability"), wide) for law in LAWS),
+                *(_bar(report.value(f"{law}_probability"), wide) for law in laws),
                 _parameters(report),
                 Text.assemble(bias, (f"{NEW_LINE}{health}" if health else "", "red")),
             )

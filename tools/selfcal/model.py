@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,21 @@ LAWS: dict[str, tuple[str, ...]] = {
     "constant": ("N",),
     "random_walk": ("N", "K"),
     "gauss_markov": ("N", "sigma_m", "alpha"),
+    "flicker": ("N", "B", "alpha"),
+    "moving_average": ("N", "K", "spectral_ratio"),
 }
+#: Those that are sums of several terms: SELFCAL_TERMS_MAX of 3.
+SUMS = ("flicker", "moving_average")
+#: The others: the paper's.
+PLAIN = tuple(law for law in LAWS if law not in SUMS)
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
+#: Limits of spectral_ratio: beyond, 1 + theta or 1 - theta is no longer a float.
+RATIOS = (1e-3, 1e3)
+#: Place of each parameter there; two share one where no law has both.
+PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3}
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
@@ -50,7 +60,8 @@ class Prior:
 
 @dataclass(frozen=True)
 class Group:
-    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha; units of `units.py`)."""
+    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and spectral_ratio if a
+    hypothesis has them; units of `units.py`)."""
 
     name: str
     axes: tuple[str, ...]
@@ -89,10 +100,11 @@ class Regressor:
 
 @dataclass(frozen=True)
 class GridNodes:
-    """Filter nodes of one target: random walk (rho) and Gauss-Markov (rho, alpha)."""
+    """Filter nodes of one target: random walk (rho) and by law (rho, alpha), the moving average's (rho,
+    spectral_ratio)."""
 
     random_walk: int
-    gauss_markov: tuple[int, int]
+    pairs: Mapping[str, tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -210,16 +222,19 @@ class _Reader:
             raise self.fail(where, f"unknown law '{law}' (log_uniform or uniform)")
         low = self.number(self.entry(fields, "min", where), f"{where}.min")
         high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
+        if where.endswith(".spectral_ratio") and not (RATIOS[0] <= low and high <= RATIOS[1]):
+            raise self.fail(where, f"must lie within {RATIOS[0]:g} to {RATIOS[1]:g}")
         return Prior(law, min=low, max=high)
 
-    def group(self, name: str, tree: Any) -> Group:
+    def group(self, name: str, tree: Any, laws: Collection[str]) -> Group:
         where = f"groups.{name}"
         fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors"), where)
         axes = self.entry(fields, "axes", where)
         if not isinstance(axes, list) or not axes or not all(isinstance(axis, str) for axis in axes):
             raise self.fail(f"{where}.axes", "must be a list of axis names")
-        names = ("bias", *PARAMETERS)
-        priors = self.only(self.entry(fields, "priors", where), names, f"{where}.priors")
+        names = ("bias", *PARAMETERS, *(name for law in laws for name in LAWS[law] if name not in PARAMETERS))
+        known = ("bias", *PLACES)
+        priors = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")
         return Group(
             name=name,
             axes=tuple(axes),
@@ -282,18 +297,22 @@ class _Reader:
             raise self.fail("regressors", f"{columns} columns are more than {MOST_COLUMNS} (periodic: two each)")
         return found
 
-    def nodes(self, tree: Any, where: str) -> GridNodes:
-        fields = self.only(tree, ("random_walk", "gauss_markov"), where)
-        pair = self.entry(fields, "gauss_markov", where)
-        if not isinstance(pair, list) or len(pair) != 2:
-            raise self.fail(f"{where}.gauss_markov", "must be [rho nodes, alpha nodes]")
-        return GridNodes(
-            self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", *NODES),
-            (
-                self.count(pair[0], f"{where}.gauss_markov", *NODES),
-                self.count(pair[1], f"{where}.gauss_markov", *NODES),
-            ),
-        )
+    def nodes(self, tree: Any, where: str, laws: Collection[str]) -> GridNodes:
+        known = ("gauss_markov", *SUMS)
+        fields = self.only(tree, ("random_walk", *known), where)
+        pairs = {}
+        for law in known:
+            if law != "gauss_markov" and law not in laws:
+                continue
+            pair = self.entry(fields, law, where)
+            if not isinstance(pair, list) or len(pair) != 2:
+                second = "spectral_ratio" if law == "moving_average" else "alpha"
+                raise self.fail(f"{where}.{law}", f"must be [rho nodes, {second} nodes]")
+            pairs[law] = (
+                self.count(pair[0], f"{where}.{law}", *NODES),
+                self.count(pair[1], f"{where}.{law}", *NODES),
+            )
+        return GridNodes(self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", *NODES), pairs)
 
     def model(self) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
@@ -302,18 +321,18 @@ class _Reader:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s"), "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
-        groups_tree = self.entry(tree, "groups", "")
-        if not isinstance(groups_tree, dict) or not groups_tree:
-            raise self.fail("groups", "must be a mapping of at least one group")
-        groups = tuple(self.group(str(name), fields) for name, fields in groups_tree.items())
-        axes = [axis for group in groups for axis in group.axes]
-        for axis in axes:
-            if axes.count(axis) > 1:
-                raise self.fail("groups", f"axis '{axis}' appears twice")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
         if not weights:
             raise self.fail("hypotheses", f"must name at least one of {', '.join(LAWS)}")
+        groups_tree = self.entry(tree, "groups", "")
+        if not isinstance(groups_tree, dict) or not groups_tree:
+            raise self.fail("groups", "must be a mapping of at least one group")
+        groups = tuple(self.group(str(name), fields, weights) for name, fields in groups_tree.items())
+        axes = [axis for group in groups for axis in group.axes]
+        for axis in axes:
+            if axes.count(axis) > 1:
+                raise self.fail("groups", f"axis '{axis}' appears twice")
         targets = self.entry(tree, "nodes", "")
         if not isinstance(targets, dict) or "host" not in targets:
             raise self.fail("nodes", "must be a mapping of targets, 'host' among them")
@@ -327,7 +346,7 @@ class _Reader:
             filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1),
             groups=groups,
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
-            nodes={name: self.nodes(fields, f"nodes.{name}") for name, fields in targets.items()},
+            nodes={name: self.nodes(fields, f"nodes.{name}", weights) for name, fields in targets.items()},
             simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),

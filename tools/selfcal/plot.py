@@ -12,7 +12,13 @@ from selfcal.errors import UserError
 from selfcal.model import LAWS
 from selfcal.wire import AxisReport, signal_unit
 
-COLORS = {"constant": "tab:green", "random_walk": "tab:blue", "gauss_markov": "tab:red"}
+COLORS = {
+    "constant": "tab:green",
+    "random_walk": "tab:blue",
+    "gauss_markov": "tab:red",
+    "flicker": "tab:purple",
+    "moving_average": "tab:orange",
+}
 #: Columns after the probabilities: parameter, and the laws whose estimates of it are drawn.
 PANELS = {
     "N": ("random_walk", "gauss_markov"),

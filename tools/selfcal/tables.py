@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline
 
 from selfcal import _library32
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, Model, Regressor
+from selfcal.model import LAWS, PARAMETERS, PLACES, SUMS, Group, Model, Regressor
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
 RATE_LIMITS = (1e-6, 1e6)
@@ -63,13 +63,15 @@ class RegressorTable:
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """One hypothesis: its law (index into LAWS), prior probability and grids."""
+    """One hypothesis: its law (index into LAWS), prior probability and grids; of a sum also each axis's priors (ln
+    limits, whether uniform) in the order of PARAMETERS."""
 
     name: str
     law: int
     ln_probability: float
     rho: Grid | None
     alpha: Grid | None
+    priors: tuple[tuple[tuple[float, float, bool], ...], ...] = ()
 
     @property
     def nodes(self) -> int:
@@ -94,10 +96,15 @@ class Tables:
         return sum(h.nodes for h in self.hypotheses)
 
     @property
+    def term_nodes(self) -> int:
+        """Filters of the laws that are sums."""
+        return sum(h.nodes for h in self.hypotheses if h.name in SUMS)
+
+    @property
     def id(self) -> int:
         """32-bit checksum of everything that decides what the sums mean."""
         hypotheses = [
-            (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0)
+            (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0, *h.priors)
             for h in self.hypotheses
         ]
         extras = (*self.regressors, *([self.half_life_s] if self.half_life_s else []))
@@ -156,14 +163,20 @@ def make_tables(
     grids: dict[str, tuple[Grid | None, Grid | None]] = {
         "constant": (None, None),
         "random_walk": (make_grid(nodes.random_walk), None),
-        "gauss_markov": (make_grid(nodes.gauss_markov[0]), make_grid(nodes.gauss_markov[1])),
+        **{law: (make_grid(rho), make_grid(alpha)) for law, (rho, alpha) in nodes.pairs.items()},
     }
     return Tables(
         dt_s=float(np.float32(block / rate_hz)),
         block=block,
         axes=tuple(axis_tables),
         hypotheses=tuple(
-            HypothesisTable(name, list(LAWS).index(name), math.log(probability), *grids[name])
+            HypothesisTable(
+                name,
+                list(LAWS).index(name),
+                math.log(probability),
+                *grids[name],
+                priors=tuple(_priors(model.group_of(axis), name) for axis in names) if name in SUMS else (),
+            )
             for name, probability in model.hypotheses.items()
         ),
         regressors=tuple(
@@ -173,6 +186,13 @@ def make_tables(
         ),
         half_life_s=model.half_life_s,
     )
+
+
+def _priors(group: Group, law: str) -> tuple[tuple[float, float, bool], ...]:
+    """In each place the prior of the parameter that the law has there, else that of the axis."""
+    of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in LAWS[law]}
+    chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
+    return tuple((math.log(p.min), math.log(p.max), p.law == "uniform") for p in chosen)
 
 
 def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:

@@ -146,9 +146,9 @@ def per_second(unit: str) -> str:
 
 
 def parameter_unit(parameter: str, unit: str) -> str:
-    """Unit of a model parameter (bias, N, K, sigma_m, alpha) of an axis that reads in `unit`."""
+    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, spectral_ratio) of an axis that reads in `unit`."""
     match parameter:
-        case "bias" | "sigma_m":
+        case "bias" | "sigma_m" | "B":
             return unit
         case "N":
             return f"{unit}/sqrt(Hz)"
@@ -156,4 +156,6 @@ def parameter_unit(parameter: str, unit: str) -> str:
             return f"{per_second(unit)}/sqrt(Hz)"
         case "alpha":
             return "1/s"
+        case "spectral_ratio":
+            return "1"
     raise ValueError(f"no such parameter: {parameter}")

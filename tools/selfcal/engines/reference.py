@@ -39,6 +39,8 @@ _LN_EVIDENCE, _MOMENT = 4e-4, 5e-3
 _MOST = 1_000_000
 #: Scan for modes: points in each drift parameter, by the number of those.
 _SCAN = {0: (), 1: (25,), 2: (11, 9)}
+#: What of a law's states is drift, where that is not the one it has.
+_DRIFT = {"flicker": (1.0, 1.0, 1.0), "moving_average": (1.0, 0.0, 0.0)}
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -113,7 +115,9 @@ def _posterior(
     columns: tuple[_Floats, _Floats] | None,
 ) -> _Posterior:
     z, sd = (None, None) if columns is None else columns
-    now = np.ones(2) if z is None else np.concatenate([[1.0, 1.0], z[np.flatnonzero(np.isfinite(y))[-1]]])
+    drift = _DRIFT.get(law, (1.0,))
+    columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
+    now = np.concatenate([drift, [1.0], columns_now])
     names = LAWS[law]
     priors = [group.priors[name] for name in names]
     low = np.log([prior.min for prior in priors])
@@ -138,15 +142,16 @@ def _posterior(
             sd,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
-        own = np.diagonal(covariance, axis1=1, axis2=2)[:, 2:]
+        own = np.diagonal(covariance, axis1=1, axis2=2)[:, len(drift) + 1 :]
         return _Filtered(
             ln_p + ln_prior,
-            np.column_stack([mean @ now, mean[:, 2:]]),
+            np.column_stack([mean @ now, mean[:, len(drift) + 1 :]]),
             np.column_stack([np.einsum("i,mij,j->m", now, covariance, now), own]),
         )
 
     seeds = _modes(lambda x: filtered(x).value, low, high)
-    lattice = _Lattice(filtered, low, high, _widths(lambda x: filtered(x).value, seeds[0], low, high), len(now) - 1)
+    widths = _widths(lambda x: filtered(x).value, seeds[0], low, high)
+    lattice = _Lattice(filtered, low, high, widths, 1 + len(columns_now))
     lattice.start(seeds)
     lattice.refine()
     mass = lattice.mass(None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from selfcal.errors import UserError
@@ -58,6 +58,7 @@ def _header(model: Model, tables: Tables) -> str:
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
 #define SELFCAL_MODEL_EXPONENTS {{{", ".join(str(coarsest_exponent(axis, tables.dt_s)) for axis in tables.axes)}}}
+#define SELFCAL_MODEL_TERM_NODES {tables.term_nodes}U
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
 
@@ -67,7 +68,7 @@ def _header(model: Model, tables: Tables) -> str:
 #if SELFCAL_HYPOTHESIS_NODES_MAX < {most}
 #error "SELFCAL_HYPOTHESIS_NODES_MAX is too small for this model"
 #endif
-
+{_terms(tables)}
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 
@@ -85,6 +86,10 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
     return max(math.ceil(math.log2(span / FIXED_LIMIT)), math.floor(math.log2(sigma) + 1e-5) - FIXED_SIGMA_BITS)
+def _terms(tables: Tables) -> str:
+    if not tables.term_nodes:
+        return ""
+    return '#if SELFCAL_TERMS_MAX < 3\n#error "set SELFCAL_TERMS_MAX to 3: this model has laws that are sums"\n#endif\n'
 
 
 def _source(model: Model, tables: Tables) -> str:
@@ -94,6 +99,11 @@ def _source(model: Model, tables: Tables) -> str:
     parts += ['#include "selfcal_model.h"', ""]
     parts += [_grid(grids[nodes]) for nodes in sizes]
     parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
+    for h in tables.hypotheses:
+        if h.priors:
+            named = zip(h.priors, tables.axes, strict=True)
+            rows = (f"    {_priors(priors)}, /* {axis.name} */" for priors, axis in named)
+            parts += [f"static const selfcal_prior_t priors_of_{h.name}[] = {{", *rows, "};", ""]
     hypotheses = (_hypothesis(h) for h in tables.hypotheses)
     parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
     parts += _regressors(tables)
@@ -131,11 +141,12 @@ def _grid(grid: Grid) -> str:
     )
 
 
+def _priors(priors: Iterable[tuple[float, float, bool]]) -> str:
+    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}" for lo, hi, uniform in priors)
+
+
 def _axis(axis: AxisTable) -> str:
-    priors = ", ".join(
-        f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}"
-        for lo, hi, uniform in zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True)
-    )
+    priors = _priors(zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True))
     readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
     return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
 
@@ -162,5 +173,7 @@ def _regressors(tables: Tables) -> list[str]:
 
 def _hypothesis(hypothesis: HypothesisTable) -> str:
     law = f"SELFCAL_{list(LAWS)[hypothesis.law].upper()}"
-    grids = ", ".join(f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
-    return f"    {{{law}, {_f(hypothesis.ln_probability)}, {grids}}},"
+    rho, alpha = (f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
+    prior = f", .prior = priors_of_{hypothesis.name}" if hypothesis.priors else ""
+    chance = _f(hypothesis.ln_probability)
+    return f"    {{.law = {law}, .ln_probability = {chance}, .rho = {rho}, .alpha = {alpha}{prior}}},"

@@ -150,8 +150,6 @@ def identify_axis(
         raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
-    if engine == "fixed" and regressors:
-        raise UserError("the fixed-point bank knows no regressors: take --engine library, or a model without them")
     choices = choices_of(regressors)
     results: list[AxisResult] = []
     z = blocks.z - np.array([column.reference for column in tables.regressors])
@@ -279,8 +277,8 @@ def _checks(
         -offset,
         group.priors["bias"].sd,
         list(LAWS).index(law),
-        at.get("K", at.get("sigma_m", 0.0)),
-        at.get("alpha", 1.0),
+        at.get("K", at.get("sigma_m", at.get("B", 0.0))),
+        at.get("alpha", at.get("spectral_ratio", 1.0)),
         at["N"] / math.sqrt(tables.dt_s),
         blocks.r,
         np.ascontiguousarray(z[:, used]) if used else None,
@@ -418,7 +416,7 @@ def show(document: Mapping[str, Any]) -> None:
         caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it",
         caption_justify="left",
     )
-    for heading in ("law", "P", "N", "K or sigma_m", "1/alpha, s"):
+    for heading in ("law", "P", "N", "K, sigma_m or B", "1/alpha, s, or ratio"):
         table.add_column(heading, no_wrap=True)
     failed: list[str] = []
     kept: list[str] = []
@@ -433,8 +431,8 @@ def show(document: Mapping[str, Any]) -> None:
                 law,
                 f"{probability:.4f}",
                 _interval(parameters["N"]),
-                _interval(parameters.get("K") or parameters.get("sigma_m")),
-                _interval(parameters.get("alpha"), inverse=True),
+                _interval(parameters.get("K") or parameters.get("sigma_m") or parameters.get("B")),
+                _interval(parameters.get("alpha"), inverse=True) or _interval(parameters.get("spectral_ratio")),
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )

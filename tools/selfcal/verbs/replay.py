@@ -20,7 +20,7 @@ from rich.console import Console
 
 from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
-from selfcal.model import Model
+from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, load
 from selfcal.tables import bank_block
@@ -93,6 +93,9 @@ def replay(
     loaded_model = Model.load(model)
     if loaded_model.regressors:
         raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
+    sums = [law for law in loaded_model.hypotheses if law in SUMS]
+    if sums:
+        raise UserError(f"{loaded_model.path}: telemetry has no items for {' and '.join(sums)}; take `identify`")
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded_model, axes)
     for name in names:

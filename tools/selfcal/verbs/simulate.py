@@ -13,7 +13,8 @@ import numpy as np
 
 from selfcal import _reference, recording, units
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, Group, Model, Prior
+from selfcal.model import LAWS, PARAMETERS, PLACES, Group, Model, Prior
+from selfcal.tables import bank_block
 
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
 _DRAWS = 2**32
@@ -93,6 +94,7 @@ def simulate(
     if not 0 <= seed < 2**64:
         raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
     scene = _scene(model, seed)
+    scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = _truth(model, seed)
     axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
     applied = [_apply(text, model, scene, axes) for text in effects]
@@ -104,7 +106,7 @@ def simulate(
             "bias_now": now,
             # Rounding to the lattice adds lsb^2 / 12 to each sample's variance: the white noise that a record shows.
             "N_with_lattice": math.sqrt(axis.N**2 + axis.lsb**2 / 12.0 / scene.rate_hz),
-            "units": {key: units.parameter_unit(key, truth[name]["unit"]) for key in ("bias", *PARAMETERS)},
+            "units": {key: units.parameter_unit(key, truth[name]["unit"]) for key in model.group_of(name).priors},
         }
     meta = {
         "simulated": True,
@@ -159,7 +161,7 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
     for number, name in enumerate(model.axes):
         where = f"axes.{name}"
         fields = stated.get(name) or {}
-        allowed = ("hypothesis", "bias", *PARAMETERS)
+        allowed = ("hypothesis", "bias", *PLACES)
         if not isinstance(fields, Mapping):
             raise UserError(f"{model.path}: simulate.{where}: must be a mapping of {', '.join(allowed)}")
         for key in fields:
@@ -170,11 +172,14 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         priors = model.group_of(name).priors
         law = _pick(model.hypotheses, random.uniform())
         drawn = {"bias": priors["bias"].sd * random.normal()}
-        drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in PARAMETERS}
+        more = [parameter for parameter in priors if parameter not in ("bias", *PARAMETERS)]
+        drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in (*PARAMETERS, *more)}
         law = fields.get("hypothesis", law)
         if law not in LAWS:
             raise UserError(f"{model.path}: simulate.{where}.hypothesis: unknown '{law}' (known: {', '.join(LAWS)})")
-        for key in drawn.keys() & fields.keys():
+        for key in PLACES.keys() | {"bias"}:
+            if key not in fields:
+                continue
             drawn[key] = _positive(model, fields[key], f"{where}.{key}", signed=key == "bias")
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
         truth[name] |= {parameter: drawn[parameter] for parameter in LAWS[law]}

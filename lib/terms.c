@@ -1,0 +1,445 @@
+/* Laws that are sums: nodes whose drift, or whose coloured noise, has several states.
+ *
+ * A reading is y_i = x0 + sum_j x_j + w_i, the states scaled so that each is read with a factor of 1. All variances are relative to
+ * sigma_v^2, r that of a sample's white noise (1 for a whole block):
+ *   x_j' = phi_j x_j + noise of variance q_j,   w_i ~ N(0, r/(1 + theta)^2).
+ * A moving average (e_i + theta e_(i-1))/(1 + theta) is w_i = e_i/(1 + theta) and a last state theta e_(i-1)/(1 + theta), whose phi is 0
+ * and whose noise is theta w_i. The filter with noise of reading and state correlated (Anderson & Moore, Optimal Filtering, 1979, section
+ * 5.4), one step from prediction to prediction, with S = theta r/(1 + theta)^2 in the last place and else 0:
+ *   nu = y - sum x_j    s = r/(1 + theta)^2 + sum P    kappa = (phi_j sum_i P_ij + S_j)/s
+ *   x_j' = phi_j x_j + kappa_j nu                      P' = phi P phi + Q - kappa kappa' s
+ * P and the gains are in selfcal_wide_t, until P has converged; a sample then costs the filter alone. The bias and sigma_v are integrated
+ * out from the same sums as for every node (bank.c), which are here taken to twice the digits, the regressors' columns among them
+ * (regressors.c says why). */
+#include "kernel.h"
+
+#if SELFCAL_TERMS_MAX > 1
+
+/* P has converged when no variance moves by this part of itself within a sample: at a gain of 1e-4 it then is within 1e-8. */
+#define CONVERGED 1e-12
+
+/* As in bank.c. */
+#define ALPHA_DT_MAX 6.9
+
+/* Products of s are so far from 0 and infinity that the next s cannot reach either. */
+#define PRODUCT_MAX 1e200
+
+static size_t order_of(selfcal_law_t law) {
+    return law == SELFCAL_FLICKER ? 3U : 2U;
+}
+
+size_t selfcal_terms_nodes(const selfcal_model_t *model) {
+    size_t nodes = 0;
+    for (uint8_t h = 0; h < model->hypotheses; h++) {
+        nodes += is_sum(model->hypothesis[h].law) ? hypothesis_nodes(&model->hypothesis[h]) : 0U;
+    }
+    return nodes;
+}
+
+static size_t columns_of(const selfcal_t *self) {
+    return self->model->regressors != NULL ? self->model->regressors->count : 0U;
+}
+
+static size_t series_of(const selfcal_t *self) {
+    return 1U + columns_of(self) + self->model->axes;
+}
+
+/* Node `j` among those of sums, and its law. */
+typedef struct {
+    size_t index, order;
+} term_t;
+
+static term_t term_of(const selfcal_t *self, size_t j) {
+    const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
+    size_t others = 0, first = 0;
+    while (j - first >= hypothesis_nodes(hypothesis)) {
+        const size_t nodes = hypothesis_nodes(hypothesis);
+        others += is_sum(hypothesis->law) ? 0U : nodes;
+        first += nodes;
+        hypothesis++;
+    }
+    const term_t term = {j - others, order_of(hypothesis->law)};
+    return term;
+}
+
+/* States of one series. */
+static selfcal_sum_t *states(const selfcal_t *self, size_t index, size_t series) {
+    return &self->terms->x[(index * series_of(self) + series) * SELFCAL_TERMS_MAX];
+}
+
+/* Sums of the readings of an axis. */
+typedef struct {
+    selfcal_sum_t *b, *c;
+} reading_sums_t;
+
+static reading_sums_t reading_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
+#ifdef SELFCAL_FIXED
+    (void)j;
+    selfcal_sum_t *bc = &self->terms->bc[(index * self->model->axes + axis) * 2U];
+    const reading_sums_t sums = {bc, bc + 1};
+#else
+    (void)index;
+    const size_t k = j * self->model->axes + axis;
+    const reading_sums_t sums = {&self->b[k], &self->c[k]};
+#endif
+    return sums;
+}
+
+/* Behind the memory of the bank and its regressors; what SELFCAL_TERMS_SIZE() adds includes the room to align it. */
+void selfcal_terms_init(selfcal_t *self, unsigned char *memory) {
+    const size_t nodes = selfcal_terms_nodes(self->model);
+    memory += (8U - ((uintptr_t)memory & 7U)) & 7U;
+    self->terms = (selfcal_terms_t *)(void *)memory;
+    memory += (sizeof *self->terms + 7U) / 8U * 8U;
+    self->terms->node = (selfcal_term_node_t *)(void *)memory;
+    self->terms->x = (selfcal_sum_t *)(void *)(self->terms->node + nodes);
+#ifdef SELFCAL_FIXED
+    self->terms->bc = self->terms->x + nodes * series_of(self) * SELFCAL_TERMS_MAX;
+#endif
+}
+
+/* ------------------------------------------------------------------------------------------------------------- gains */
+
+static selfcal_wide_t phi_of(const selfcal_term_node_t *node, size_t a) {
+    return 1.0 - (selfcal_wide_t)node->beta[a];
+}
+
+/* 1/(1 + theta)^2. */
+static selfcal_wide_t white_of(const selfcal_term_node_t *node) {
+    const selfcal_wide_t whole = 1.0 + (selfcal_wide_t)node->theta;
+    return 1.0 / (whole * whole);
+}
+
+void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
+    const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
+    const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
+    selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
+    memset(node, 0, sizeof *node);
+    if (law == SELFCAL_FLICKER) {
+        const selfcal_wide_t variance = square * SELFCAL_FLICKER_TERM; /* stationary, of each term */
+        selfcal_wide_t alpha_dt = 0.1 * exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s;
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+            node->beta[a] = (selfcal_real_t)-expm1(-fmin(alpha_dt, ALPHA_DT_MAX));
+            const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
+            node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
+            node->p[term_pair(a, a)] = variance;
+            alpha_dt *= 10.0;
+        }
+    } else {
+        node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
+        node->q[0] = (selfcal_real_t)square;
+        node->p[term_pair(0, 0)] = square; /* x_0 = 0 */
+        node->beta[1] = R(1.0);
+        node->p[term_pair(1, 1)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
+    }
+}
+
+/* The gain side of a span. */
+typedef struct {
+    gains_t sums; /* of which inv_s and scale are used */
+    selfcal_real_t kappa[SELFCAL_TERMS_MAX][SELFCAL_BATCH];
+} term_gains_t;
+
+/* One sample's, and P for the next one. */
+typedef struct {
+    selfcal_wide_t s, kappa[SELFCAL_TERMS_MAX];
+} gain_t;
+
+static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wide_t r) {
+    const selfcal_wide_t white = r * white_of(node);
+    gain_t gain;
+    gain.s = white;
+    for (size_t a = 0; a < order; a++) {
+        gain.kappa[a] = 0.0;
+        for (size_t b = 0; b < order; b++) {
+            gain.kappa[a] += node->p[a >= b ? term_pair(a, b) : term_pair(b, a)];
+        }
+        gain.s += gain.kappa[a];
+    }
+    for (size_t a = 0; a < order; a++) {
+        gain.kappa[a] = (phi_of(node, a) * gain.kappa[a] + (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
+    }
+    return gain;
+}
+
+/* Whether P has come to rest. */
+static bool step(selfcal_term_node_t *node, size_t order, selfcal_wide_t r, const gain_t *gain) {
+    const selfcal_wide_t theta = (selfcal_wide_t)node->theta;
+    bool rests = true;
+    for (size_t a = 0; a < order; a++) {
+        for (size_t b = 0; b <= a; b++) {
+            selfcal_wide_t *p = &node->p[term_pair(a, b)];
+            const selfcal_wide_t before = *p;
+            *p = phi_of(node, a) * phi_of(node, b) * before - gain->kappa[a] * gain->kappa[b] * gain->s;
+            if (a == b) {
+                *p += (selfcal_wide_t)node->q[a] + (a + 1U == order ? theta * theta * r * white_of(node) : 0.0);
+                *p = fmax(*p, 0.0); /* a moving average's, once its e_(i-1) is known */
+                /* a moving average's is what is left of two numbers of the size of the last term */
+                const selfcal_wide_t rounding = a + 1U == order ? 1e-15 * theta * theta * white_of(node) : 0.0;
+                rests = rests && fabs(*p - before) <= CONVERGED * before + rounding;
+            }
+        }
+    }
+    return rests;
+}
+
+/* The constant s of a converged node goes into D with the count of its samples. */
+static void settle(selfcal_node_t *node, const selfcal_term_node_t *term, size_t order) {
+    if (term->steady) {
+        const selfcal_sum_t ln_s = make_sum((selfcal_wide_t)node->steady * log(gain_of(term, order, 1.0).s));
+        sum_add(&node->ln_s, ln_s.hi, ln_s.lo);
+        node->steady = 0;
+    }
+}
+
+void selfcal_terms_settle(selfcal_t *self, size_t j) {
+    const term_t term = term_of(self, j);
+    settle(&self->node[j], &self->terms->node[term.index], term.order);
+}
+
+#ifdef SELFCAL_FIXED
+void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+    for (size_t axis = 0; axis < self->model->axes; axis++) {
+        const reading_sums_t sums = reading_sums(self, j, term_of(self, j).index, axis);
+        sum_fade(sums.b, keep_b);
+        sum_fade(sums.c, keep_c);
+    }
+}
+#endif
+
+static void gains_steady(const selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
+    const gain_t gain = gain_of(term, order, 1.0);
+    gains->sums.scale = make_sum(1.0 / gain.s);
+    for (uint32_t i = gains->sums.span.from; i < gains->sums.span.to; i++) {
+        gains->sums.inv_s[i] = R(1.0);
+        for (size_t a = 0; a < order; a++) {
+            gains->kappa[a][i] = (selfcal_real_t)gain.kappa[a];
+        }
+    }
+}
+
+/* What the rounding of 1/s loses on the mean of the span goes into the scale, as in bank.c. */
+static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term, size_t order,
+                          term_gains_t *gains) {
+    const span_t span = gains->sums.span;
+    selfcal_wide_t product = 1.0, ln_s = 0.0, short_of = 0.0;
+    bool rests = false;
+    for (uint32_t i = span.from; i < span.to; i++) {
+        const selfcal_wide_t r = (selfcal_wide_t)batch->r[i];
+        const gain_t gain = gain_of(term, order, r);
+        const selfcal_real_t inv_s = (selfcal_real_t)(1.0 / gain.s);
+        gains->sums.inv_s[i] = inv_s;
+        short_of += 1.0 - (selfcal_wide_t)inv_s * gain.s;
+        for (size_t a = 0; a < order; a++) {
+            gains->kappa[a][i] = (selfcal_real_t)gain.kappa[a];
+        }
+        product *= gain.s;
+        if (product > PRODUCT_MAX || product < 1.0 / PRODUCT_MAX) {
+            ln_s += log(product);
+            product = 1.0;
+        }
+        rests = step(term, order, r, &gain) && r == 1.0;
+    }
+    const selfcal_sum_t more = make_sum(ln_s + log(product));
+    sum_add(&node->ln_s, more.hi, more.lo);
+    gains->sums.scale.hi = R(1.0);
+    gains->sums.scale.lo = (selfcal_real_t)(short_of / (selfcal_wide_t)(span.to - span.from));
+    term->steady = rests;
+}
+
+/* ------------------------------------------------------------------------------------------------------------ filter */
+
+/* One series, `y` [SELFCAL_BATCH] or all 1 if NULL, through a span; `x` are its states. Sums are taken to twice the digits. */
+static void filter(const selfcal_term_node_t *term, size_t order, const term_gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x[],
+                   innovations_t *out) {
+    const uint32_t from = gains->sums.span.from, count = gains->sums.span.to - from;
+    for (uint32_t i = 0; i < count; i++) {
+        selfcal_sum_t rest = {y != NULL ? y[from + i] : R(1.0), R(0.0)};
+        for (size_t a = 0; a < order; a++) {
+            const selfcal_sum_t less = two_sum(rest.hi, -x[a].hi);
+            rest.hi = less.hi;
+            rest.lo += less.lo - x[a].lo;
+        }
+        const selfcal_real_t nu = rest.hi + rest.lo, inv_s = gains->sums.inv_s[from + i];
+        out->nu[i] = nu;
+        out->weighted[i] = nu * inv_s;
+        out->low[i] = r_fma_exact(nu, inv_s, -out->weighted[i]);
+        for (size_t a = 0; a < order; a++) {
+            const selfcal_real_t beta = term->beta[a];
+            const selfcal_real_t change = r_fma_exact(gains->kappa[a][from + i], nu, -beta * x[a].hi);
+            x[a] = two_sum(x[a].hi, change + (R(1.0) - beta) * x[a].lo);
+        }
+    }
+}
+
+void selfcal_terms_run(selfcal_t *self, size_t j, const span_t *span) {
+    const selfcal_batch_t *batch = waiting(self);
+    const term_t at_node = term_of(self, j);
+    const size_t p = columns_of(self), axes = self->model->axes, order = at_node.order;
+    selfcal_node_t *node = &self->node[j];
+    selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    bool whole = true;
+    for (uint32_t i = span->from; i < span->to && batch->part; i++) {
+        whole = whole && batch->r[i] == R(1.0);
+    }
+    term_gains_t gains;
+    gains.sums.span = *span;
+    if (whole && term->steady) {
+        gains_steady(term, order, &gains);
+        node->steady += span->to - span->from;
+    } else {
+        settle(node, term, order);
+        gains_varying(batch, node, term, order, &gains);
+    }
+    innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
+    selfcal_sum_t *a = p > 0U ? &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
+    for (size_t k = 0; k <= p; k++) {
+        const selfcal_real_t *y = k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering];
+        filter(term, order, &gains, y, states(self, at_node.index, k), &column[k]);
+        for (size_t l = 0; p > 0U && l <= k; l++) {
+            selfcal_add_products(a++, &gains.sums, &column[l], &column[k]);
+        }
+    }
+    selfcal_add_products(&node->a, &gains.sums, &column[0], &column[0]);
+    for (size_t axis = 0; axis < axes; axis++) {
+        const reading_sums_t sums = reading_sums(self, j, at_node.index, axis);
+        filter(term, order, &gains, batch->y[axis], states(self, at_node.index, 1U + p + axis), &reading);
+        selfcal_add_products(sums.c, &gains.sums, &reading, &reading);
+        selfcal_add_products(sums.b, &gains.sums, &column[0], &reading);
+        for (size_t k = 0; k < p; k++) {
+            selfcal_add_products(&self->columns->b[(j * axes + axis) * p + k], &gains.sums, &column[k + 1U], &reading);
+        }
+    }
+}
+
+void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
+    const term_t at_node = term_of(self, j);
+    const size_t order = at_node.order;
+    const selfcal_wide_t intervals = (selfcal_wide_t)count;
+    selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    settle(&self->node[j], term, order);
+    term->steady = false;
+    selfcal_wide_t less[SELFCAL_TERMS_MAX]; /* 1 - phi^count */
+    for (size_t a = 0; a < order; a++) {
+        less[a] = term->beta[a] < R(1.0) ? -expm1(intervals * log1p(-(selfcal_wide_t)term->beta[a])) : 1.0;
+    }
+    for (size_t a = 0; a < order; a++) {
+        const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a], theta = (selfcal_wide_t)term->theta;
+        for (size_t b = 0; b <= a; b++) {
+            term->p[term_pair(a, b)] *= (1.0 - less[a]) * (1.0 - less[b]);
+        }
+        term->p[term_pair(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a]) : intervals * q;
+        term->p[term_pair(a, a)] += a + 1U == order ? theta * theta * white_of(term) : 0.0;
+    }
+    for (size_t series = 0; series < series_of(self); series++) {
+        selfcal_sum_t *x = states(self, at_node.index, series);
+        for (size_t a = 0; a < order; a++) {
+            x[a] = make_sum(sum_value(x[a]) * (1.0 - less[a]));
+        }
+    }
+}
+
+/* -------------------------------------------------------------------------------------------------------------- views */
+
+size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis) {
+    return 1U + columns_of(self) + axis;
+}
+
+/* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
+void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
+    const term_t at_node = term_of(self, j);
+    const selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        const bool is_drift = a < at_node.order && term->beta[a] < R(1.0);
+        drift[a] = is_drift ? sum_value(states(self, at_node.index, series)[a]) / phi_of(term, a) : 0.0;
+    }
+}
+
+void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
+    const term_t at_node = term_of(self, j);
+    const selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    memset(spread, 0, SELFCAL_TERM_PAIRS * sizeof spread[0]);
+    for (size_t a = 0; a < at_node.order; a++) {
+        for (size_t b = 0; b <= a && term->beta[a] < R(1.0); b++) {
+            /* P' = phi P(now) phi + Q */
+            const selfcal_wide_t p = term->p[term_pair(a, b)] - (a == b ? (selfcal_wide_t)term->q[a] : 0.0);
+            spread[term_pair(a, b)] = p / (phi_of(term, a) * phi_of(term, b));
+        }
+    }
+}
+
+void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
+    const term_t at_node = term_of(self, index);
+    const selfcal_node_t *node = &self->node[index];
+    const selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    const reading_sums_t sums = reading_sums(self, index, at_node.index, axis);
+    view->a = sum_value(node->a);
+    view->b = sum_value(*sums.b);
+    view->c = sum_value(*sums.c);
+    view->ln_s = sum_value(node->ln_s);
+    if (term->steady) {
+        view->ln_s += (selfcal_wide_t)node->steady * log(gain_of(term, at_node.order, 1.0).s);
+    }
+    selfcal_wide_t of_one[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
+    selfcal_terms_drift(self, index, 0, of_one);
+    selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), of_reading);
+    view->drift = 0.0;
+    view->bias_left = 1.0;
+    view->drift_var = 0.0;
+    selfcal_wide_t spread[SELFCAL_TERM_PAIRS];
+    selfcal_terms_spread(self, index, spread);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        view->drift += of_reading[a];
+        view->bias_left -= of_one[a];
+        for (size_t b = 0; b <= a; b++) {
+            view->drift_var += (a == b ? 1.0 : 2.0) * spread[term_pair(a, b)];
+        }
+    }
+}
+
+bool selfcal_terms_sound(const selfcal_t *self) {
+    const size_t nodes = selfcal_terms_nodes(self->model);
+    const selfcal_terms_t *terms = self->terms;
+    const size_t values = nodes * series_of(self) * SELFCAL_TERMS_MAX;
+    const uintptr_t after = ((uintptr_t)(terms + 1) + 7U) & ~(uintptr_t)7U;
+    if ((uintptr_t)terms->node != after || terms->x != (const void *)(terms->node + nodes)) {
+        return false;
+    }
+    for (size_t k = 0; k < values; k++) {
+        if (!isfinite(terms->x[k].hi) || !isfinite(terms->x[k].lo)) {
+            return false;
+        }
+    }
+#ifdef SELFCAL_FIXED
+    if (terms->bc != terms->x + values) {
+        return false;
+    }
+    for (size_t k = 0; k < nodes * self->model->axes * 2U; k++) {
+        if (!isfinite(terms->bc[k].hi) || !isfinite(terms->bc[k].lo) || (k % 2U == 1U && !(terms->bc[k].hi >= R(0.0)))) {
+            return false;
+        }
+    }
+#endif
+    for (size_t k = 0; k < nodes; k++) {
+        const selfcal_term_node_t *node = &terms->node[k];
+        if (!(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
+            return false;
+        }
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+            if (!(node->beta[a] >= R(0.0)) || !(node->beta[a] <= R(1.0)) || !(node->q[a] >= R(0.0)) || !isfinite(node->q[a]) ||
+                !(node->p[term_pair(a, a)] >= 0.0)) {
+                return false;
+            }
+        }
+        for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
+            if (!isfinite(node->p[a])) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+#else
+typedef int selfcal_no_terms_t; /* C99 wants a declaration in every file */
+#endif
