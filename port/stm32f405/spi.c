@@ -1,5 +1,5 @@
 /* ADIS16405 on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. Registers one
- * frame at a time and polled; bursts by DMA2 (RM0090 table 43: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+ * frame at a time and polled; bursts by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3 sends). */
 #include "board.h"
 #include "sensor.h"
 #include "stm32f405.h"

@@ -1,5 +1,6 @@
-/* The registers of the STM32F405 that this firmware uses, by hand from RM0090 (reference manual) and PM0214 (Cortex-M4
- * programming manual); the section is named at each block. Names are the manuals'. */
+/* The registers of the STM32F405 that this firmware uses, by hand from RM0090 (reference manual, revision 21) and PM0214
+ * (Cortex-M4 programming manual); the section is named at each block. Older revisions have the same sections, and some tables
+ * numbered one lower. Names are the manuals'. */
 #ifndef STM32F405_H
 #define STM32F405_H
 
@@ -246,7 +247,7 @@
 #define SCB_AIRCR_SYSRESETREQ (0x05FA0000U | BIT(2))
 #define SCB_CPACR_FPU (0xFU << 20)
 
-/* Interrupt numbers, RM0090 table 61. */
+/* Interrupt numbers, RM0090 table 62. */
 enum {
     IRQ_EXTI0 = 6,
     IRQ_CAN1_TX = 19,
