@@ -342,7 +342,7 @@ static void obey(app_t *app, uint32_t now)
 {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
-    if (command == 0U || app->answering) {
+    if (command == 0U || app->answering || app->module == NULL) {
         return;
     }
     app->ordered = 0;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import subprocess
 import sys
 from functools import lru_cache
@@ -27,6 +28,9 @@ from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is t
 from unicorn import arm_const as arm  # noqa: E402
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+#: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
+#: their rows go to build/campaigns.txt as well.
+MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
 #: A model whose bank takes no sample within a test, so that no report is made and time goes by fast.
 QUIET_RATE_HZ = 102.4
 QUIET_BANK_HZ = 0.01
@@ -67,6 +71,15 @@ def image(
             stamp.write_text(flags)
         subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
     return folder / "selfcal.elf"
+
+
+def tell(name: str, trials: int, survived: int, more: str = "") -> None:
+    """A row of the table of campaigns."""
+    row = f"{name:40} {trials:>9,} {survived:>9,}   {more}".rstrip()
+    print(f"\n{row}")
+    if MANY > 1:
+        with (ROOT / "build" / "campaigns.txt").open("a") as file:
+            file.write(row + "\n")
 
 
 def reports(frames: list[can.Message]) -> tuple[Decoder, list[AxisReport]]:

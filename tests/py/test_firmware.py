@@ -26,9 +26,9 @@ QUIET: dict[str, Any] = {"flags": "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0", "quiet
 
 
 def test_telemetry_on_the_bus_equals_the_host() -> None:
-    """The image as it ships, at 819.2 Hz: two reports of six axes, one sample in 97 stale and 0.14 s without data-ready.
-    What the library was given is exactly what the sensor made, each in its place; what it then sent is what the host
-    makes of that."""
+    """The image as it ships, at 819.2 Hz: two reports of six axes, one sample in 97 stale and 0.14 s without
+    data-ready. What the library was given is exactly what the sensor made, each in its place; what it then sent is what
+    the host makes of that."""
     board = Board(image("shipped"), seed=3, channel="test_firmware_equals_host")
     listener = can.Bus(interface="virtual", channel="test_firmware_equals_host")
     tap = Tap(board)

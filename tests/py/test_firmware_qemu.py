@@ -93,7 +93,7 @@ def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> 
     model, axes = Model.load(), ("gx", "gy", "ax") if core == "cortex-m4f" else ("gy", "ax")
     every = 200.0 if core == "cortex-m4f" else 600.0
     recording = part(tmp_path, 600.0, axes, slice(3000, 3070))
-    flags = "tests/c/same_math.c -Wno-double-promotion" + (" -DSAME_FMAF" if core == "cortex-m0" else "")
+    flags = f"{ROOT}/tests/c/same_math.c -Wno-double-promotion" + (" -DSAME_FMAF" if core == "cortex-m0" else "")
     history = {}
     for target in ("host", core):
         firmware = program(model, recording.rate_hz, axes, target, core, tmp_path, flags)
