@@ -95,7 +95,9 @@ emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
 
 campaigns: setup
-	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py
+	@rm -f $(BUILD)/campaigns.txt
+	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py
+	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 

@@ -187,6 +187,34 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
     return SELFCAL_OK;
 }
 
+selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
+    if (self == NULL || axis >= self->model->axes || !(fabsf(amount) < SELFCAL_SAMPLE_MAX) ||
+        !(fabsf(self->shifted[axis] + amount) < SELFCAL_SAMPLE_MAX)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (selfcal_retired(self, axis)) {
+        return SELFCAL_AXIS_RETIRED;
+    }
+    if (self->position > 0U && !self->dropped) {
+        open_gap(self);
+        drop_block(self);
+    }
+    self->shifted[axis] += amount;
+    if (self->started) {
+        const float before = self->origin[axis], sum = before + amount;
+        const float part = sum - before;
+        const float lost = (before - (sum - part)) + (amount - part); /* of the sum's rounding, exactly (Knuth's TwoSum) */
+        self->origin[axis] = sum;
+        self->offset[axis] += (selfcal_real_t)lost;
+    }
+    return SELFCAL_OK;
+}
+
+float selfcal_shifted(const selfcal_t *self, uint8_t axis) {
+    SELFCAL_ASSERT(axis < self->model->axes);
+    return self->shifted[axis];
+}
+
 /* Bits of a float without its sign: they order as the numbers do, infinity and not-a-number at the top. */
 #define MAGNITUDE 0x7FFFFFFFU
 #define INFINITE 0x7F800000U

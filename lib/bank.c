@@ -572,6 +572,10 @@ selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis) {
     return (selfcal_wide_t)self->origin[axis] + (selfcal_wide_t)self->offset[axis];
 }
 
+selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
+    return selfcal_offset(self, axis) - (selfcal_wide_t)self->shifted[axis];
+}
+
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_node_t *node = &self->node[index];

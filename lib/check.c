@@ -111,7 +111,7 @@ static bool averager_is_sound(const selfcal_t *self) {
         return false;
     }
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        if (self->bad[axis] > self->watched || !isfinite(self->last[axis])) {
+        if (self->bad[axis] > self->watched || !isfinite(self->last[axis]) || !isfinite(self->shifted[axis])) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&

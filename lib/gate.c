@@ -134,6 +134,11 @@ selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const se
     return SELFCAL_OK;
 }
 
+void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount) {
+    SELFCAL_ASSERT(gate != NULL && axis < gate->config.axes && isfinite(amount));
+    gate->origin[axis] += amount; /* 0 before the first sample, which then sets it */
+}
+
 selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise) {
     if (gate == NULL || noise == NULL || axis >= gate->config.axes) {
         return SELFCAL_BAD_ARGUMENT;

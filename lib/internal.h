@@ -141,6 +141,9 @@ bool selfcal_bank_run(selfcal_t *self, uint16_t nodes);
 bool selfcal_bank_hand_over(selfcal_t *self);
 /* Both, to the end. */
 void selfcal_bank_flush(selfcal_t *self);
+
+/* selfcal_offset() less the mean of the bias's prior, which moves with selfcal_shift(). */
+selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis);
 /* Where a node lies: its hypothesis, and ln of its rho and alpha; NaN where the law has none. */
 typedef struct {
     uint8_t hypothesis;

@@ -200,7 +200,7 @@ static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff
     selfcal_bank_view(bank, work->axis, index, &v);
     const selfcal_wide_t residual = fmax(v.c - v.b * v.b / v.a, least);
     const selfcal_wide_t var = residual / n_eff;
-    const selfcal_wide_t miss = v.b / v.a + selfcal_offset(bank, work->axis);
+    const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis);
     field_t field;
     field.ln_sigma = 0.5 * log(var);
     field.profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field.ln_sigma) + v.ln_s + n_eff + log1p(p0 * v.a / var) +
@@ -834,7 +834,7 @@ static void step_bias(selfcal_work_t *work) {
     const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t mean_sq = best_sq * (1.0 + 2.0 * first + second), prior_precision = mean_sq / (sd * sd);
-    const selfcal_wide_t offset = selfcal_offset(work->bank, work->axis);
+    const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
     const bool begins = work->at == 0U;
     for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         selfcal_node_view_t v;

@@ -263,7 +263,7 @@ typedef struct {
     uint8_t regressor[UNKNOWNS_MAX]; /* of each, from 1 on */
     selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], b[UNKNOWNS_MAX]; /* sums A and B */
     selfcal_wide_t sd[UNKNOWNS_MAX];       /* of the priors of x0 and of the coefficients */
-    selfcal_wide_t first[UNKNOWNS_MAX];    /* offset; first values of the regressors less their references */
+    selfcal_wide_t first[UNKNOWNS_MAX];    /* offset from the prior; first values of the regressors less their references */
     selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
     selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
     selfcal_wide_t lost[UNKNOWNS_MAX][SELFCAL_TERMS_MAX]; /* what the drift, each term of it, takes of that */
@@ -339,7 +339,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->lost[0][0] = 1.0 - normal->left[0];
     normal->drift[0] = normal->node.drift;
     normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
-    normal->first[0] = selfcal_offset(self, axis);
+    normal->first[0] = selfcal_bank_from_prior(self, axis);
     const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;
 #if SELFCAL_TERMS_MAX > 1

@@ -464,7 +464,7 @@ typedef struct {
 #define SELFCAL_TERMS_SIZE(nodes, axes, p) ((size_t)0U)
 #endif
 
-/* Private; declared here so that the caller can place it. */
+/* Private but for reading `position` and `block`; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
 #if SELFCAL_TERMS_MAX > 1
@@ -514,6 +514,7 @@ typedef struct {
     float last[SELFCAL_AXES_MAX];
     uint32_t equal[SELFCAL_AXES_MAX];
     bool in_gap;
+    float shifted[SELFCAL_AXES_MAX]; /* by selfcal_shift(), in all, unit */
     uint32_t retired;        /* a bit for each axis */
     uint32_t watched;        /* samples looked at since the axes were last judged ... */
     uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
@@ -567,6 +568,13 @@ selfcal_status_t selfcal_moving(selfcal_t *self);
 #define SELFCAL_VARIANCE_RATIO_MAX 1024.0F
 selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ratio);
 
+/* From the next sample on the sensor itself adds `amount` (unit) to the readings of an axis, say because its offset register was
+ * written with the bias. Everything known is kept, and the bias goes up by `amount`: only the origin of the sums and of the bias's
+ * prior moves, to the last digits of a float. The interval in progress yields no value. Not while a report is under way: begin it anew.
+ * SELFCAL_BAD_ARGUMENT, and nothing changes: no such axis, or `amount` or the sum of all of them is not below SELFCAL_SAMPLE_MAX;
+ * SELFCAL_AXIS_RETIRED. */
+selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount);
+
 /* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */
 
 /* Bank samples in the sums, those on their way into them included. */
@@ -580,6 +588,9 @@ const selfcal_counters_t *selfcal_counters(const selfcal_t *self);
 /* Standard deviation of samples about their block's mean, pooled, unit; NaN with block == 1, before the first whole block, of a retired axis.
  * White noise would make it sigma_v * sqrt(block): more says coloured noise or vibration within the blocks. */
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis);
+
+/* Sum of what selfcal_shift() has been told of an axis, unit; a snapshot keeps it, so that a sensor which has forgotten can be told. */
+float selfcal_shifted(const selfcal_t *self, uint8_t axis);
 
 /* Offset (unit) that is taken off an axis before the filters: its first bank sample. */
 selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis);
@@ -697,14 +708,14 @@ typedef struct {
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
 } selfcal_truth_t;
 
-/* Scratch of a report under way. Private; may be shared by all axes and reused. */
+/* Scratch of a report under way. Private but for reading `gathered`; may be shared by all axes and reused. */
 typedef struct {
     selfcal_t *bank;
     uint8_t axis, hypothesis, stage, pass;
     uint16_t first_node;
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     uint32_t batches; /* of the bank, when the sums came to rest */
-    bool gathered;    /* the nodes run over the last batch */
+    bool gathered;    /* the nodes run over the last batch: what is pushed now is later than the report */
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     /* of the hypothesis in hand */
@@ -851,6 +862,9 @@ selfcal_motion_t selfcal_gate_skip(selfcal_gate_t *gate, uint64_t count);
  * is not above 0, or a factor that is infinite. */
 selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise);
 
+/* The sensor itself adds `amount` (unit) to the readings of an axis from the next sample on, see selfcal_shift(): no motion. */
+void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount);
+
 /* The noise as measured over the whole windows of rest so far, for selfcal_gate_noise(): run with false_alarm 0 while the sensor
  * is known to rest, and with the sigma that is to be used. Each factor's relative error is about sqrt(2/windows), that of
  * `within` less. SELFCAL_TOO_SHORT below SELFCAL_GATE_MEASURED_MIN windows. */
@@ -892,7 +906,20 @@ typedef struct {
     uint32_t state_refused;
     uint32_t state_saves;
     uint32_t state_save_failures;
+    uint32_t motion;
+    uint32_t gate_alarm_count;
+    uint32_t retired; /* a bit for each axis of the model */
+    uint32_t command_count;
+    uint32_t command_refused_count;
+    float offset[SELFCAL_AXES_MAX]; /* of each axis of the model, unit: what the sensor adds by itself, see selfcal_shift() */
 } selfcal_module_t;
+
+/* A corrected sample, by axis of the model, unit; sd NAN: there is none of this axis. */
+typedef struct {
+    float value[SELFCAL_AXES_MAX]; /* reading less bias, see selfcal_predict() */
+    float sd[SELFCAL_AXES_MAX];    /* of that bias */
+    uint32_t motion;               /* code as in selfcal.dbc */
+} selfcal_corrected_t;
 
 /* Private; declared here so that the caller can place it. */
 typedef struct {
@@ -900,8 +927,11 @@ typedef struct {
     const selfcal_module_t *module;
     uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
     uint8_t of_law[SELFCAL_LAWS];      /* hypothesis with that law; SELFCAL_HYPOTHESES_MAX: none */
-    /* source of the frames under way: a report, or the status if NULL */
+    /* of the frames under way */
+    uint8_t source;
     const selfcal_report_t *report;
+    const selfcal_corrected_t *corrected;
+    uint32_t answer;
     const selfcal_counters_t *counters;
     selfcal_wide_t ln_best;
     uint32_t report_number;
@@ -928,9 +958,15 @@ selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfc
 /* What the following statuses tell of the module; it must stay. NULL: zeros. */
 void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module);
 
-/* Sends the status next, 34 frames; otherwise as selfcal_telemetry_report(). */
+/* Sends the status next, 46 frames; otherwise as selfcal_telemetry_report(). */
 selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
                                           selfcal_state_t state, uint32_t report_number, uint32_t time_ms);
+
+/* Sends a corrected sample next, up to 14 frames; otherwise as selfcal_telemetry_report(). */
+selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const selfcal_corrected_t *corrected, uint32_t time_ms);
+
+/* Sends one item of the answer message next; otherwise as selfcal_telemetry_report(). SELFCAL_BAD_ARGUMENT also if there is no such item. */
+selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t item, uint32_t value, uint32_t time_ms);
 
 /* Makes the next frame; false when there is none. O(1). */
 bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame);

@@ -123,6 +123,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, last, FLOAT)                     \
     F(selfcal_t, equal, U32)                      \
     F(selfcal_t, in_gap, BOOL)                    \
+    F(selfcal_t, shifted, FLOAT)                  \
     F(selfcal_t, retired, U32)                    \
     F(selfcal_t, watched, U32)                    \
     F(selfcal_t, bad, U32)                        \

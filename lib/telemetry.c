@@ -6,6 +6,7 @@
 #include <string.h>
 
 enum { STATISTICS = 5 }; /* mean, median, sd, q05, q95: items in this order */
+enum { STATUS, REPORT, CORRECTED, ANSWER }; /* what the frames under way are of */
 
 static const struct {
     const char *name;
@@ -104,27 +105,37 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
     return SELFCAL_OK;
 }
 
+/* Frames of `source` next, up to the item `last`; false while others are under way. */
+static bool begin(selfcal_telemetry_t *self, uint8_t source, uint8_t last, uint32_t time_ms)
+{
+    if (self->items != 0) {
+        return false;
+    }
+    self->source = source;
+    self->time_ms = time_ms;
+    self->item = 0;
+    self->made = 0;
+    self->items = (uint8_t)(last + 1U);
+    return true;
+}
+
 selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
                                           const selfcal_counters_t *counters, uint32_t time_ms)
 {
     if (self == NULL || report == NULL || counters == NULL || report->axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (self->items != 0) {
+    if (!begin(self, REPORT, SELFCAL_AXIS_END_ITEMS, time_ms)) {
         return SELFCAL_BUSY;
     }
     self->report = report;
     self->counters = counters;
-    self->time_ms = time_ms;
     self->ln_best = report->hypothesis[0].ln_evidence;
     for (uint8_t k = 1; k < self->model->hypotheses; k++) {
         if (report->hypothesis[k].ln_evidence > self->ln_best) {
             self->ln_best = report->hypothesis[k].ln_evidence;
         }
     }
-    self->item = 0;
-    self->made = 0;
-    self->items = SELFCAL_AXIS_END_ITEMS + 1;
     return SELFCAL_OK;
 }
 
@@ -139,17 +150,37 @@ selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfc
     if (self == NULL || counters == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (self->items != 0) {
+    if (!begin(self, STATUS, SELFCAL_STATUS_FRAMES_SENT, time_ms)) {
         return SELFCAL_BUSY;
     }
-    self->report = NULL;
     self->counters = counters;
     self->state = state;
     self->report_number = report_number;
-    self->time_ms = time_ms;
-    self->item = 0;
-    self->made = 0;
-    self->items = SELFCAL_STATUS_FRAMES_SENT + 1;
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const selfcal_corrected_t *corrected, uint32_t time_ms)
+{
+    if (self == NULL || corrected == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (!begin(self, CORRECTED, SELFCAL_CORRECTED_MOTION, time_ms)) {
+        return SELFCAL_BUSY;
+    }
+    self->corrected = corrected;
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t item, uint32_t value, uint32_t time_ms)
+{
+    if (self == NULL || item > SELFCAL_ANSWER_RESULT) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (!begin(self, ANSWER, item, time_ms)) {
+        return SELFCAL_BUSY;
+    }
+    self->item = item;
+    self->answer = value;
     return SELFCAL_OK;
 }
 
@@ -259,8 +290,29 @@ static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t coun
     return held_count(sum);
 }
 
-static uint32_t module_value(const selfcal_module_t *module, uint8_t item)
+/* What the module tells of the axis that has message `message`, as a number; 0 if none has. */
+static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message)
 {
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        if (self->message[axis] == message) {
+            return float_bits(self->module->offset[axis]);
+        }
+    }
+    return 0U;
+}
+
+static uint32_t retired_value(const selfcal_telemetry_t *self)
+{
+    uint32_t axes = 0;
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        axes |= (self->module->retired >> axis & 1U) << self->message[axis];
+    }
+    return axes;
+}
+
+static uint32_t module_value(const selfcal_telemetry_t *self, uint8_t item)
+{
+    const selfcal_module_t *module = self->module;
     switch (item) {
     case SELFCAL_STATUS_RESET_CAUSE: return module->reset_cause;
     case SELFCAL_STATUS_FAULT_ADDRESS: return module->fault_address;
@@ -279,7 +331,13 @@ static uint32_t module_value(const selfcal_module_t *module, uint8_t item)
     case SELFCAL_STATUS_STATE_FOUND: return module->state_found;
     case SELFCAL_STATUS_STATE_REFUSED: return module->state_refused;
     case SELFCAL_STATUS_STATE_SAVES: return module->state_saves;
-    default: return module->state_save_failures; /* SELFCAL_STATUS_STATE_SAVE_FAILURES */
+    case SELFCAL_STATUS_STATE_SAVE_FAILURES: return module->state_save_failures;
+    case SELFCAL_STATUS_MOTION: return module->motion;
+    case SELFCAL_STATUS_GATE_ALARM_COUNT: return module->gate_alarm_count;
+    case SELFCAL_STATUS_AXES_RETIRED: return retired_value(self);
+    case SELFCAL_STATUS_COMMAND_COUNT: return module->command_count;
+    case SELFCAL_STATUS_COMMAND_REFUSED_COUNT: return module->command_refused_count;
+    default: return offset_value(self, (uint8_t)(item - SELFCAL_STATUS_OFFSET_GX)); /* to SELFCAL_STATUS_OFFSET_AZ */
     }
 }
 
@@ -303,9 +361,29 @@ static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
     case SELFCAL_STATUS_NOT_FINITE_COUNT: return sum_of_axes(self, c->not_finite);
     case SELFCAL_STATUS_SATURATED_COUNT: return sum_of_axes(self, c->saturated);
     case SELFCAL_STATUS_STUCK_COUNT: return sum_of_axes(self, c->stuck);
+    case SELFCAL_STATUS_BLOCKS_MOVING_COUNT: return c->blocks_moving;
     case SELFCAL_STATUS_FRAMES_SENT: return self->frames;
-    default: return self->module != NULL ? module_value(self->module, item) : 0U;
+    default: return self->module != NULL ? module_value(self, item) : 0U;
     }
+}
+
+/* The value of an item of the corrected sample; false if its axis has none. */
+static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
+{
+    const selfcal_corrected_t *corrected = self->corrected;
+    if (item == SELFCAL_CORRECTED_TIME_MS || item == SELFCAL_CORRECTED_MOTION) {
+        *value = item == SELFCAL_CORRECTED_TIME_MS ? self->time_ms : corrected->motion;
+        return true;
+    }
+    const bool of_sd = item >= SELFCAL_CORRECTED_SD_GX;
+    const unsigned message = item - (of_sd ? (unsigned)SELFCAL_CORRECTED_SD_GX : (unsigned)SELFCAL_CORRECTED_CORRECTED_GX);
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        if (self->message[axis] == message) {
+            *value = float_bits(of_sd ? corrected->sd[axis] : corrected->value[axis]);
+            return isfinite(corrected->sd[axis]);
+        }
+    }
+    return false;
 }
 
 static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t value, uint32_t counter, uint32_t time_ms)
@@ -332,14 +410,22 @@ bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame)
     while (self->item < self->items) {
         const uint8_t item = self->item++;
         uint16_t id = SELFCAL_FRAME_STATUS_ID;
-        uint32_t value;
-        if (self->report == NULL) {
-            value = status_value(self, item);
-        } else {
+        uint32_t value = self->answer;
+        bool has = true;
+        switch (self->source) {
+        case STATUS: value = status_value(self, item); break;
+        case REPORT:
             id = message_table[self->message[self->report->axis]].id;
-            if (!axis_value(self, item, &value)) {
-                continue;
-            }
+            has = axis_value(self, item, &value);
+            break;
+        case CORRECTED:
+            id = SELFCAL_FRAME_CORRECTED_ID;
+            has = corrected_value(self, item, &value);
+            break;
+        default: id = SELFCAL_FRAME_ANSWER_ID; break;
+        }
+        if (!has) {
+            continue;
         }
         pack(frame, id, item, value, self->frames, self->time_ms);
         self->frames++;

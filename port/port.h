@@ -50,6 +50,14 @@ typedef struct {
     bool (*save_put)(void *context, const void *bytes, size_t count);
     bool (*save_end)(void *context);
 
+    /* Has the sensor add `wanted` to each axis of the model, as nearly as it can, reads that back, and says in `got` what it adds
+     * now; kept through a restart of the sensor. Samples of before are given no more. False: it cannot, and adds what it did. */
+    bool (*write_offsets)(void *context, const float wanted[], float got[]);
+
+    /* For commands: a random number, false if there is none; and a restart. NULL without commands. */
+    bool (*random)(void *context, uint32_t *number);
+    void (*restart)(void *context);
+
     uint32_t save_period_ms; /* between saves, at least: bounds the wear */
     uint64_t save_gap;       /* samples taken as missing after a restore: the age of a saved state is not known */
 } port_module_t;

@@ -3,7 +3,8 @@
 Data sheet of the ADIS16400/ADIS16405: serial interface, tables 8 to 22. Reads are pipelined: the answer to a frame
 comes in the next one. A burst is the frame 0x3E00 and then 12 words with chip select low throughout. ND is set in an
 output register when a sample is written to it and cleared when it is read; EA is set in all while DIAG_STAT has a bit
-set."""
+set. XGYRO_OFF to ZACCL_OFF are added to the readings. With a negative XGYRO_OFF bursts lose the sign bit of negative x
+rates, a known anomaly of the part."""
 
 from __future__ import annotations
 
@@ -16,8 +17,10 @@ OUTPUTS = range(0x02, 0x1A, 2)  # supply, 3 gyro, 3 accel, 3 magn, temperature, 
 XGYRO_OUT = 0x04
 BOOT_US, RESET_US, SELF_TEST_US = 220_000.0, 170_000.0, 20_000.0
 BASE_HZ = (1638.4, 1e3 / 18.92)
-#: 14-bit readings of one sample: gx gy gz ax ay az, LSB.
-Sample = tuple[int, int, int, int, int, int]
+#: True readings of one sample: gx gy gz ax ay az, LSB of 0.05 deg/s and 3.33 mg; rounded as they are read out.
+Sample = tuple[float, float, float, float, float, float]
+#: Offset registers: their bits, and their LSB in those of the output (0.0125 deg/s, 3.33 mg).
+OFFSETS = {0x1A + 2 * channel: (13, 0.25) if channel < 3 else (12, 1.0) for channel in range(6)}
 
 
 class Adis16405:
@@ -28,8 +31,12 @@ class Adis16405:
         self.source = source
         self.on_ready: Callable[[bool], None] = lambda level: None
         self.clock_error = 0.0  # of its own sample clock, relative
+        self.jitter = 0.0  # rms of each of its periods, relative
         self.supply = 2068  # LSB of 2.418 mV: 5.0 V
-        self.taken: list[tuple[int, float, Sample]] = []  # every sample it made: index, time in us, readings
+        #: Every sample it made: index, time in us, readings as read out.
+        self.taken: list[tuple[int, float, tuple[int, ...]]] = []
+        self.factory = dict.fromkeys(OFFSETS, 0)  # offset registers as its flash has them
+        self.writes_fail = False  # offset registers keep what they hold
         self.read_twice: list[int] = []  # indices of the samples that two whole bursts have read
         # what can be wrong
         self.connected = True
@@ -80,7 +87,7 @@ class Adis16405:
 
     def _boot(self, delay_us: float) -> None:
         self._stop()
-        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x56: self.product}
+        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x56: self.product, **self.factory}
         self.out = dict.fromkeys(OUTPUTS, 0)
         self.new = dict.fromkeys(OUTPUTS, False)
         self.answer = 0
@@ -91,25 +98,35 @@ class Adis16405:
         self.booted_at = self.machine.time_us + delay_us
         self._event = self.machine.at(delay_us + self.period_us(), self._sample)
 
+    def _offset(self, address: int) -> float:
+        """What a register adds, in LSB of the output."""
+        bits, lsb = OFFSETS[address]
+        value = self.registers[address] & (1 << bits) - 1
+        return (value - (value >> bits - 1 << bits)) * lsb
+
     def period_us(self) -> float:
         """SMPL_PRD, table 17."""
         period = self.registers[0x36]
         return 1e6 * ((period & 0x7F) + 1) / BASE_HZ[period >> 7 & 1] * (1.0 + self.clock_error)
 
     def _sample(self) -> None:
-        self._event = self.machine.at(self.period_us(), self._sample)
+        jitter = 1.0 + max(-0.9, self.jitter * self.machine.random.gauss(0.0, 1.0)) if self.jitter else 1.0
+        self._event = self.machine.at(self.period_us() * jitter, self._sample)
         index = self.index
         self.index += 1
         if self.dead or self.registers[0x34] >> 10 & 1:
             return
         if not self.stale(index):
             if not self.frozen:
-                sample = self.source(index)
+                sample = tuple(
+                    round(value + self._offset(address))
+                    for value, address in zip(self.source(index), OFFSETS, strict=True)
+                )
                 self.taken.append((index, self.machine.time_us, sample))
                 words = [self.supply, *sample, 0, 0, 0, 0, 0]
                 for address, word in zip(OUTPUTS, words, strict=True):
                     self.out[address] = word & 0x3FFF
-                if self.lose_sign(index):
+                if self.lose_sign(index) or self._offset(0x1A) < 0:
                     self.out[XGYRO_OUT] &= 0x1FFF
             self.new = dict.fromkeys(OUTPUTS, True)
         self.registers[0x3C] |= self.trouble
@@ -187,7 +204,9 @@ class Adis16405:
         if base == 0x3E:
             if shift == 0 and byte >> 7:
                 self._boot(RESET_US)
-        elif base in (0x34, 0x36, 0x38):
+        elif base in OFFSETS and self.writes_fail:
+            pass
+        elif base in (0x34, 0x36, 0x38) or base in OFFSETS:
             self.registers[base] = self.registers[base] & ~(0xFF << shift) | byte << shift
             if base == 0x34 and shift and byte >> 2 & 1:
                 self.machine.at(SELF_TEST_US, self._self_tested)

@@ -15,7 +15,7 @@ from .flash import Flash
 from .machine import SRAM, SRAM_BYTES, Machine, SystemControl
 from .spi import Dma2, Spi
 from .symbols import place
-from .system import Exti, Gpio, Iwdg, Pwr, Rcc, Tim2
+from .system import Exti, Gpio, Iwdg, Pwr, Rcc, Rng, Tim2
 from .usart import Usart
 
 
@@ -25,8 +25,8 @@ def resting(seed: int) -> Callable[[int], Sample]:
 
     def sample(index: int) -> Sample:
         rng = random.Random(seed * 1_000_003 + index)
-        gx, gy, gz = (round(rng.gauss(mean, 18.0)) for mean in (-9.0, 4.0, 13.0))
-        ax, ay, az = (round(rng.gauss(mean, 2.7)) for mean in (3.0, -2.0, 300.0))
+        gx, gy, gz = (rng.gauss(mean, 18.0) for mean in (-9.0, 4.0, 13.0))
+        ax, ay, az = (rng.gauss(mean, 2.7) for mean in (3.0, -2.0, 300.0))
         return gx, gy, gz, ax, ay, az
 
     return sample
@@ -54,6 +54,7 @@ class Board:
         self.rcc.pll_works = clock_broken != "pll"
         self.system = SystemControl(machine)
         self.pwr = Pwr(machine)
+        self.rng = Rng(machine, self.rcc)
         self.tim2 = Tim2(machine, self.rcc)
         self.iwdg = Iwdg(machine)
         self.port_a = Gpio(machine, 0x40020000)

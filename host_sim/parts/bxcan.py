@@ -1,4 +1,5 @@
-"""bxCAN: initialisation, three mailboxes, the error counters and bus-off, on a bus that python-can can listen to."""
+"""bxCAN: initialisation, three mailboxes, reception into FIFO 0 by filter bank 0, the error counters and bus-off, on a
+bus that python-can can listen to."""
 
 from __future__ import annotations
 
@@ -49,6 +50,7 @@ class Bxcan(Part):
         self.on_frame: Callable[[float, Frame], None] = lambda us, frame: None
         self.bus_offs = 0
         self.attempts = 0
+        self.heard = self.overruns = 0  # frames of others that the filter took, and that found no room
 
     def reset(self) -> None:
         """Asleep, 32.9.2."""
@@ -60,6 +62,10 @@ class Bxcan(Part):
         self.box = [[0, 0, 0, 0] for _ in range(3)]
         self.requests: list[int] = []  # mailboxes in order of request
         self.abort: set[int] = set()
+        self.fifo: list[tuple[int, int, int, int]] = []  # RIR, RDTR, RDLR, RDHR of each message
+        self.full = self.overrun = False
+        self.fmr = 0x2A1C0E01
+        self.filters = dict.fromkeys((0x204, 0x20C, 0x214, 0x21C, 0x240, 0x244), 0)  # FM1R FS1R FFA1R FA1R F0R1 F0R2
         self.sending: int | None = None
         for event in (self.event, self.sync):
             if event is not None:
@@ -79,6 +85,14 @@ class Bxcan(Part):
         """Control, status, mailboxes."""
         if 0x180 <= offset < 0x1B0:
             return self.box[(offset - 0x180) // 16][(offset & 15) // 4]
+        if 0x1B0 <= offset < 0x1C0:
+            return self.fifo[0][(offset & 15) // 4] if self.fifo else 0
+        if offset == 0x0C:
+            return len(self.fifo) | self.full << 3 | self.overrun << 4
+        if offset == 0x200:
+            return self.fmr
+        if offset in self.filters:
+            return self.filters[offset]
         esr = self.tec << 16 & 0xFF0000 | self.lec << 4 | self.boff << 2 | (self.tec > 127) << 1 | (self.tec > 95) << 0
         return {0x00: self.mcr, 0x04: self.msr, 0x08: self._tsr(), 0x14: self.ier, 0x18: esr, 0x1C: self.btr}[offset]
 
@@ -103,6 +117,18 @@ class Bxcan(Part):
                     self.tsr &= ~(0xF << 8 * i)
                 if value >> 8 * i + 7 & 1 and i in self.requests:
                     self._abort(i)
+        elif offset == 0x0C:
+            self.full = self.full and not value >> 3 & 1
+            self.overrun = self.overrun and not value >> 4 & 1
+            if value >> 5 & 1 and self.fifo:
+                self.fifo.pop(0)
+                self.full = False
+        elif offset == 0x200:
+            self.fmr = self.fmr & ~1 | value & 1
+        elif offset in self.filters:
+            if not self.fmr & 1 and not (offset >= 0x240 and not self.filters[0x21C] & 1) and offset != 0x21C:
+                self.machine.violations.append("a CAN filter changed while it is in use")
+            self.filters[offset] = value
         elif offset == 0x14:
             self.ier = value
         elif offset == 0x1C:
@@ -163,6 +189,34 @@ class Bxcan(Part):
 
     # ---------------------------------------------------------------------------------------------------------------
     # bus
+
+    def say(
+        self, identifier: int, data: bytes, *, extended: bool = False, remote: bool = False, length: int = -1
+    ) -> None:
+        """A frame of somebody else on the bus. `length`: its DLC, if not that of the data."""
+        if self.msr & 3 or self.boff or self.fmr & 1 or self.bus_bit_s == 0 or not self.filters[0x21C] & 1:
+            return
+        rir = identifier << (3 if extended else 21) | extended << 2 | remote << 1
+        # one 32-bit filter of identifier and mask: FBM 0, FSC 1; others have no model
+        if self.filters[0x204] & 1 or not self.filters[0x20C] & 1 or self.filters[0x214] & 1:
+            self.machine.violations.append("a CAN filter in a mode that has no model")
+        if (rir ^ self.filters[0x240]) & self.filters[0x244] & ~1:
+            return
+        self.heard += 1
+        whole = data.ljust(8, b"\0")
+        message = (
+            rir,
+            (len(data) if length < 0 else length) & 15,
+            int.from_bytes(whole[:4], "little"),
+            int.from_bytes(whole[4:8], "little"),
+        )
+        if len(self.fifo) == 3:
+            self.overrun = True
+            self.overruns += 1
+            self.fifo[2] = message  # RFLM 0: the last one is overwritten
+        else:
+            self.fifo.append(message)
+            self.full = len(self.fifo) == 3
 
     def _complete(self, i: int, flags: int) -> None:
         self.requests.remove(i)

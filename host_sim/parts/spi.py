@@ -77,7 +77,7 @@ class Spi(Part):
 
 
 class Dma2(Part):
-    """RM0090 10.5, as far as SPI1 needs it: stream 0 channel 3 receives, stream 3 channel 3 sends (table 43)."""
+    """RM0090 10.5, as far as SPI1 needs it: stream 0 channel 3 receives, stream 3 channel 3 sends (table 44)."""
 
     base = 0x40026400
     end: Event | None = None

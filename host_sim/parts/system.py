@@ -29,7 +29,7 @@ class Rcc(Part):
     def reset(self) -> None:
         """Reset values, 7.3.1 to 7.3.3; the flags of CSR stay."""
         self.cr, self.pllcfgr, self.cfgr = 0x83, 0x24003010, 0
-        self.enabled = dict.fromkeys((0x30, 0x40, 0x44), 0)
+        self.enabled = dict.fromkeys((0x30, 0x34, 0x40, 0x44), 0)
         self.hse_at = self.pll_at = float("inf")
         self._apply()
 
@@ -40,6 +40,13 @@ class Rcc(Part):
         if not 0.95e6 <= source / m <= 2.1e6 or not 100e6 <= source / m * n <= 432e6:
             self.machine.violations.append("PLL input or VCO out of range, RM0090 7.3.2")
         return source / m * n / p
+
+    @property
+    def pll48_hz(self) -> float:
+        """7.3.2, PLLQ; 0 without the PLL."""
+        if self.machine.time_us < self.pll_at:
+            return 0.0
+        return self._pll_hz() * 2 * ((self.pllcfgr >> 16 & 3) + 1) / (self.pllcfgr >> 24 & 15)
 
     def _apply(self) -> None:
         pll = self.cfgr & 3 == 2
@@ -97,6 +104,46 @@ class Rcc(Part):
     def clock_on(self, register: int, bit: int) -> bool:
         """Whether a peripheral has its clock."""
         return bool(self.enabled[register] >> bit & 1)
+
+
+class Rng(Part):
+    """RM0090 24.4: a number each 40 periods of the PLL's 48 MHz; without that clock none, and CECS."""
+
+    base = 0x50060800
+
+    def __init__(self, machine: Machine, rcc: Rcc) -> None:
+        super().__init__(machine)
+        self.rcc = rcc
+        self.stuck = False  # the same number for ever
+
+    def reset(self) -> None:
+        """Off."""
+        self.cr = 0
+        self.ready_at = float("inf")
+
+    def _next(self) -> None:
+        hz = self.rcc.pll48_hz
+        on = self.cr >> 2 & 1 and hz > 0.0 and self.rcc.clock_on(0x34, 6)
+        self.ready_at = self.machine.time_us + 40e6 / hz if on else float("inf")
+
+    def read(self, offset: int) -> int:
+        """CR, SR, DR."""
+        if offset == 0x04:
+            return (self.machine.time_us >= self.ready_at) | (self.rcc.pll48_hz < 1e6) << 1
+        if offset == 0x08:
+            if self.machine.time_us < self.ready_at:
+                self.machine.violations.append("RNG_DR read without DRDY")
+                return 0
+            self._next()
+            return 0x12345678 if self.stuck else self.machine.random.getrandbits(32)
+        return {0x00: self.cr}[offset]
+
+    def write(self, offset: int, value: int) -> None:
+        """CR."""
+        if offset != 0x00:
+            raise KeyError(offset)
+        self.cr = value
+        self._next()
 
 
 class Pwr(Part):

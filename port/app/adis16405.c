@@ -4,6 +4,7 @@
 
 /* Registers. */
 enum {
+    XGYRO_OFF = 0x1A, /* then y, z, and the accelerometers', two bytes each */
     MSC_CTRL = 0x34,
     SMPL_PRD = 0x36,
     SENS_AVG = 0x38,
@@ -36,7 +37,9 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define RESET_PULSE_US 1000U
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
-#define SILENCE_US 250000U    /* without a sample; at least 10 periods as well */
+/* Without a sample; at least 10 periods as well. Less than a reset takes, so that at 67 samples a second or more a sensor that was reset by
+ * something else, and has lost its settings and offsets, is set up anew. */
+#define SILENCE_US 150000U
 #define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
 #define BACKOFF_MIN_US 100000U
 #define BACKOFF_MAX_US 10000000U
@@ -69,6 +72,49 @@ static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
     uint16_t found;
     return write_byte(self, address, value) && write_byte(self, (uint8_t)(address + 1U), (uint16_t)(value >> 8)) &&
            read_surely(self, address, &found) && found == value;
+}
+
+/* Bits of an offset register: 13 of 0.0125 deg/s, 12 of 3.33 mg, two's complement. */
+static int32_t offset_limit(size_t channel)
+{
+    return channel < 3U ? 4096 : 2048;
+}
+
+static float offset_step(const adis16405_t *self, size_t channel)
+{
+    return channel < 3U ? 0.0125F : self->scale[channel];
+}
+
+/* As a signed number; the bits above are not used. */
+static int16_t offset_value(size_t channel, uint16_t word)
+{
+    const int32_t limit = offset_limit(channel), value = (int32_t)(word & (2U * (uint32_t)limit - 1U));
+    return (int16_t)(value >= limit ? value - 2 * limit : value);
+}
+
+static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
+{
+    const uint8_t address = (uint8_t)(XGYRO_OFF + 2U * channel);
+    const uint16_t word = (uint16_t)(value & 0xFFFF);
+    uint16_t found;
+    return write_byte(self, address, word) && write_byte(self, (uint8_t)(address + 1U), (uint16_t)(word >> 8)) &&
+           read_surely(self, address, &found) && offset_value(channel, found) == value;
+}
+
+/* After a reset: what the registers hold, and then what has been added to that. */
+static bool restore_offsets(adis16405_t *self)
+{
+    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
+        uint16_t word;
+        if (!read_surely(self, (uint8_t)(XGYRO_OFF + 2U * channel), &word)) {
+            return false;
+        }
+        self->base[channel] = offset_value(channel, word);
+        if (self->added[channel] != 0 && !write_offset(self, channel, self->base[channel] + self->added[channel])) {
+            return false;
+        }
+    }
+    return true;
 }
 
 static void enter(adis16405_t *self, uint8_t step, uint64_t now)
@@ -236,6 +282,40 @@ static void listen(adis16405_t *self)
     self->listening = true;
 }
 
+bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES])
+{
+    int16_t added[ADIS16405_AXES];
+    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
+        const float steps = wanted[channel] / offset_step(self, channel);
+        if (!(steps > -4096.0F && steps < 4096.0F)) {
+            return false;
+        }
+        added[channel] = (int16_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
+        const int32_t value = self->base[channel] + added[channel], limit = offset_limit(channel);
+        if (value < -limit || value >= limit || (channel == 0U && value < 0 && added[channel] != 0)) {
+            return false;
+        }
+        got[channel] = (float)added[channel] * offset_step(self, channel);
+    }
+    if (self->state == ADIS16405_RUNNING) {
+        bool done = true;
+        hold(self);
+        self->tail = self->head;
+        for (size_t channel = 0; channel < ADIS16405_AXES && done; channel++) {
+            done = added[channel] == self->added[channel] || write_offset(self, channel, self->base[channel] + added[channel]);
+        }
+        self->settling = (uint8_t)(2U + (2U << (self->filter & 7U)));
+        self->progress_us = self->bus->time_us(self->bus->context);
+        if (!done) {
+            fail(self, ADIS16405_SET_UP, self->progress_us); /* the restart writes what was added before */
+            return false;
+        }
+        listen(self);
+    }
+    memcpy(self->added, added, sizeof added);
+    return true;
+}
+
 /* Reads DIAG_STAT, which clears it; false: not readable. */
 static bool diagnose(adis16405_t *self, uint16_t *bits)
 {
@@ -266,7 +346,7 @@ static void start_on(adis16405_t *self, uint64_t now)
         if (!read_surely(self, PRODUCT_ID, &value) || value != PRODUCT) {
             fail(self, ADIS16405_ABSENT, now);
         } else if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, self->filter) ||
-                   !write_register(self, MSC_CTRL, MSC_CTRL_READY)) {
+                   !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
             fail(self, ADIS16405_SET_UP, now);
         } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
             fail(self, ADIS16405_SELF_TEST, now);
@@ -367,6 +447,10 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         }
         self->tail = tail + 1U;
         if (self->state != ADIS16405_RUNNING) {
+            continue;
+        }
+        if (self->settling > 0U) {
+            self->settling--;
             continue;
         }
         if (self->anchored && stamp - self->last_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {

@@ -82,6 +82,9 @@ typedef struct {
 typedef struct {
     const adis16405_bus_t *bus;
     uint16_t sample_period, filter; /* SMPL_PRD, SENS_AVG */
+    int16_t base[ADIS16405_AXES];   /* offset registers as a reset leaves them ... */
+    int16_t added[ADIS16405_AXES];  /* ... and what has been added to them */
+    uint8_t settling;               /* samples to leave out after that */
     uint32_t nominal_q8, period_q8; /* sample period, us / 256 */
     float scale[ADIS16405_AXES];
     adis16405_state_t state;
@@ -123,6 +126,13 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 
 /* From the main loop, every few ms at least: goes on with the start, watches, tries again. */
 void adis16405_poll(adis16405_t *self);
+
+/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset) to its readings by its offset registers, and says in `got` what
+ * the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
+ * goes into its flash. Samples that wait, and some that follow, are dropped: missing in time. False: beyond the registers (50 deg/s,
+ * 6.8 g), or not written; the sensor adds what it did, after a restart if need be. A negative XGYRO_OFF is refused: with one the part loses the
+ * sign bit of negative x rates (the anomaly above), so that a positive x bias stays. */
+bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES]);
 
 /* The oldest waiting sample, deg/s and m/s^2, and the samples missing before it; false: none is waiting. */
 bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing);

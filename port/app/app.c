@@ -1,6 +1,9 @@
 #include "app.h"
 
+#include <math.h>
 #include <string.h>
+
+#include "selfcal_frames.h"
 
 enum { SAMPLES_A_TURN = 64 };
 enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
@@ -18,7 +21,38 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
     if (status != SELFCAL_OK) {
         return status;
     }
-    return selfcal_telemetry_init(&app->telemetry, &selfcal_model, selfcal_model_axis_name);
+#if APP_COMMANDS
+    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        app->bias[axis] = NAN;
+    }
+#endif
+    const selfcal_status_t wire = selfcal_telemetry_init(&app->telemetry, &selfcal_model, selfcal_model_axis_name);
+    selfcal_telemetry_module(&app->telemetry, &app->told);
+    return wire;
+}
+
+bool app_gate(app_t *app)
+{
+#if SELFCAL_MODEL_GATE
+    app->learn_at = SELFCAL_GATE_MEASURED_MIN;
+    app->gated = selfcal_gate_init(&app->gate, &selfcal_model_gate) == SELFCAL_OK;
+    return app->gated;
+#else
+    (void)app;
+    return false;
+#endif
+}
+
+/* What the bank knows the sensor to add, into a sensor that may have forgotten. */
+static bool tell_sensor(app_t *app)
+{
+    float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
+    bool any = false;
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        wanted[axis] = selfcal_shifted(&app->bank, axis);
+        any = any || wanted[axis] != 0.0F;
+    }
+    return !any || app->module->write_offsets(app->module->context, wanted, got);
 }
 
 static void restore(app_t *app)
@@ -33,7 +67,11 @@ static void restore(app_t *app)
         const selfcal_status_t status =
             selfcal_restore(&app->bank, &selfcal_model, app->memory, sizeof app->memory, bytes, length);
         if (status == SELFCAL_OK) {
-            (void)selfcal_skip(&app->bank, module->save_gap);
+            /* Up to the start of a bank interval: it holds whole windows of the gate. */
+            (void)selfcal_moving(&app->bank);
+            const uint64_t block = app->bank.block, past = (app->bank.position + module->save_gap) % block;
+            (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
+            (void)tell_sensor(app);
             app->told.state_found = older == 0 ? 1U : 2U;
             return;
         }
@@ -47,7 +85,6 @@ void app_module(app_t *app, const port_module_t *module)
     app->module = module;
     restore(app);
     app->saved_ms = app->port->time_ms(app->port->context);
-    selfcal_telemetry_module(&app->telemetry, &app->told);
 }
 
 bool app_healthy(const app_t *app)
@@ -56,13 +93,10 @@ bool app_healthy(const app_t *app)
     return !app->corrupt && (app->stage == STAGE_NONE || now - app->report_ms < REPORT_MOST_MS);
 }
 
-/* Saves when it is time to; between reports, because the bank must stand still. */
-static void save_when_due(app_t *app, uint32_t now)
+/* Between reports, because the bank must stand still. */
+static void save(app_t *app, uint32_t now)
 {
     const port_module_t *module = app->module;
-    if (module == NULL || now - app->saved_ms < module->save_period_ms) {
-        return;
-    }
     app->saved_ms = now;
     if (module->save_begin(module->context) &&
         selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK && module->save_end(module->context)) {
@@ -72,6 +106,82 @@ static void save_when_due(app_t *app, uint32_t now)
     }
 }
 
+#if SELFCAL_MODEL_GATE
+/* Whether the bank will keep this sample out for a fault of the sensor's, which it then counts. */
+static bool faulty(const app_t *app, const float reading[])
+{
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        const float range = selfcal_model.axis[axis].range;
+        if (!selfcal_retired(&app->bank, axis) && (!isfinite(reading[axis]) || (range > 0.0F && fabsf(reading[axis]) >= range))) {
+            return true;
+        }
+    }
+    return false;
+}
+
+/* Takes what the gate has measured at rest for its noise, after 30 windows of it and whenever there are twice as many. */
+static void learn_noise(app_t *app)
+{
+    if (app->gate.measured < app->learn_at) {
+        return;
+    }
+    app->learn_at *= 2U;
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        selfcal_gate_noise_t noise;
+        if (isfinite(app->gate.axis[axis].sigma) && selfcal_gate_measured(&app->gate, axis, &noise) == SELFCAL_OK) {
+            (void)selfcal_gate_noise(&app->gate, axis, &noise); /* refused if a factor is 0, as that of a record without noise */
+        }
+    }
+}
+
+/* An axis that is retired says nothing of motion. */
+static void leave_out_retired(app_t *app)
+{
+    const selfcal_gate_noise_t nothing = {INFINITY, 1.0F, 1.0F, 1.0F};
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        if (selfcal_retired(&app->bank, axis) && isfinite(app->gate.axis[axis].sigma)) {
+            (void)selfcal_gate_noise(&app->gate, axis, &nothing);
+        }
+    }
+}
+#endif
+
+/* `count` samples are missing. */
+static void pass(app_t *app, uint32_t count)
+{
+#if SELFCAL_MODEL_GATE
+    if (app->gated && selfcal_gate_skip(&app->gate, count) == SELFCAL_MOVING) {
+        (void)selfcal_moving(&app->bank);
+    }
+#endif
+    (void)selfcal_skip(&app->bank, count);
+}
+
+/* By the rule at selfcal_moving(). */
+static void give(app_t *app, const float reading[])
+{
+#if SELFCAL_MODEL_GATE
+    if (app->gated) {
+        const selfcal_motion_t before = app->gate.state;
+        const selfcal_motion_t now = selfcal_gate_push(&app->gate, reading);
+        learn_noise(app);
+        if (before == SELFCAL_MOVING || now == SELFCAL_MOVING) {
+            (void)selfcal_moving(&app->bank);
+            if (!faulty(app, reading)) {
+                (void)selfcal_skip(&app->bank, 1U);
+                return;
+            }
+        }
+    }
+#endif
+    (void)selfcal_push(&app->bank, reading); /* what it rejects it counts */
+#if SELFCAL_MODEL_GATE
+    if (app->gated && app->bank.retired != 0U) {
+        leave_out_retired(app);
+    }
+#endif
+}
+
 static bool take_sample(app_t *app)
 {
     float reading[SELFCAL_MODEL_AXES];
@@ -79,10 +189,14 @@ static bool take_sample(app_t *app)
     switch (app->port->sample(app->port->context, reading, &missing)) {
     case PORT_SAMPLE:
         if (missing > 0) {
-            (void)selfcal_skip(&app->bank, missing);
+            pass(app, missing);
         }
-        (void)selfcal_push(&app->bank, reading); /* what it rejects it counts */
+        give(app, reading);
         app->fresh = true;
+#if APP_CORRECTED_MS
+        app->passed += (uint64_t)missing + 1U;
+        memcpy(app->reading, reading, sizeof reading);
+#endif
         return true;
     case PORT_END: app->ended = true; return false;
     default: return false;
@@ -104,6 +218,199 @@ static bool send_frames(app_t *app)
     }
 }
 
+static uint32_t motion(const app_t *app)
+{
+#if SELFCAL_MODEL_GATE
+    if (app->gated) {
+        return app->gate.state == SELFCAL_RESTING ? SELFCAL_STATUS_MOTION_RESTING : SELFCAL_STATUS_MOTION_MOVING;
+    }
+#endif
+    (void)app;
+    return SELFCAL_STATUS_MOTION_NOT_WATCHED;
+}
+
+/* What the status says of the module. */
+static void tell(app_t *app)
+{
+    selfcal_module_t *told = &app->told;
+    if (app->module != NULL) {
+        app->module->tell(app->module->context, told);
+    }
+    told->motion = motion(app);
+#if SELFCAL_MODEL_GATE
+    told->gate_alarm_count = (uint32_t)app->gate.counters.alarms;
+#endif
+    told->retired = app->bank.retired;
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        told->offset[axis] = selfcal_shifted(&app->bank, axis);
+    }
+}
+
+#if APP_COMMANDS
+/* -------------------------------------------------------------------------------------------------------------- commands */
+
+static const uint64_t command_key[2] = {APP_COMMAND_KEY};
+enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = 0x3F };
+#define RESTART_MS 100U /* for the answer to leave */
+
+static void answer(app_t *app, uint8_t command, uint8_t result)
+{
+    app->told.command_count += result == SELFCAL_ANSWER_RESULT_DONE ? 1U : 0U;
+    app->told.command_refused_count += result == SELFCAL_ANSWER_RESULT_DONE ? 0U : 1U;
+    app->answering = true;
+    app->answer_item = SELFCAL_ANSWER_RESULT;
+    app->answer = (uint32_t)command << SELFCAL_ANSWER_COMMAND_SHIFT | (uint32_t)result << SELFCAL_ANSWER_RESULT_SHIFT;
+}
+
+/* Bit of an axis of the model in a command: gx gy gz ax ay az. */
+static uint32_t axis_bit(uint8_t axis)
+{
+    static const char *const name[] = {"gx", "gy", "gz", "ax", "ay", "az"};
+    uint32_t bit = 0;
+    while (bit < sizeof name / sizeof name[0] && strcmp(selfcal_model_axis_name[axis], name[bit]) != 0) {
+        bit++;
+    }
+    return 1UL << bit;
+}
+
+/* Has the sensor take off the biases of `axes`, or, with none, what it has been told to add. All that was learnt is kept. */
+static uint8_t write_offsets(app_t *app, uint32_t axes)
+{
+    float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
+    uint32_t found = 0;
+    if (motion(app) == SELFCAL_STATUS_MOTION_MOVING) {
+        return SELFCAL_ANSWER_RESULT_NOT_NOW;
+    }
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        const bool meant = (axes & axis_bit(axis)) != 0U;
+        if (meant && (selfcal_retired(&app->bank, axis) || !isfinite(app->bias[axis]))) {
+            return SELFCAL_ANSWER_RESULT_NOT_NOW;
+        }
+        found |= axis_bit(axis);
+        wanted[axis] = axes == 0U ? 0.0F : selfcal_shifted(&app->bank, axis) - (meant ? app->bias[axis] : 0.0F);
+    }
+    if ((axes & ~found) != 0U) {
+        return SELFCAL_ANSWER_RESULT_OUT_OF_RANGE;
+    }
+    if (!app->module->write_offsets(app->module->context, wanted, got)) {
+        return SELFCAL_ANSWER_RESULT_FAILED;
+    }
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        const float amount = got[axis] - selfcal_shifted(&app->bank, axis);
+        if (amount == 0.0F || selfcal_shift(&app->bank, axis, amount) != SELFCAL_OK) {
+            continue;
+        }
+        app->bias[axis] += amount;
+#if SELFCAL_MODEL_GATE
+        if (app->gated) {
+            selfcal_gate_shift(&app->gate, axis, amount);
+        }
+#endif
+#if APP_CORRECTED_MS
+        app->last_report[axis].bias_mean += amount;
+        for (uint8_t h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
+            app->last_report[axis].hypothesis[h].bias_mean += amount;
+        }
+#endif
+    }
+    return SELFCAL_ANSWER_RESULT_DONE;
+}
+
+/* Begins anew with what the sensor adds. */
+static uint8_t forget(app_t *app)
+{
+    float shifted[SELFCAL_MODEL_AXES];
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        shifted[axis] = selfcal_shifted(&app->bank, axis);
+    }
+    const selfcal_status_t status = selfcal_init(&app->bank, &selfcal_model, app->memory, sizeof app->memory);
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        (void)selfcal_shift(&app->bank, axis, shifted[axis]);
+        app->bias[axis] = NAN;
+#if APP_CORRECTED_MS
+        app->has_report[axis] = false;
+#endif
+    }
+    app->fresh = false;
+    /* The gate's windows go on: the bank must start with one of them. */
+    (void)app_gate(app);
+    return status == SELFCAL_OK ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
+}
+
+/* Between reports: the bank stands still. */
+static void obey(app_t *app, uint32_t now)
+{
+    const uint8_t command = app->ordered;
+    uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
+    if (command == 0U || app->answering || app->module == NULL) {
+        return;
+    }
+    app->ordered = 0;
+    if (command == SELFCAL_ANSWER_COMMAND_SAVE) {
+        const uint32_t before = app->told.state_saves;
+        save(app, now);
+        result = app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
+    } else if (command == SELFCAL_ANSWER_COMMAND_WRITE_OFFSETS) {
+        result = write_offsets(app, app->argument);
+    } else if (app->argument == 1U) {
+        result = forget(app);
+    } else {
+        app->restarting = true;
+        app->restart_ms = now;
+    }
+    answer(app, command, result);
+}
+
+/* What is wrong with a command's argument or time. */
+static uint8_t judge(const app_t *app, uint8_t command, uint32_t argument)
+{
+    bool in_range;
+    switch (command) {
+    case SELFCAL_ANSWER_COMMAND_RESET: in_range = argument <= 1U; break;
+    case SELFCAL_ANSWER_COMMAND_SAVE: in_range = argument == 0U; break;
+    case SELFCAL_ANSWER_COMMAND_TELEMETRY_PERIOD: in_range = argument >= TELEMETRY_PERIOD_LEAST_MS; break;
+    case SELFCAL_ANSWER_COMMAND_WRITE_OFFSETS: in_range = argument <= AXIS_BITS; break;
+    default: return SELFCAL_ANSWER_RESULT_UNKNOWN;
+    }
+    const bool now = app->ordered == 0U && !app->restarting && app->module != NULL;
+    return !in_range ? SELFCAL_ANSWER_RESULT_OUT_OF_RANGE : now ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_NOT_NOW;
+}
+
+void app_command(app_t *app, const uint8_t data[8])
+{
+    const uint32_t now = app->port->time_ms(app->port->context);
+    const uint8_t command = data[0];
+    const uint32_t argument = (uint32_t)data[1] | (uint32_t)data[2] << 8 | (uint32_t)data[3] << 16;
+    if (command == SELFCAL_ANSWER_COMMAND_CHALLENGE) {
+        uint32_t number = 0;
+        const bool asked = argument == 0U && data[4] == 0U && data[5] == 0U && data[6] == 0U && data[7] == 0U;
+        if (asked && app->module != NULL && app->module->random(app->module->context, &number) &&
+            command_open(&app->command, number, now)) {
+            app->answering = true;
+            app->answer_item = SELFCAL_ANSWER_CHALLENGE;
+            app->answer = number;
+        } else {
+            answer(app, command, asked ? SELFCAL_ANSWER_RESULT_NOT_NOW : SELFCAL_ANSWER_RESULT_OUT_OF_RANGE);
+        }
+        return;
+    }
+    uint8_t result = command_check(&app->command, command_key, data, now);
+    if (result == SELFCAL_ANSWER_RESULT_DONE) {
+        result = judge(app, command, argument);
+    }
+    if (result != SELFCAL_ANSWER_RESULT_DONE || command == SELFCAL_ANSWER_COMMAND_TELEMETRY_PERIOD) {
+        if (result == SELFCAL_ANSWER_RESULT_DONE) {
+            app->period_ms = argument;
+            app->due_ms = now + argument;
+        }
+        answer(app, command, result);
+        return;
+    }
+    app->ordered = command;
+    app->argument = argument;
+}
+#endif
+
 /* Begins a report when one is due, and goes from its status over the axes to its end. Only with all frames out. */
 static bool advance(app_t *app)
 {
@@ -111,7 +418,12 @@ static bool advance(app_t *app)
     const selfcal_counters_t *counters = selfcal_counters(&app->bank);
     if (app->stage == STAGE_NONE) {
         const bool due = (int32_t)(now - app->due_ms) >= 0;
-        save_when_due(app, now);
+        if (app->module != NULL && now - app->saved_ms >= app->module->save_period_ms) {
+            save(app, now);
+        }
+#if APP_COMMANDS
+        obey(app, now);
+#endif
         app->corrupt = app->corrupt || (due && selfcal_check(&app->bank) != SELFCAL_OK);
         if (app->corrupt) {
             return false;
@@ -123,6 +435,7 @@ static bool advance(app_t *app)
             app->stage = STAGE_STATUS;
         } else if (app->ended && !app->finished) {
             app->finished = true;
+            tell(app);
             (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_FINISHED, app->report_number, now);
             return true;
         } else {
@@ -130,9 +443,7 @@ static bool advance(app_t *app)
         }
     }
     if (app->stage == STAGE_STATUS) {
-        if (app->module != NULL) {
-            app->module->tell(app->module->context, &app->told);
-        }
+        tell(app);
         (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_RUNNING, app->report_number, now);
         if (!app->fresh) { /* no sample since the last report: the status alone */
             app->stage = STAGE_END;
@@ -149,14 +460,78 @@ static bool advance(app_t *app)
 
 static bool compute(app_t *app)
 {
-    const selfcal_status_t status = selfcal_report_step(&app->work, &app->report);
-    if (status != SELFCAL_BUSY) {
-        app->computing = false;
-        if (status == SELFCAL_OK) {
-            (void)selfcal_telemetry_report(&app->telemetry, &app->report, selfcal_counters(&app->bank), app->begun_ms);
-        }
+#if APP_CORRECTED_MS
+    if (!app->work.gathered) {
+        app->gathered_at = app->passed - app->bank.position;
     }
+#endif
+    const selfcal_status_t status = selfcal_report_step(&app->work, &app->report);
+    if (status == SELFCAL_BUSY) {
+        return true;
+    }
+    app->computing = false;
+    app->worked_out = status == SELFCAL_OK;
+#if APP_CORRECTED_MS
+    if (app->worked_out) {
+        app->last_report[app->report.axis] = app->report;
+        app->has_report[app->report.axis] = true;
+        app->rests_on[app->report.axis] = app->gathered_at;
+    }
+#endif
+#if APP_COMMANDS
+    if (app->worked_out) {
+        app->bias[app->report.axis] = app->report.bias_mean;
+    }
+#endif
     return true;
+}
+
+#if APP_CORRECTED_MS
+/* The newest sample less the bias predicted for its time. */
+static void correct(app_t *app)
+{
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        const uint64_t since = app->passed - app->rests_on[axis];
+        float bias = NAN, sd = NAN;
+        if (app->has_report[axis] && !selfcal_retired(&app->bank, axis)) {
+            (void)selfcal_predict(&app->last_report[axis], &selfcal_model, (float)since / SELFCAL_MODEL_RATE_HZ, &bias, &sd);
+        }
+        app->corrected.value[axis] = app->reading[axis] - bias;
+        app->corrected.sd[axis] = sd;
+    }
+    app->corrected.motion = motion(app);
+}
+#endif
+
+/* Begins what does not wait for a report's end: the report worked out, an answer, a corrected sample. Only with all frames out. */
+static bool begin_frames(app_t *app)
+{
+    const uint32_t now = app->port->time_ms(app->port->context);
+    if (app->worked_out) {
+        app->worked_out = false;
+        (void)selfcal_telemetry_report(&app->telemetry, &app->report, selfcal_counters(&app->bank), app->begun_ms);
+        return true;
+    }
+#if APP_COMMANDS
+    if (app->answering) {
+        app->answering = false;
+        (void)selfcal_telemetry_answer(&app->telemetry, app->answer_item, app->answer, now);
+        return true;
+    }
+    if (app->restarting && now - app->restart_ms > RESTART_MS) {
+        app->module->restart(app->module->context);
+    }
+#endif
+#if APP_CORRECTED_MS
+    if (app->passed > 0U && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt) {
+        app->corrected_ms = now;
+        correct(app);
+        (void)selfcal_telemetry_corrected(&app->telemetry, &app->corrected, now);
+        return true;
+    }
+#endif
+    (void)now;
+    return false;
 }
 
 bool app_step(app_t *app)
@@ -169,8 +544,8 @@ bool app_step(app_t *app)
         busy = true;
     }
     busy = send_frames(app) || busy;
-    if (!app->computing && !app->waiting) {
-        busy = advance(app) || busy;
+    if (!app->waiting) {
+        busy = begin_frames(app) || (!app->computing && advance(app)) || busy;
     }
     if (!busy) {
         if (app->finished && !app->waiting) {

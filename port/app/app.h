@@ -1,18 +1,33 @@
-/* The firmware application, the same on every target: samples into the bank, reports out as frames.
+/* The firmware application, the same on every target: samples through the stationary gate into the bank, reports out as frames.
  *
  *     app_init(&app, &port, period);
+ *     app_gate(&app);
  *     while (app_step(&app)) {
  *     }
  */
 #ifndef APP_H
 #define APP_H
 
+#include "command.h"
 #include "port.h"
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
 #if SELFCAL_MODEL_REGRESSORS > 0 || SELFCAL_MODEL_TERM_NODES > 0
 #error "this application gives its bank no regressors, and its telemetry has no items for laws that are sums"
+#endif
+
+/* Milliseconds between corrected samples on the wire (message CORRECTED); 0: none, and none of their memory, a report an axis. */
+#ifndef APP_CORRECTED_MS
+#define APP_CORRECTED_MS 0
+#endif
+
+/* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: commands are taken (command.h).
+ * Without it nothing that comes by the wire is looked at but the opening and closing of an SLCAN channel. */
+#ifdef APP_COMMAND_KEY
+#define APP_COMMANDS 1
+#else
+#define APP_COMMANDS 0
 #endif
 
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */
@@ -23,6 +38,7 @@ typedef struct {
     uint32_t report_number;
     uint8_t stage;    /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
     bool computing;   /* an axis's report is being worked out */
+    bool worked_out;  /* ... is, and waits for the wire */
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
     bool waiting;     /* `frame` is made but not taken yet */
@@ -32,6 +48,32 @@ typedef struct {
     uint32_t saved_ms;  /* when the state was saved last, or the start */
     selfcal_module_t told; /* filled in by `module` */
     uint32_t begun_ms; /* start of the axis report under way */
+#if SELFCAL_MODEL_GATE
+    bool gated;
+    uint64_t learn_at; /* windows of rest after which the gate's noise is taken anew */
+    selfcal_gate_t gate;
+#endif
+#if APP_CORRECTED_MS
+    uint32_t corrected_ms; /* when a corrected sample was sent last */
+    uint64_t passed;       /* samples, the missing ones too */
+    uint64_t gathered_at;  /* of them, to the end of the last bank interval of the report under way */
+    uint64_t rests_on[SELFCAL_MODEL_AXES]; /* ... of each axis's last report */
+    selfcal_report_t last_report[SELFCAL_MODEL_AXES];
+    bool has_report[SELFCAL_MODEL_AXES];
+    float reading[SELFCAL_MODEL_AXES]; /* the newest */
+    selfcal_corrected_t corrected;
+#endif
+#if APP_COMMANDS
+    command_t command;
+    uint8_t ordered;        /* command that is obeyed between reports; 0: none */
+    uint32_t argument;      /* ... and its argument */
+    bool answering;         /* `answer` is yet to be sent */
+    uint8_t answer_item;
+    uint32_t answer;
+    bool restarting;        /* once the answer is out */
+    uint32_t restart_ms;    /* since when */
+    float bias[SELFCAL_MODEL_AXES]; /* of the last reports; NAN: none */
+#endif
     selfcal_frame_t frame;
     selfcal_telemetry_t telemetry;
     selfcal_t bank;
@@ -45,9 +87,19 @@ typedef struct {
  * selfcal_telemetry_init() do. `port` must stay. */
 selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms);
 
-/* After app_init(): restores the newest saved state that is whole and of this model, and from here on saves, tells of the module in
+/* After app_init(): from here on only samples of rest feed the bank; while the module moves time passes as a gap. Starts with the
+ * model's noise, a bound, and goes on with what is measured at rest, once 30 windows have been. False: the model has no gate, and
+ * every sample counts as one of rest. */
+bool app_gate(app_t *app);
+
+/* After that: restores the newest saved state that is whole and of this model, and from here on saves, tells of the module in
  * the status, and sends a status even when no sample comes. `module` must stay. */
 void app_module(app_t *app, const port_module_t *module);
+
+#if APP_COMMANDS
+/* A frame of message COMMAND came. */
+void app_command(app_t *app, const uint8_t data[8]);
+#endif
 
 /* False once the bank's memory has been found corrupt, or a report has not ended for a minute: then only a restart helps, and the
  * watchdog must not be fed. */

@@ -2,6 +2,10 @@
 
 #include <string.h>
 
+#ifdef APP_COMMAND_KEY
+#include "selfcal_frames.h"
+#endif
+
 #define CR '\r'
 #define BEL '\a'
 
@@ -18,6 +22,44 @@ static size_t reply(char answer[SLCAN_ANSWER_BYTES], const char *text)
     }
     return length;
 }
+
+#ifdef APP_COMMAND_KEY
+/* -1: none. */
+static int digit_value(char digit)
+{
+    return digit >= '0' && digit <= '9'   ? digit - '0'
+           : digit >= 'A' && digit <= 'F' ? digit - 'A' + 10
+           : digit >= 'a' && digit <= 'f' ? digit - 'a' + 10
+                                          : -1;
+}
+
+/* Takes a line that is a COMMAND message of 8 bytes. */
+static bool take_command(slcan_t *self)
+{
+    uint32_t head = 0;
+    uint8_t data[8] = {0};
+    if (!self->open || self->length != SLCAN_LINE_BYTES || self->line[0] != 't') {
+        return false;
+    }
+    for (unsigned i = 1; i < SLCAN_LINE_BYTES; i++) {
+        const int value = digit_value(self->line[i]);
+        if (value < 0) {
+            return false;
+        }
+        if (i < 5U) {
+            head = head << 4 | (uint32_t)value;
+        } else {
+            data[(i - 5U) / 2U] = (uint8_t)((unsigned)data[(i - 5U) / 2U] << 4 | (unsigned)value);
+        }
+    }
+    if (head != (SELFCAL_FRAME_COMMAND_ID << 4 | sizeof data)) {
+        return false;
+    }
+    memcpy(self->data, data, sizeof data);
+    self->came = true;
+    return true;
+}
+#endif
 
 static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
 {
@@ -39,6 +81,11 @@ static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
         default: break;
         }
     }
+#ifdef APP_COMMAND_KEY
+    if (take_command(self)) {
+        return reply(answer, "z\r");
+    }
+#endif
     answer[0] = BEL;
     return 1;
 }

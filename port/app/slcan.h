@@ -1,5 +1,6 @@
 /* SLCAN, the Lawicel text protocol: CAN frames over a serial line, as python-can's `slcan` and slcand speak it. This end
- * is the adapter; its bus carries telemetry only, so commands that transmit are refused.
+ * is the adapter; its bus carries telemetry only, so commands that transmit are refused, but for the COMMAND message in an image
+ * with commands.
  * No I/O here: bytes go in, bytes to write come out. */
 #ifndef SLCAN_H
 #define SLCAN_H
@@ -12,18 +13,28 @@
 
 #define SLCAN_FRAME_BYTES 22 /* "t" id(3) length(1) data(16) CR */
 #define SLCAN_ANSWER_BYTES 8
+/* The longest line that is accepted. */
+#ifdef APP_COMMAND_KEY
+#define SLCAN_LINE_BYTES 21
+#else
+#define SLCAN_LINE_BYTES 2
+#endif
 
 typedef struct {
     bool open;       /* frames may be sent */
-    uint8_t length;  /* of the line so far; 3 stands for any that is longer than a command */
-    char line[2];    /* no command that is accepted is longer */
+    uint8_t length;  /* of the line so far; one more than `line` stands for any that is longer */
+    char line[SLCAN_LINE_BYTES];
+#ifdef APP_COMMAND_KEY
+    bool came;       /* a COMMAND message, its bytes in `data`: the caller's to take */
+    uint8_t data[8];
+#endif
 } slcan_t;
 
 void slcan_init(slcan_t *self);
 
 /* Takes one byte from the host. Returns how many bytes of `answer` are to be written back: 0 within a line. A line ends in
  * CR. C closes; O and L open, also when open; S0 to S8 and an empty line are accepted and change nothing; V, v and N are
- * answered; anything else is answered BEL. */
+ * answered; anything else is answered BEL. With commands, "t2088" and 16 hexadecimal digits on an open channel are a command. */
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]);
 
 /* The frame as a line, without a terminating zero. */

@@ -44,10 +44,6 @@ void spi_reset_line(void *context, bool low);
 void spi_handler(void);
 void ready_handler(void);
 
-/* main.c: what the handlers hand on. */
-void board_sensor_ready(void);
-void board_sensor_burst(const uint16_t words[12], bool whole);
-
 /* uart.c: SLCAN at 115200 bit/s */
 
 void uart_init(void);

@@ -1,4 +1,5 @@
-/* Registers of the nRF51822 that this target uses: nRF51 Series Reference Manual 3.0, chapter in each heading. */
+/* Registers of the nRF51822 that this target uses: nRF51 Series Reference Manual 3.0, by the chapter of
+ * the peripheral that each heading names. */
 #ifndef NRF51_H
 #define NRF51_H
 
@@ -12,7 +13,7 @@
 #define SCB_AIRCR REG32(0xE000ED0CU)
 #define SCB_AIRCR_SYSRESETREQ 0x05FA0004U
 
-/* 12: power. 11: clocks. */
+/* POWER, CLOCK */
 #define POWER_RAMONB REG32(0x40000554U)
 #define POWER_RAMONB_ALL 0x3U
 #define CLOCK_HFCLKSTART REG32(0x40000000U)
@@ -21,7 +22,7 @@
 #define CLOCK_LFCLKSRC REG32(0x40000518U)
 #define CLOCK_LFCLKSRC_RC 0U
 
-/* 14: pins. */
+/* GPIO, chapter 14 */
 #define GPIO_OUTSET REG32(0x50000508U)
 #define GPIO_OUTCLR REG32(0x5000050CU)
 #define GPIO_PIN_CNF(pin) REG32(0x50000700U + 4U * (uint32_t)(pin))
@@ -30,13 +31,13 @@
 #define GPIO_PULL_DOWN 0x4U
 #define GPIO_PULL_UP 0xCU
 
-/* 15: pin events. */
+/* GPIOTE */
 #define GPIOTE_IN0 REG32(0x40006100U)
 #define GPIOTE_INTENSET REG32(0x40006304U)
 #define GPIOTE_CONFIG0 REG32(0x40006510U)
 #define GPIOTE_RISING(pin) (0x1U | (uint32_t)(pin) << 8 | 0x1U << 16)
 
-/* 18: timer. */
+/* TIMER, chapter 18 */
 #define TIMER0_START REG32(0x40008000U)
 #define TIMER0_CAPTURE0 REG32(0x40008040U)
 #define TIMER0_COMPARE1 REG32(0x40008144U)
@@ -48,7 +49,7 @@
 #define TIMER0_CC0 REG32(0x40008540U)
 #define TIMER0_CC1 REG32(0x40008544U)
 
-/* 21: watchdog. */
+/* WDT */
 #define WDT_START REG32(0x40010000U)
 #define WDT_CRV REG32(0x40010504U)
 #define WDT_CONFIG REG32(0x4001050CU)
@@ -56,7 +57,7 @@
 #define WDT_RR0 REG32(0x40010600U)
 #define WDT_RELOAD 0x6E524635U
 
-/* 27: SPI master. */
+/* SPI master */
 #define SPI0_READY REG32(0x40003108U)
 #define SPI0_INTENSET REG32(0x40003304U)
 #define SPI0_INTENCLR REG32(0x40003308U)
@@ -72,7 +73,7 @@
 #define SPI0_CONFIG REG32(0x40003554U)
 #define SPI0_CONFIG_MODE3 0x6U
 
-/* 29: UART. */
+/* UART */
 #define UART0_STARTRX REG32(0x40002000U)
 #define UART0_STARTTX REG32(0x40002008U)
 #define UART0_RXDRDY REG32(0x40002108U)

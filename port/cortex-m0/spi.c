@@ -1,6 +1,7 @@
 /* ADIS16405 on SPI0, mode 3, 1 MHz. Registers one frame at a time and polled; bursts byte by byte from the interrupt: this
  * SPI has no DMA, and TXD holds one byte in waiting. */
 #include "board.h"
+#include "sensor.h"
 #include "nrf51.h"
 
 enum { BURST_WORDS = 12, BURST_BYTES = 2 + 2 * BURST_WORDS, BURST_COMMAND = 0x3E };
@@ -121,12 +122,12 @@ void spi_handler(void)
         for (size_t i = 0; i < BURST_WORDS; i++) {
             words[i] = (uint16_t)((uint32_t)burst[2U * i + 2U] << 8 | burst[2U * i + 3U]);
         }
-        board_sensor_burst(words, true);
+        sensor_burst(words, true);
     }
 }
 
 void ready_handler(void)
 {
     GPIOTE_IN0 = 0U;
-    board_sensor_ready();
+    sensor_ready();
 }

@@ -1,10 +1,10 @@
 /* The application on a POSIX host: a recording takes the sensor's place, a pseudo-terminal with SLCAN the bus's.
  *
- *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S]
+ *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate]
  *
  * Prints `SELFCAL_PTY path`, waits for the host to open the channel, plays the recording (time stands still while the
  * channel is closed), and ends when the host closes the channel after the last frame. Exit code: 0; 1 if the host went
- * away or never came; 2 for bad arguments or a bad recording.
+ * away or never came; 2 for bad arguments or a bad recording. With --gate motion is kept out, by the model's gate.
  *
  * RECORDING: see port/replay/replay.h.
  */
@@ -134,6 +134,7 @@ int main(int argc, char **argv)
     const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};
     const char *path = NULL;
     double report_every_s = 10.0, timeout_s = 30.0;
+    bool gate = false;
 
     for (int i = 1; i < argc; i++) {
         double *option = strcmp(argv[i], "--report-every") == 0 ? &report_every_s
@@ -145,6 +146,8 @@ int main(int argc, char **argv)
                 return fail(2, argv[i], "wants a positive number");
             }
             i++;
+        } else if (strcmp(argv[i], "--gate") == 0) {
+            gate = true;
         } else if (path == NULL && argv[i][0] != '-') {
             path = argv[i];
         } else {
@@ -160,6 +163,9 @@ int main(int argc, char **argv)
     }
     if (app_init(&app, &port, (uint32_t)ceil(report_every_s * 1000.0)) != SELFCAL_OK) {
         return fail(2, "model", "refused by the library");
+    }
+    if (gate && !app_gate(&app)) {
+        return fail(2, "model", "has no gate");
     }
 
     const int timeout_ms = (int)(timeout_s * 1000.0);

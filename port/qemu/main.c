@@ -1,7 +1,8 @@
 /* The application on an emulated board (QEMU's netduinoplus2: Cortex-M4F; microbit: Cortex-M0). A recording, read through
  * semihosting, takes the sensor's place; telemetry leaves through the emulated UART as SLCAN.
  *
- * Arguments (-semihosting-config arg=...): a word, the recording's file (port/replay/replay.h), the report period in ms.
+ * Arguments (-semihosting-config arg=...): a word, the recording's file (port/replay/replay.h), the report period in ms, and "gate" to
+ * keep motion out.
  * Says SELFCAL_UART on the console once it listens.
  * Time is the recording's, so every run sends the same bytes. It stands still until the host opens the channel; the emulator
  * ends when the host has closed it after the last frame. Exit code: 0; 1 if the host never came or never closed; 2 for bad
@@ -109,7 +110,7 @@ static bool await_channel(board_t *self, bool open)
 }
 
 /* The recording's path and the period out of the command line; false if they are not there. */
-static bool arguments(char *line, const char **path, uint32_t *period_ms)
+static bool arguments(char *line, const char **path, uint32_t *period_ms, bool *gate)
 {
     char *const file = strchr(line, ' ');
     char *const period = file != NULL ? strchr(file + 1, ' ') : NULL;
@@ -119,10 +120,12 @@ static bool arguments(char *line, const char **path, uint32_t *period_ms)
     *period = '\0';
     *path = file + 1;
     *period_ms = 0;
-    for (const char *digit = period + 1; *digit >= '0' && *digit <= '9'; digit++) {
+    const char *digit = period + 1;
+    for (; *digit >= '0' && *digit <= '9'; digit++) {
         *period_ms = *period_ms * 10U + (uint32_t)(*digit - '0');
     }
-    return *period_ms > 0U;
+    *gate = strcmp(digit, " gate") == 0;
+    return *period_ms > 0U && (*gate || *digit == '\0');
 }
 
 static int fail(int code, const char *subject, const char *what)
@@ -140,7 +143,8 @@ int main(void)
     const port_t port = {&board, board_time_ms, board_sample, board_send, board_idle};
     const char *path = NULL;
     uint32_t period_ms = 0;
-    if (!semihost_command_line(line, sizeof line) || !arguments(line, &path, &period_ms)) {
+    bool gate = false;
+    if (!semihost_command_line(line, sizeof line) || !arguments(line, &path, &period_ms, &gate)) {
         return fail(2, "arguments", "want the recording and the report period in ms");
     }
     board.file = semihost_open(path);
@@ -155,6 +159,9 @@ int main(void)
     }
     if (app_init(&app, &port, period_ms) != SELFCAL_OK) {
         return fail(2, "model", "refused by the library");
+    }
+    if (gate && !app_gate(&app)) {
+        return fail(2, "model", "has no gate");
     }
     slcan_init(&board.slcan);
     uart_start();

@@ -38,7 +38,7 @@ static void send_byte(uint8_t byte)
 
 #elif defined QEMU_MICROBIT
 
-/* nRF51 Series Reference Manual 3.0, section 29.10. */
+/* nRF51 Series Reference Manual 3.0, UART: register overview. */
 #define UART_STARTRX REG32(0x40002000U)
 #define UART_STARTTX REG32(0x40002008U)
 #define UART_RXDRDY REG32(0x40002108U)

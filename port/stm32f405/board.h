@@ -58,10 +58,6 @@ void spi_reset_line(void *context, bool low);
 void sensor_ready_handler(void);
 void sensor_burst_handler(void);
 
-/* In main.c: what the handlers hand on. */
-void board_sensor_ready(void);
-void board_sensor_burst(const uint16_t words[12], bool whole);
-
 /* ------------------------------------------------------------------------------------------------------------- wire */
 
 /* Either CAN or SLCAN on the USART, chosen at build time: BOARD_CAN_KBITPS, 125 to 1000, or 0 for the USART. */
@@ -80,6 +76,7 @@ typedef struct {
 /* False: the bit rate cannot be made exactly from this clock, or the controller does not answer. Then nothing is sent. */
 bool can_init(uint32_t bit_per_s);
 bool can_send(const selfcal_frame_t *frame);
+void can_poll(void); /* takes a command, in an image with commands */
 void can_counters(wire_counters_t *counters);
 void can_tx_handler(void);
 void can_error_handler(void);
@@ -92,6 +89,12 @@ bool usart_send(const selfcal_frame_t *frame);
 void usart_poll(void); /* takes what the host said */
 void usart_counters(wire_counters_t *counters);
 void usart_handler(void);
+
+/* In main.c, in an image with commands: one came. */
+void board_command(const uint8_t data[8]);
+
+/* A random number of the RNG's; false: it has none, for want of a clock or by its own checks. 1 ms at most. */
+bool rng_number(void *context, uint32_t *number);
 
 /* --------------------------------------------------------------------------------------------- watchdog, reset cause */
 

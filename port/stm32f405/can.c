@@ -1,6 +1,8 @@
-/* Telemetry on bxCAN: CAN1, RX PB8, TX PB9. Transmits only: no filter is active, so nothing is received (RM0090 32.7.4).
+/* Telemetry on bxCAN: CAN1, RX PB8, TX PB9. Without commands no filter is active, so nothing is received (RM0090 32.7.4); with them
+ * one is, for the command's identifier alone.
  * Frames leave in the order they were taken (TXFP). Bus-off ends by itself after 128 x 11 recessive bits (ABOM). */
 #include "board.h"
+#include "selfcal_frames.h"
 #include "stm32f405.h"
 
 enum { MAILBOXES = 3 };
@@ -66,6 +68,16 @@ bool can_init(uint32_t bit_per_s)
         return false;
     }
     CAN_BTR = timing;
+#ifdef APP_COMMAND_KEY
+    CAN_FMR |= CAN_FMR_FINIT;
+    CAN_FS1R |= BIT(0);   /* bank 0: one 32-bit filter ... */
+    CAN_FM1R &= ~BIT(0);  /* ... of identifier and mask ... */
+    CAN_FFA1R &= ~BIT(0); /* ... into FIFO 0 */
+    CAN_F0R1 = SELFCAL_FRAME_COMMAND_ID << CAN_TIR_STID_POS;
+    CAN_F0R2 = 0x7FFU << CAN_TIR_STID_POS | CAN_RIR_IDE | CAN_RIR_RTR;
+    CAN_FA1R |= BIT(0);
+    CAN_FMR &= ~CAN_FMR_FINIT;
+#endif
     CAN_IER = CAN_IER_TMEIE | CAN_IER_BOFIE | CAN_IER_ERRIE;
     CAN_MCR = CAN_MCR_TXFP | CAN_MCR_ABOM;
     /* With the bus held dominant this does not come about yet; mailboxes may be filled all the same and go out when it does. */
@@ -103,6 +115,25 @@ bool can_send(const selfcal_frame_t *frame)
     CAN_TDHR(mailbox) = (uint32_t)d[4] | (uint32_t)d[5] << 8 | (uint32_t)d[6] << 16 | (uint32_t)d[7] << 24;
     CAN_TIR(mailbox) = (uint32_t)frame->id << CAN_TIR_STID_POS | CAN_TIR_TXRQ;
     return true;
+}
+
+void can_poll(void)
+{
+#ifdef APP_COMMAND_KEY
+    if ((CAN_RF0R & CAN_RF0R_FMP) == 0U) {
+        return;
+    }
+    const uint32_t id = CAN_RI0R, length = CAN_RDT0R & CAN_RDTR_DLC, low = CAN_RDL0R, high = CAN_RDH0R;
+    CAN_RF0R = CAN_RF0R_RFOM;
+    if (length == 8U && id >> CAN_TIR_STID_POS == SELFCAL_FRAME_COMMAND_ID && (id & (CAN_RIR_IDE | CAN_RIR_RTR)) == 0U) {
+        uint8_t data[8];
+        for (unsigned i = 0; i < 4U; i++) {
+            data[i] = (uint8_t)(low >> (8U * i));
+            data[4U + i] = (uint8_t)(high >> (8U * i));
+        }
+        board_command(data);
+    }
+#endif
 }
 
 /* Wakes the main loop, which fills the mailbox. */

@@ -1,14 +1,17 @@
 /* The application on an STM32F405 with an ADIS16405: wiring and flashing in GUIDE.md, "The module". */
-#include "adis16405.h"
 #include "app.h"
 #include "board.h"
+#include "sensor.h"
 #include "stm32f405.h"
-
-#include <string.h>
 
 /* Milliseconds between reports of all axes. */
 #ifndef BOARD_REPORT_MS
 #define BOARD_REPORT_MS 10000
+#endif
+
+/* 0: every sample counts as one of rest. */
+#ifndef BOARD_GATE
+#define BOARD_GATE 1
 #endif
 
 /* Seconds of running between saves of the state. A sector bears 10 000 erases and a save erases one of two, so that four saves
@@ -17,8 +20,6 @@
 #define BOARD_SAVE_PERIOD_S 21600U
 #endif
 
-static adis16405_t sensor;
-static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 static app_t app;
 
 /* ------------------------------------------------------------------------------------------------------------- sensor */
@@ -37,52 +38,12 @@ static uint32_t bus_time_us32(void *context)
 
 static const adis16405_bus_t bus = {NULL, bus_time_us, bus_time_us32, spi_word, spi_burst, spi_reset_line};
 
-void board_sensor_ready(void)
-{
-    adis16405_ready(&sensor);
-}
-
-void board_sensor_burst(const uint16_t words[12], bool whole)
-{
-    adis16405_burst(&sensor, words, whole);
-}
-
-static bool sensor_init(void)
-{
-    static const char *const name[ADIS16405_AXES] = {"gx", "gy", "gz", "ax", "ay", "az"};
-    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        uint8_t at = 0;
-        while (at < ADIS16405_AXES && strcmp(selfcal_model_axis_name[axis], name[at]) != 0) {
-            at++;
-        }
-        if (at == ADIS16405_AXES) {
-            return false;
-        }
-        channel[axis] = at;
-    }
-    const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
-    return adis16405_init(&sensor, &bus, &config);
-}
-
 /* --------------------------------------------------------------------------------------------------------------- port */
 
 static uint32_t port_time_ms(void *context)
 {
     (void)context;
     return clock_ms();
-}
-
-static port_sample_t port_sample(void *context, float reading[], uint32_t *missing)
-{
-    (void)context;
-    float all[ADIS16405_AXES];
-    if (!adis16405_sample(&sensor, all, missing)) {
-        return PORT_EMPTY;
-    }
-    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        reading[axis] = all[channel[axis]];
-    }
-    return PORT_SAMPLE;
 }
 
 static bool port_send(void *context, const selfcal_frame_t *frame)
@@ -98,7 +59,7 @@ static void port_idle(void *context)
     __asm__ volatile("wfi" : : : "memory");
 }
 
-static const port_t port = {NULL, port_time_ms, port_sample, port_send, port_idle};
+static const port_t port = {NULL, port_time_ms, sensor_sample, port_send, port_idle};
 
 /* ------------------------------------------------------------------------------------------------------------- module */
 
@@ -111,15 +72,7 @@ static void module_tell(void *context, selfcal_module_t *told)
     told->reset_cause = (uint32_t)reset_cause;
     told->fault_address = last_fault.pc;
     told->clock = board_clock.crystal ? 1U : 2U;
-    told->sensor_state = (uint32_t)sensor.state + 1U;
-    told->sensor_fault = (uint32_t)sensor.fault;
-    told->sensor_fault_count = sensor.counters.faults;
-    told->sensor_diagnosis = sensor.diagnosis;
-    told->sensor_stale_count = sensor.counters.stale + sensor.counters.repeated;
-    told->sensor_alarm_count = sensor.counters.alarms;
-    told->sensor_damaged_count = sensor.counters.damaged;
-    told->sensor_anomaly_count = sensor.counters.anomalies;
-    told->sensor_overrun_count = sensor.counters.overruns;
+    sensor_tell(told);
     wire_counters_t wire;
     if (BOARD_CAN_KBITPS > 0) {
         can_counters(&wire);
@@ -149,9 +102,27 @@ static bool module_save_end(void *context)
     return flash_end();
 }
 
+#if APP_COMMANDS
+static void module_restart(void *context)
+{
+    (void)context;
+    board_reset();
+}
+
+void board_command(const uint8_t data[8])
+{
+    app_command(&app, data);
+}
+#endif
+
 static const port_module_t module = {
-    NULL, module_tell, module_stored, module_save_begin, flash_put, module_save_end, BOARD_SAVE_PERIOD_S * 1000U,
-    (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
+    NULL, module_tell, module_stored, module_save_begin, flash_put, module_save_end, sensor_write_offsets,
+#if APP_COMMANDS
+    rng_number, module_restart,
+#else
+    NULL, NULL,
+#endif
+    BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 
 /* Fed once in 100 ms at most, and only if the ticks go on (a main loop that turns without its interrupts is not healthy) and the
@@ -181,15 +152,20 @@ int main(void)
         usart_init(BOARD_USART_BAUD);
     }
     spi_init();
-    if (!sensor_init() || app_init(&app, &port, BOARD_REPORT_MS) != SELFCAL_OK) {
+    if (!sensor_init(&bus) || app_init(&app, &port, BOARD_REPORT_MS) != SELFCAL_OK) {
         return 1; /* the model is not one for this sensor: the start-up code resets */
+    }
+    if (BOARD_GATE) {
+        (void)app_gate(&app);
     }
     app_module(&app, &module);
     for (;;) {
         if (BOARD_CAN_KBITPS == 0) {
             usart_poll();
+        } else {
+            can_poll();
         }
-        adis16405_poll(&sensor);
+        sensor_poll();
         (void)app_step(&app);
         feed();
     }

@@ -1,6 +1,7 @@
 /* ADIS16405 on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. Registers one
- * frame at a time and polled; bursts by DMA2 (RM0090 table 43: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+ * frame at a time and polled; bursts by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3 sends). */
 #include "board.h"
+#include "sensor.h"
 #include "stm32f405.h"
 
 enum { CS_PIN = 4, READY_PIN = 0, RESET_PIN_NUMBER = 1, BURST_WORDS = 13, SCK_MAX_HZ = 1000000 };
@@ -117,7 +118,7 @@ bool spi_burst(void *context)
 void sensor_ready_handler(void)
 {
     EXTI_PR = BIT(READY_PIN);
-    board_sensor_ready();
+    sensor_ready();
 }
 
 void sensor_burst_handler(void)
@@ -131,5 +132,5 @@ void sensor_burst_handler(void)
     for (size_t i = 0; i < BURST_WORDS - 1; i++) {
         words[i] = burst_in[i + 1];
     }
-    board_sensor_burst(words, whole);
+    sensor_burst(words, whole);
 }

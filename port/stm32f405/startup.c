@@ -88,7 +88,7 @@ typedef union {
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16 + IRQ_COUNT] = {
     {.stack = link_stack}, {.call = startup},
     X12, X, {.call = systick_handler},                /* exceptions 2 to 15, PM0214 2.3.2 */
-    X4, X, X, {.call = sensor_ready_handler},         /* interrupts from 0 (RM0090 table 61) to 6 EXTI0 */
+    X4, X, X, {.call = sensor_ready_handler},         /* interrupts from 0 (RM0090 table 62) to 6 EXTI0 */
     X12, {.call = can_tx_handler},                    /* to 19 CAN1_TX */
     X, X, {.call = can_error_handler},                /* to 22 CAN1_SCE */
     X12, X, X, {.call = usart_handler},               /* to 37 USART1 */

@@ -1,5 +1,6 @@
-/* The registers of the STM32F405 that this firmware uses, by hand from RM0090 (reference manual) and PM0214 (Cortex-M4
- * programming manual); the section is named at each block. Names are the manuals'. */
+/* The registers of the STM32F405 that this firmware uses, by hand from RM0090 (reference manual, revision 21) and PM0214
+ * (Cortex-M4 programming manual); the section is named at each block. Older revisions have the same sections, and some tables
+ * numbered one lower. Names are the manuals'. */
 #ifndef STM32F405_H
 #define STM32F405_H
 
@@ -13,6 +14,7 @@
 #define RCC_PLLCFGR REG32(0x40023804U)
 #define RCC_CFGR REG32(0x40023808U)
 #define RCC_AHB1ENR REG32(0x40023830U)
+#define RCC_AHB2ENR REG32(0x40023834U)
 #define RCC_APB1ENR REG32(0x40023840U)
 #define RCC_APB2ENR REG32(0x40023844U)
 #define RCC_CSR REG32(0x40023874U)
@@ -35,6 +37,7 @@
 #define RCC_AHB1ENR_GPIOA BIT(0)
 #define RCC_AHB1ENR_GPIOB BIT(1)
 #define RCC_AHB1ENR_DMA2 BIT(22)
+#define RCC_AHB2ENR_RNG BIT(6)
 #define RCC_APB1ENR_TIM2 BIT(0)
 #define RCC_APB1ENR_CAN1 BIT(25)
 #define RCC_APB1ENR_PWR BIT(28)
@@ -177,6 +180,7 @@
 #define CAN_MCR REG32(CAN1 + 0x000U)
 #define CAN_MSR REG32(CAN1 + 0x004U)
 #define CAN_TSR REG32(CAN1 + 0x008U)
+#define CAN_RF0R REG32(CAN1 + 0x00CU)
 #define CAN_IER REG32(CAN1 + 0x014U)
 #define CAN_ESR REG32(CAN1 + 0x018U)
 #define CAN_BTR REG32(CAN1 + 0x01CU)
@@ -184,6 +188,17 @@
 #define CAN_TDTR(mailbox) REG32(CAN1 + 0x184U + 0x10U * (mailbox))
 #define CAN_TDLR(mailbox) REG32(CAN1 + 0x188U + 0x10U * (mailbox))
 #define CAN_TDHR(mailbox) REG32(CAN1 + 0x18CU + 0x10U * (mailbox))
+#define CAN_RI0R REG32(CAN1 + 0x1B0U)
+#define CAN_RDT0R REG32(CAN1 + 0x1B4U)
+#define CAN_RDL0R REG32(CAN1 + 0x1B8U)
+#define CAN_RDH0R REG32(CAN1 + 0x1BCU)
+#define CAN_FMR REG32(CAN1 + 0x200U)
+#define CAN_FM1R REG32(CAN1 + 0x204U)
+#define CAN_FS1R REG32(CAN1 + 0x20CU)
+#define CAN_FFA1R REG32(CAN1 + 0x214U)
+#define CAN_FA1R REG32(CAN1 + 0x21CU)
+#define CAN_F0R1 REG32(CAN1 + 0x240U)
+#define CAN_F0R2 REG32(CAN1 + 0x244U)
 #define CAN_MCR_INRQ BIT(0)
 #define CAN_MCR_SLEEP BIT(1)
 #define CAN_MCR_TXFP BIT(2)
@@ -194,6 +209,12 @@
 #define CAN_TSR_TXOK(mailbox) BIT(8U * (mailbox) + 1U)
 #define CAN_TSR_ABRQ(mailbox) BIT(8U * (mailbox) + 7U)
 #define CAN_TSR_TME_POS 26U
+#define CAN_RF0R_FMP 3U
+#define CAN_RF0R_RFOM BIT(5)
+#define CAN_RIR_IDE BIT(2)
+#define CAN_RIR_RTR BIT(1)
+#define CAN_RDTR_DLC 15U
+#define CAN_FMR_FINIT BIT(0)
 #define CAN_IER_TMEIE BIT(0)
 #define CAN_IER_BOFIE BIT(10)
 #define CAN_IER_ERRIE BIT(15)
@@ -202,6 +223,15 @@
 #define CAN_BTR_TS2_POS 20U
 #define CAN_TIR_TXRQ BIT(0)
 #define CAN_TIR_STID_POS 21U
+
+/* --------------------------------------------------------------------------------------------- RNG, RM0090 section 24.4 */
+#define RNG_CR REG32(0x50060800U)
+#define RNG_SR REG32(0x50060804U)
+#define RNG_DR REG32(0x50060808U)
+#define RNG_CR_RNGEN BIT(2)
+#define RNG_SR_DRDY BIT(0)
+#define RNG_SR_CECS BIT(1) /* clock error */
+#define RNG_SR_SECS BIT(2) /* seed error */
 
 /* ------------------------------------------------------- core: SysTick PM0214 4.5, NVIC 4.3, SCB 4.4, FPU 4.6 */
 #define SYST_CSR REG32(0xE000E010U)
@@ -217,7 +247,7 @@
 #define SCB_AIRCR_SYSRESETREQ (0x05FA0000U | BIT(2))
 #define SCB_CPACR_FPU (0xFU << 20)
 
-/* Interrupt numbers, RM0090 table 61. */
+/* Interrupt numbers, RM0090 table 62. */
 enum {
     IRQ_EXTI0 = 6,
     IRQ_CAN1_TX = 19,

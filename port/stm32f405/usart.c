@@ -60,6 +60,12 @@ void usart_poll(void)
         const size_t count = slcan_receive(&slcan, in[in_tail % IN_BYTES], answer);
         in_tail++;
         (void)put(answer, (uint32_t)count); /* an answer that finds no room is left out */
+#ifdef APP_COMMAND_KEY
+        if (slcan.came) {
+            slcan.came = false;
+            board_command(slcan.data);
+        }
+#endif
     }
 }
 

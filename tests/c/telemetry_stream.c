@@ -35,6 +35,12 @@ static float random_float(void)
     return sign * powf(10.0F, (float)random32() / 4294967296.0F * 60.0F - 30.0F);
 }
 
+/* Of axes_retired, as the DBC words it. */
+static unsigned retired_bit(const char *name)
+{
+    return (unsigned)(name[1] - 'x') + (name[0] == 'a' ? 3U : 0U);
+}
+
 static float told(const char *message, const char *signal, float number)
 {
     (void)printf("V %s %s %.17g\n", message, signal, (double)number);
@@ -150,6 +156,22 @@ int main(int argc, char **argv)
         module.state_refused = told_count("STATUS", "state_refused", random32());
         module.state_saves = told_count("STATUS", "state_saves", random32());
         module.state_save_failures = told_count("STATUS", "state_save_failures", random32());
+        module.motion = told_count("STATUS", "motion", random32());
+        module.gate_alarm_count = told_count("STATUS", "gate_alarm_count", random32());
+        counters.blocks_moving = told_count("STATUS", "blocks_moving_count", random32());
+        module.command_count = told_count("STATUS", "command_count", random32());
+        module.command_refused_count = told_count("STATUS", "command_refused_count", random32());
+        module.retired = 0;
+        uint32_t retired = 0;
+        for (uint8_t a = 0; a < AXES; a++) {
+            char signal[] = "offset_??";
+            memcpy(signal + 7, axis_name[a], 2);
+            module.offset[a] = told("STATUS", signal, random_float());
+            const bool is_retired = (random32() & 1U) != 0U;
+            module.retired |= is_retired ? 1UL << a : 0U;
+            retired |= is_retired ? 1UL << retired_bit(axis_name[a]) : 0U;
+        }
+        (void)told_count("STATUS", "axes_retired", retired);
         selfcal_telemetry_module(&telemetry, &module);
         (void)told_count("STATUS", "time_ms", time_ms);
         (void)told_count("STATUS", "model_id", model.id);

@@ -55,6 +55,22 @@ static void rest_motion_and_rest_again(void) {
     TEST_ASSERT_EQUAL(1, gate.counters.alarms);
 }
 
+/* What the sensor itself adds is no motion: half of a window before, half after. */
+static void a_shift_by_the_sensor_is_no_motion(void) {
+    for (unsigned i = 0; i < 5U; i++) {
+        (void)window(5.0F, 9.8F);
+    }
+    for (unsigned i = 0; i < 10U; i++) {
+        const float off = i % 2U == 0U ? 1.0F : -1.0F, level = i < 5U ? 5.0F : -1.0F;
+        if (i == 5U) {
+            selfcal_gate_shift(&gate, 0, -6.0F);
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_RESTING, selfcal_gate_push(&gate, (const float[2]){level + off, 9.8F - off}));
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_RESTING, window(-1.0F, 9.8F));
+    TEST_ASSERT_EQUAL(SELFCAL_MOVING, window(5.0F, 9.8F));
+}
+
 /* The largest samples that count, and the smallest noise: nothing becomes rest by way of a NaN. */
 static void extremes_are_motion(void) {
     const float most = nextafterf(SELFCAL_SAMPLE_MAX, 0.0F);
@@ -79,6 +95,7 @@ int main(void) {
     UNITY_BEGIN();
     RUN_TEST(bad_arguments_are_refused);
     RUN_TEST(rest_motion_and_rest_again);
+    RUN_TEST(a_shift_by_the_sensor_is_no_motion);
     RUN_TEST(extremes_are_motion);
     return UNITY_END();
 }

@@ -197,17 +197,17 @@ static void test_status_counts_stop_at_the_end_of_their_range(void)
     counters.saturated[1] = 2;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_status(&telemetry, &counters, SELFCAL_FINISHED, 3, 5000));
     selfcal_frame_t frame;
-    for (uint32_t item = 0; item < 34; item++) {
+    for (uint32_t item = 0; item < 46; item++) {
         frame = next(item);
         TEST_ASSERT_EQUAL_HEX16(0x200, frame.id);
         switch (item) {
-        case 1: TEST_ASSERT_EQUAL_UINT32(2, value(&frame)); break;
+        case 1: TEST_ASSERT_EQUAL_UINT32(3, value(&frame)); break;
         case 2: TEST_ASSERT_EQUAL_HEX32(0xCAFEF00D, value(&frame)); break;
         case 5: TEST_ASSERT_EQUAL_UINT32(2, value(&frame)); break;
         case 6: TEST_ASSERT_EQUAL_UINT32(3, value(&frame)); break;
         case 7:
         case 13: TEST_ASSERT_EQUAL_HEX32(0xFFFFFFFF, value(&frame)); break;
-        case 33: TEST_ASSERT_EQUAL_UINT32(33, value(&frame)); break; /* frames before this one */
+        case 45: TEST_ASSERT_EQUAL_UINT32(45, value(&frame)); break; /* frames before this one */
         default: break;
         }
     }
@@ -225,6 +225,47 @@ static void test_busy_until_all_frames_are_fetched(void)
     TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, 1, 1));
     TEST_ASSERT_EQUAL_UINT(43, drain(&items));
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, 1, 1));
+}
+
+/* gx is axis 1 of the model and item 1 (its sd 7), ay axis 0 and item 5 (11); an axis without sd, and axes the model has not, are left out. */
+static void test_a_corrected_sample_goes_out_by_axis(void)
+{
+    selfcal_corrected_t corrected = {{0.25F, -1.5F}, {0.5F, 0.125F}, 2U};
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_corrected(&telemetry, &corrected, 70000));
+    static const struct {
+        uint32_t item;
+        float value;
+    } want[] = {{1, -1.5F}, {5, 0.25F}, {7, 0.125F}, {11, 0.5F}};
+    selfcal_frame_t frame = next(0);
+    TEST_ASSERT_EQUAL_HEX16(0x207, frame.id);
+    TEST_ASSERT_EQUAL_UINT32(70000, value(&frame));
+    TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_telemetry_corrected(&telemetry, &corrected, 0));
+    TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_telemetry_answer(&telemetry, 0, 0, 0));
+    for (size_t i = 0; i < sizeof want / sizeof want[0]; i++) {
+        frame = next(want[i].item);
+        uint32_t bits_wanted;
+        memcpy(&bits_wanted, &want[i].value, sizeof bits_wanted);
+        TEST_ASSERT_EQUAL_HEX32(bits_wanted, value(&frame));
+    }
+    frame = next(13);
+    TEST_ASSERT_EQUAL_UINT32(2, value(&frame));
+    TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
+    corrected.sd[0] = NAN;
+    uint64_t items;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_corrected(&telemetry, &corrected, 0));
+    TEST_ASSERT_EQUAL_UINT(4, drain(&items));
+}
+
+static void test_an_answer_is_one_frame(void)
+{
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_answer(&telemetry, 1, 0x0305, 9000));
+    selfcal_frame_t frame = next(1);
+    TEST_ASSERT_EQUAL_HEX16(0x209, frame.id);
+    TEST_ASSERT_EQUAL_HEX32(0x0305, value(&frame));
+    TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_answer(&telemetry, 2, 0, 0));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_answer(NULL, 0, 0, 0));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_corrected(&telemetry, NULL, 0));
 }
 
 static void test_bad_arguments_and_models_are_refused(void)
@@ -258,6 +299,8 @@ int main(void)
     RUN_TEST(test_health_flags_are_the_axis_s_own);
     RUN_TEST(test_status_counts_stop_at_the_end_of_their_range);
     RUN_TEST(test_busy_until_all_frames_are_fetched);
+    RUN_TEST(test_a_corrected_sample_goes_out_by_axis);
+    RUN_TEST(test_an_answer_is_one_frame);
     RUN_TEST(test_bad_arguments_and_models_are_refused);
     return UNITY_END();
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import subprocess
 import sys
 from functools import lru_cache
@@ -27,15 +28,24 @@ from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is t
 from unicorn import arm_const as arm  # noqa: E402
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+#: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
+#: their rows go to build/campaigns.txt as well.
+MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
 #: A model whose bank takes no sample within a test, so that no report is made and time goes by fast.
 QUIET_RATE_HZ = 102.4
 QUIET_BANK_HZ = 0.01
 
 
 @lru_cache
-def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIET_BANK_HZ) -> Path:
+def image(
+    name: str,
+    flags: str = "",
+    quiet: bool = False,
+    bank_hz: float = QUIET_BANK_HZ,
+    laws: tuple[str, ...] = ("constant", "random_walk", "gauss_markov"),
+) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at
-    `bank_hz`."""
+    `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds)."""
     folder = ROOT / "build" / "firmware" / name
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
@@ -44,6 +54,7 @@ def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIE
         if quiet:
             document = yaml.safe_load(Path(model.path).read_text())
             document["bank_rate_hz"] = bank_hz
+            document["hypotheses"] = dict.fromkeys(laws, 1)
             (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
             codegen(folder / "model.yaml", folder / "new", target="cortex-m4f", rate=QUIET_RATE_HZ)
         else:
@@ -62,6 +73,15 @@ def image(name: str, flags: str = "", quiet: bool = False, bank_hz: float = QUIE
     return folder / "selfcal.elf"
 
 
+def tell(name: str, trials: int, survived: int, more: str = "") -> None:
+    """A row of the table of campaigns."""
+    row = f"{name:40} {trials:>9,} {survived:>9,}   {more}".rstrip()
+    print(f"\n{row}")
+    if MANY > 1:
+        with (ROOT / "build" / "campaigns.txt").open("a") as file:
+            file.write(row + "\n")
+
+
 def reports(frames: list[can.Message]) -> tuple[Decoder, list[AxisReport]]:
     """What the host's decoder makes of frames that were watched from the start."""
     decoder = Decoder(from_start=True)
@@ -69,11 +89,11 @@ def reports(frames: list[can.Message]) -> tuple[Decoder, list[AxisReport]]:
     return decoder, found
 
 
-def messages(board: parts.Board) -> list[can.Message]:
-    """The frames heard on the CAN bus so far."""
+def messages(board: parts.Board, since: int = 0) -> list[can.Message]:
+    """The frames heard on the CAN bus, from the `since`-th on."""
     return [
         can.Message(timestamp=us / 1e6, arbitration_id=frame[0], data=frame[1], is_extended_id=False)
-        for us, frame in board.frames
+        for us, frame in board.frames[since:]
     ]
 
 
@@ -90,14 +110,25 @@ def readings(samples: list[tuple[int, ...]]) -> NDArray[np.float32]:
 
 class Tap:
     """What the application gives to the library: every selfcal_push() with its place on the sensor's count of samples,
-    found by what selfcal_push() and selfcal_skip() have been given before. Watches only."""
+    found by what selfcal_push() and selfcal_skip() have been given before. With a gate also what came to that, `seen`:
+    samples missing, and the sample. Watches only."""
 
     def __init__(self, board: parts.Board) -> None:
         self.board = board
         self.place = -1
         self.pushed: list[tuple[int, tuple[float, ...]]] = []
         self.skips: list[int] = []
-        for name, call in (("selfcal_push", self._push), ("selfcal_skip", self._skip)):
+        self.seen: list[tuple[int, tuple[float, ...]]] = []
+        self.intervals: list[int] = []  # place of the last sample of each bank sample
+        self._missing = 0
+        hooks = {
+            "selfcal_push": self._push,
+            "selfcal_skip": self._skip,
+            "selfcal_gate_push": self._see,
+            "selfcal_gate_skip": self._miss,
+            "selfcal_bank_sample": lambda *_: self.intervals.append(self.place),
+        }
+        for name, call in hooks.items():
             address = board.machine.symbols[name] & ~1
             board.machine.uc.hook_add(UC_HOOK_CODE, call, None, address, address)
 
@@ -105,6 +136,14 @@ class Tap:
         self.place += 1
         sample = np.frombuffer(bytes(uc.mem_read(uc.reg_read(arm.UC_ARM_REG_R1), 24)), dtype="<f4")
         self.pushed.append((self.place, tuple(sample.tolist())))
+
+    def _see(self, uc: Uc, address: int, size: int, data: object) -> None:
+        sample = np.frombuffer(bytes(uc.mem_read(uc.reg_read(arm.UC_ARM_REG_R1), 24)), dtype="<f4")
+        self.seen.append((self._missing, tuple(sample.tolist())))
+        self._missing = 0
+
+    def _miss(self, uc: Uc, address: int, size: int, data: object) -> None:
+        self._missing += uc.reg_read(arm.UC_ARM_REG_R2) | uc.reg_read(arm.UC_ARM_REG_R3) << 32
 
     def _skip(self, uc: Uc, address: int, size: int, data: object) -> None:
         count = uc.reg_read(arm.UC_ARM_REG_R2) | uc.reg_read(arm.UC_ARM_REG_R3) << 32  # AAPCS: a 64-bit argument
@@ -133,5 +172,5 @@ class Tap:
         index = {}
         for number, _, sample in self.board.sensor.taken:
             index.setdefault(tuple(readings([sample])[0].tolist()), number)
-        first = index[self.pushed[0][1]]
+        first = index[self.pushed[0][1]] - self.pushed[0][0]
         return sum(abs(index[sample] - first - place) > slack for place, sample in self.pushed if sample in index)

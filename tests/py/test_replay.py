@@ -19,14 +19,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gated import Gated, Learning
 
 from selfcal import recording as recording_module
 from selfcal.engines.library import Bank
 from selfcal.model import Model
 from selfcal.recording import Recording, load
 from selfcal.tables import make_tables
+from selfcal.units import factor
 from selfcal.verbs import replay as replay_module
 from selfcal.verbs.replay import build, replay, run, write_rows
+
+from conftest import shared_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
@@ -82,6 +86,67 @@ def assert_same(
         assert abs(axis["bias_now"]["sd"] / factor(name) / want.bias_sd - 1.0) <= SD_TOLERANCE
 
 
+def test_replay_with_the_gate_keeps_motion_out(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """10 s of shaking and 7 s missing: the firmware's result is that of gate and bank by the rule at
+    selfcal_moving()."""
+    part_of_shipped(tmp_path / "part.npz")
+    part = load(tmp_path / "part.npz")
+    axes = Model.load().axes
+    columns = {name: (part.columns[name].unit, part.in_unit(name, part.columns[name].unit).copy()) for name in axes}
+    columns["gx"][1][1500:1600] += 20.0 * np.sin(np.arange(100.0))
+    t = (np.arange(part.samples) + np.cumsum(part.missing_before)) / part.rate_hz
+    recording_module.save(tmp_path / "moved.npz", columns, part.rate_hz, {}, t=t)
+    moved = load(tmp_path / "moved.npz")
+    document = replay(tmp_path / "moved.npz", report_every=600.0, gate=True)
+    assert "gate: rest ended 1 times" in capfd.readouterr().err
+    host = Gated(Model.load(), moved.rate_hz, axes)
+    samples = np.column_stack([moved.in_unit(name, Model.load().group_of(name).unit) for name in axes])
+    for missing, sample in zip(moved.missing_before, samples.astype(np.float32), strict=True):
+        host.feed(int(missing), sample)
+    assert not any(host.used[1505:1600])
+    assert sum(host.used) > 5930 - 100 - 60  # but the shaking, and 12 windows of 5: at the start, after it and the gap
+    assert_same(document, {name: host.bank.report(index) for index, name in enumerate(axes)})
+    sigma = document["axes"]["gx"]["parameters"]["constant"]["N"]["mean"]
+    with_motion = replay(tmp_path / "moved.npz", report_every=600.0, axes=("gx",))
+    assert sigma < 0.5 * with_motion["axes"]["gx"]["parameters"]["constant"]["N"]["mean"]
+
+
+def test_the_shocks_of_run_4_do_not_reach_the_bank() -> None:
+    """The real recording with two shocks: what the firmware finds behind the gate is what the library finds in the
+    whole intervals of rest; both shocks are outside of those, next to all the rest within; and the white noise is that
+    of the same sensor's other two runs, which lie within 8 % of each other."""
+    recording = shared_recording("adis16405_run4.npz")
+    model, axes = Model.load(), Model.load().axes
+    tables = make_tables(model, recording.rate_hz, axes)
+    samples = np.column_stack([recording.in_unit(name, model.group_of(name).unit) for name in axes]).astype(np.float32)
+    gate = Learning(model, tables)
+    rest = np.concatenate([gate.push(samples[at : at + gate.window]) for at in range(0, len(samples), gate.window)])
+    used = rest & np.concatenate([[False], rest[:-1]])
+    start = int(np.argmax(used))
+    blocks = (len(used) - start) // tables.block
+    whole = used[start : start + blocks * tables.block].reshape(blocks, tables.block).all(axis=1)
+    bank = Bank(tables)
+    for index, good in enumerate(whole):
+        at = start + index * tables.block
+        if good:
+            bank.push(samples[at : at + tables.block])
+        else:
+            bank.raw.skip(tables.block)
+    for first, last in ((404_537, 404_621), (514_615, 514_660)):
+        assert not whole[(first - start) // tables.block : (last - start) // tables.block + 1].any()
+    assert whole.mean() > 0.98  # accelerometers feel the building (test_gate.py)
+    found = replay(recording.path, report_every=20_000.0, gate=True)
+    truth = {name: bank.report(index) for index, name in enumerate(axes)}
+    assert_same(found, truth, lambda name: factor(model.group_of(name).unit, recording.columns[name].unit))
+    gyros = ("gx", "gy", "gz")
+    for run_number in (1, 2):
+        path = shared_recording(f"adis16405_run{run_number}.npz").path
+        other = replay(path, report_every=20_000.0, gate=True, axes=gyros)
+        for name in gyros:
+            noise = [one["axes"][name]["parameters"]["random_walk"]["N"]["mean"] for one in (found, other)]
+            assert noise[0] == pytest.approx(noise[1], rel=0.08), name
+
+
 def test_replay_is_the_library_over_the_wire(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,8 +166,8 @@ def test_replay_is_the_library_over_the_wire(
     assert int(recording.missing_before.sum()) == 70
     assert_same(document, direct(recording, Model.load().axes))
     said = capfd.readouterr().err
-    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 34 + 6 x 44 frames, and the last status
-    assert f"frames: {6 * (34 + 6 * 44) + 34} received, 0 lost" in said
+    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 44 frames, and the last status
+    assert f"frames: {6 * (46 + 6 * 44) + 46} received, 0 lost" in said
     image = (tmp_path / "report.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert struct.unpack(">II", image[16:24]) >= (1000, 500)
@@ -266,7 +331,7 @@ def test_firmware_waits_for_open_and_for_close(tmp_path: Path) -> None:
     assert read_until(line, b"\r") == b"NSCAL\r"
     os.write(line, b"O\r")
     # the last frame is the number of frames sent: one report of status and axis, and the last status, less itself
-    frames = read_until(line, b"t2008" + struct.pack("<I", 34 + 44 + 33).hex().upper().encode())
+    frames = read_until(line, b"t2008" + struct.pack("<I", 46 + 44 + 45).hex().upper().encode())
     assert frames.startswith(b"\rt200860EA0000")  # its time: 60 000 ms
     time.sleep(0.3)
     assert module.process.poll() is None  # what it sent could still be unread
@@ -308,7 +373,7 @@ def test_firmware_keeps_to_the_wall_clock(tmp_path: Path) -> None:
     line = module.open()
     begun = time.monotonic()
     os.write(line, b"O\r")
-    read_until(line, b"t2008" + struct.pack("<I", 6 * (34 + 44) + 33).hex().upper().encode())
+    read_until(line, b"t2008" + struct.pack("<I", 6 * (46 + 44) + 45).hex().upper().encode())
     took = time.monotonic() - begun
     os.write(line, b"C\r")
     assert module.end()[0] == 0

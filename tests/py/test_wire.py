@@ -34,7 +34,7 @@ from wire_stream import ROOT, Sent, lines, message, serial_line, stream
 DBC = ROOT / "lib" / "selfcal.dbc"
 COMMON = {"item", "counter", "time", "crc"}
 REPORT_FRAMES = 44
-STATUS_FRAMES = 34
+STATUS_FRAMES = 46
 ALL_FLAGS = (
     "constant_N_flags",
     "random_walk_N_flags",
@@ -138,7 +138,10 @@ def test_cantools_reads_every_item_that_c_packs(hypotheses: int) -> None:
             assert_equal(name, decoded[name], number)
             seen.add((sent.message, name))
     if hypotheses == 3:
-        everything = {(m.name, s.name) for m in database.messages for s in m.signals if s.name not in COMMON}
+        reports = ("STATUS", *(axis.upper() for axis in AXES))  # the others: tests/py/test_firmware_commands.py
+        everything = {
+            (m.name, s.name) for m in database.messages for s in m.signals if s.name not in COMMON and m.name in reports
+        }
         assert everything - seen == {("STATUS", "wire_version"), ("STATUS", "frames_sent")}
 
 
@@ -240,7 +243,7 @@ def test_every_error_of_one_to_three_bits_is_caught() -> None:
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda frame: can.Message(arbitration_id=0x207, is_extended_id=False, data=frame.data),
+        lambda frame: can.Message(arbitration_id=0x208, is_extended_id=False, data=frame.data),
         lambda frame: can.Message(arbitration_id=frame.arbitration_id, is_extended_id=True, data=frame.data),
         lambda frame: can.Message(arbitration_id=frame.arbitration_id, is_extended_id=False, data=frame.data[:7]),
         lambda frame: can.Message(
@@ -342,7 +345,7 @@ def test_ten_thousand_frames_over_a_noisy_pty() -> None:
     """1 % of the bytes corrupted, dropped or doubled. Sent frames are known, so are the reports they belong to."""
     sent = stream(11, 36)
     sent_frames = [(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in lines(sent)]
-    assert len(sent_frames) == 36 * (34 + 6 * 44)  # a status and six axes each
+    assert len(sent_frames) == 36 * (STATUS_FRAMES + 6 * REPORT_FRAMES)  # a status and six axes each
     data = spoil("".join(line + "\r" for line in lines(sent)).encode(), seed=5, share=0.01)
     truth = [expected_values(one) for one in reports_of(sent)]
     decoder = Decoder(from_start=True)

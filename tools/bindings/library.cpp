@@ -365,6 +365,7 @@ public:
         d["moved"] = c.moved;
         d["blind"] = c.blind;
         d["alarms"] = c.alarms;
+        d["measured"] = gate_.measured;
         return d;
     }
 

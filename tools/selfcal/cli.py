@@ -156,6 +156,7 @@ def replay(
     report_every: Annotated[
         float | None, typer.Option(metavar="S", help="Seconds between reports; default: 100 in all, fewer in QEMU")
     ] = None,
+    gate: Annotated[bool, typer.Option("--gate", help="Keep motion out, by the model's stationary gate")] = False,
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
     rate: Rate = None,
@@ -175,6 +176,7 @@ def replay(
         target=target.value,
         transport=transport.value,
         report_every=report_every,
+        gate=gate,
         json=json,
         plot=plot,
         rate=rate,
@@ -197,6 +199,38 @@ def monitor(
     from selfcal.verbs import monitor as verb
 
     verb.monitor(interface=interface, channel=channel, log=log, duration=duration, bitrate=bitrate)
+
+
+@app.command()
+def command(
+    order: Annotated[
+        str,
+        typer.Argument(
+            metavar="ORDER",
+            help="reset [forget], save, telemetry_period MS, write_offsets AXES|none; new-key, build-flag",
+        ),
+    ],
+    value: Annotated[
+        str | None, typer.Argument(metavar="VALUE", help="As the order wants it", show_default=False)
+    ] = None,
+    key: Annotated[Path, typer.Option("--key", metavar="FILE", help="The module's key")] = Path("selfcal.key"),
+    channel: Annotated[str, typer.Option(metavar="NAME", help="Channel: a serial port for slcan")] = "",
+    interface: Annotated[str, typer.Option(metavar="NAME", help="python-can interface")] = "slcan",
+    bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
+) -> None:
+    """Have a module do something, if its image was built with a command key."""
+    from selfcal.verbs import command as verb
+
+    if order == "new-key":
+        verb.new_key(key)
+    elif order == "build-flag":
+        print(verb.build_flag(verb.read_key(key)))
+    else:
+        answer = verb.command(
+            order, value, key=verb.read_key(key), interface=interface, channel=channel, bitrate=bitrate
+        )
+        print(f"{order}: {answer}")
+        sys.exit(0 if answer == "done" else USER_ERROR)
 
 
 @app.command()

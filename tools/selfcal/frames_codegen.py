@@ -17,7 +17,7 @@ from cantools.database.can.signal import Signal
 from selfcal.errors import UserError
 from selfcal.model import PARAMETERS
 from selfcal.units import parameter_unit
-from selfcal.wire import AXES, ROOT, STATUS, load_dbc
+from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATUS, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
@@ -140,7 +140,6 @@ def _items(prefix: str, members: Iterable[Field]) -> list[str]:
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
     check(database)
-    status = database.get_message_by_name(STATUS)
     axis = fields(database.get_message_by_name(AXES[0].upper()))
     lines = [
         "/* The telemetry frame format in numbers. Generated from selfcal.dbc, which describes every item:",
@@ -156,7 +155,10 @@ def header(database: Database) -> str:
     for name, (start, length) in COMMON.items():
         lines.append(f"#define SELFCAL_FRAME_{name.upper()}_SHIFT {start}U")
         lines.append(f"#define SELFCAL_FRAME_{name.upper()}_MASK 0x{(1 << length) - 1:X}U")
-    lines += ["", f"#define SELFCAL_FRAME_STATUS_ID 0x{status.frame_id:X}U", ""]
+    lines.append("")
+    for name in (STATUS, CORRECTED, COMMAND, ANSWER):
+        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{database.get_message_by_name(name).frame_id:X}U")
+    lines.append("")
     lines.append("/* Axis name and id of each axis message. */")
     lines.append(f"#define SELFCAL_FRAME_AXES {len(AXES)}U")
     pairs = [f'{{"{name}", 0x{database.get_message_by_name(name.upper()).frame_id:X}U}}' for name in AXES]
@@ -165,11 +167,13 @@ def header(database: Database) -> str:
     lines += ["    }", ""]
     lines.append("/* Items of an axis message; units of a gyro axis, those of an accelerometer are alike in m/s^2. */")
     lines += _items("SELFCAL_AXIS", axis)
-    lines.append("/* Items of the status message. */")
-    lines += _items("SELFCAL_STATUS", fields(status))
-    for signal in status.signals:
-        for number, word in (signal.choices or {}).items():
-            lines.append(f"#define SELFCAL_STATUS_{signal.name.upper()}_{str(word).upper()} {number}U")
+    for name in (STATUS, CORRECTED, ANSWER):
+        message = database.get_message_by_name(name)
+        lines.append(f"/* Items of the {name.lower()} message. */")
+        lines += _items(f"SELFCAL_{name}", fields(message))
+        for signal in message.signals:
+            for number, word in (signal.choices or {}).items():
+                lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
     lines += ["", "#endif", ""]
     return "\n".join(lines)
 
@@ -184,16 +188,27 @@ def table(database: Database) -> str:
     for name, (start, length) in COMMON.items():
         comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
         lines.append(f"| `{name}` | {start} to {start + length - 1} | {comment} |")
-    for title, name in ((f"Axis messages: {ids}", AXES[0].upper()), (f"`0x{status.frame_id:X}` STATUS", STATUS)):
+    titles = {AXES[0].upper(): f"Axis messages: {ids}"}
+    titles |= {
+        name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
+    }
+    for name, title in titles.items():
         lines += ["", title, "", "| item | signal | type | unit | meaning |", "|---|---|---|---|---|"]
         for field in fields(database.get_message_by_name(name)):
             kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
             kind += _bits(field)
             unit = field.unit
-            if name != STATUS and accel[field.name] != unit:
+            if name.lower() in AXES and accel[field.name] != unit:
                 unit += f"; {accel[field.name]}"
             meaning = field.comment + (f": {field.choices}" if field.choices else "")
             lines.append(f"| {field.item} | `{field.name}` | {kind} | {unit} | {meaning} |")
+    command = database.get_message_by_name(COMMAND)
+    lines += ["", f"`0x{command.frame_id:X}` COMMAND, from the host"]
+    lines += ["", "| signal | bits | meaning |", "|---|---|---|"]
+    for signal in command.signals:
+        choices = ", ".join(f"{number} {word}" for number, word in (signal.choices or {}).items())
+        meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
+        lines.append(f"| `{signal.name}` | {signal.start} to {signal.start + signal.length - 1} | {meaning} |")
     return "\n".join(lines) + "\n"
 
 

@@ -99,6 +99,19 @@ class Regressor:
 
 
 @dataclass(frozen=True)
+class Gate:
+    """The stationary gate's configuration (`selfcal_gate_config_t`); `N` by group, white noise density to start from,
+    in the group's unit/sqrt(Hz). A group that is not there is left out of the gate."""
+
+    window_s: float
+    false_alarm: float
+    hold: int
+    settle: int
+    memory: int
+    N: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class GridNodes:
     """Filter nodes of one target: random walk (rho) and by law (rho, alpha), the moving average's (rho,
     spectral_ratio)."""
@@ -123,6 +136,7 @@ class Model:
     simulate: Mapping[str, Any]
     regressors: tuple[Regressor, ...] = ()
     half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
+    gate: Gate | None = None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -297,6 +311,26 @@ class _Reader:
             raise self.fail("regressors", f"{columns} columns are more than {MOST_COLUMNS} (periodic: two each)")
         return found
 
+    def gate(self, tree: Any, groups: tuple[Group, ...]) -> Gate:
+        names = ("window_s", "false_alarm", "hold", "settle", "memory", "N")
+        fields = self.only(tree, names, "gate")
+        for name in names:
+            self.entry(fields, name, "gate")
+        false_alarm = self.number(fields["false_alarm"], "gate.false_alarm", strict=False)
+        if false_alarm > 0.1:
+            raise self.fail("gate.false_alarm", f"must be 0.1 at most, not {false_alarm:g}")
+        noise = self.only(fields["N"], tuple(group.name for group in groups), "gate.N")
+        if not noise:
+            raise self.fail("gate.N", "must name at least one group")
+        return Gate(
+            window_s=self.number(fields["window_s"], "gate.window_s"),
+            false_alarm=false_alarm,
+            hold=self.count(fields["hold"], "gate.hold", 1),
+            settle=self.count(fields["settle"], "gate.settle", 0),
+            memory=self.count(fields["memory"], "gate.memory", 1),
+            N={name: self.number(value, f"gate.N.{name}") for name, value in noise.items()},
+        )
+
     def nodes(self, tree: Any, where: str, laws: Collection[str]) -> GridNodes:
         known = ("gauss_markov", *SUMS)
         fields = self.only(tree, ("random_walk", *known), where)
@@ -319,7 +353,7 @@ class _Reader:
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
-        tree = self.only(raw, (*needed, "regressors", "half_life_s"), "")
+        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate"), "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
@@ -350,4 +384,5 @@ class _Reader:
             simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
+            gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
         )

@@ -14,6 +14,7 @@ from scipy.interpolate import BSpline
 from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS, PLACES, SUMS, Group, Model, Regressor
+from selfcal.units import same_kind
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
 RATE_LIMITS = (1e-6, 1e6)
@@ -80,6 +81,20 @@ class HypothesisTable:
 
 
 @dataclass(frozen=True)
+class GateTable:
+    """The gate for one sampling rate: `window` in samples; of each axis `sigma` (infinite: left out), and if it is a
+    gyro."""
+
+    window: int
+    false_alarm: float
+    hold: int
+    settle: int
+    memory: int
+    sigma: tuple[float, ...]
+    is_rate: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
 class Tables:
     """A model for one bank interval `dt_s` = `block` samples, for some axes and one target's node counts."""
 
@@ -114,6 +129,25 @@ class Tables:
 def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
     """Samples averaged into one bank sample; a recording slower than the bank rate is taken as it is."""
     return max(1, round(rate_hz / bank_rate_hz))
+
+
+def gate_table(model: Model, tables: Tables) -> GateTable | None:
+    """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
+    if model.gate is None or tables.block < 2:
+        return None
+    gate, rate_hz = model.gate, tables.block / tables.dt_s
+    wanted = gate.window_s * rate_hz
+    divisors = [n for n in range(2, tables.block + 1) if tables.block % n == 0]
+    groups = [model.group_of(axis.name) for axis in tables.axes]
+    return GateTable(
+        window=min(divisors, key=lambda n: abs(math.log(n / wanted))),
+        false_alarm=gate.false_alarm,
+        hold=gate.hold,
+        settle=gate.settle,
+        memory=gate.memory,
+        sigma=tuple(gate.N[g.name] * math.sqrt(rate_hz) if g.name in gate.N else math.inf for g in groups),
+        is_rate=tuple(same_kind(group.unit, "rad/s") for group in groups),
+    )
 
 
 def make_tables(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Axis messages are named after the axis, in capitals.
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
-STATUS = "STATUS"
+STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 
 COUNTER = 64  # the counter is modulo this
@@ -159,11 +159,14 @@ class Decoder:
         self._messages = {
             message.frame_id: message
             for message in database.messages
-            if message.name == STATUS or message.name.lower() in AXES
+            if message.name != COMMAND
         }
         self.statistics = Statistics()
         #: Last value of each status signal.
         self.status: dict[str, float] = {}
+        #: Last value of each signal of the corrected sample, and of the answers to commands.
+        self.corrected: dict[str, float] = {}
+        self.answer: dict[str, float] = {}
         #: Module time of the last opening or status frame, unwrapped, ms.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
@@ -221,6 +224,9 @@ class Decoder:
             if "frames_sent" in values:
                 self._exact(int(values["frames_sent"]))
                 self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+            return self.flush()
+        if definition.name in (CORRECTED, ANSWER):
+            (self.corrected if definition.name == CORRECTED else self.answer).update(values)
             return self.flush()
         return self._assemble(definition.name.lower(), item, jump, second, values)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
-from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, make_tables
+from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
@@ -61,6 +61,8 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_TERM_NODES {tables.term_nodes}U
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+/* 1: selfcal_model_gate is there. */
+#define SELFCAL_MODEL_GATE {int(gate_table(model, tables) is not None)}
 
 #if SELFCAL_GRID_MAX < {largest} || SELFCAL_AXES_MAX < {axes} || SELFCAL_HYPOTHESES_MAX < {hypotheses}
 #error "SELFCAL_GRID_MAX, SELFCAL_AXES_MAX or SELFCAL_HYPOTHESES_MAX is too small for this model"
@@ -71,6 +73,9 @@ def _header(model: Model, tables: Tables) -> str:
 {_terms(tables)}
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
+#if SELFCAL_MODEL_GATE
+extern const selfcal_gate_config_t selfcal_model_gate;
+#endif
 
 #endif
 """
@@ -96,7 +101,7 @@ def _source(model: Model, tables: Tables) -> str:
     sizes = sorted({grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid})
     grids = {grid.nodes: grid for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid}
     parts = [f"/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */"]
-    parts += ['#include "selfcal_model.h"', ""]
+    parts += ["#include <math.h>", "", '#include "selfcal_model.h"', ""]
     parts += [_grid(grids[nodes]) for nodes in sizes]
     parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
     for h in tables.hypotheses:
@@ -124,7 +129,7 @@ def _source(model: Model, tables: Tables) -> str:
         "};",
         "",
     ]
-    return "\n".join(parts)
+    return "\n".join(parts + _gate(model, tables))
 
 
 def _f(value: float) -> str:
@@ -166,6 +171,22 @@ def _regressors(tables: Tables) -> list[str]:
         "};",
         "static const selfcal_regressors_t regressors = {",
         f"    &selfcal_regressors_code, {len(tables.regressors)}U, reference, coefficient_sd,",
+        "};",
+        "",
+    ]
+
+
+def _gate(model: Model, tables: Tables) -> list[str]:
+    gate = gate_table(model, tables)
+    if gate is None:
+        return []
+    sigma = ", ".join("INFINITY" if math.isinf(value) else _f(value) for value in gate.sigma)
+    kinds = ", ".join("true" if rate else "false" for rate in gate.is_rate)
+    numbers = f"{gate.window}U, {_f(gate.false_alarm)}, {gate.hold}U, {gate.settle}U, {gate.memory}U"
+    return [
+        "const selfcal_gate_config_t selfcal_model_gate = {",
+        f"    SELFCAL_MODEL_AXES, {numbers},",
+        f"    {{{sigma}}}, {{{kinds}}},",
         "};",
         "",
     ]

@@ -23,7 +23,7 @@ from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, load
-from selfcal.tables import bank_block
+from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, write_json
 from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
@@ -65,6 +65,7 @@ def replay(
     target: str = "host",
     transport: str = "slcan",
     report_every: float | None = None,
+    gate: bool = False,
     json: Path | str | None = None,
     plot: Path | str | None = None,
     rate: float | None = None,
@@ -76,8 +77,9 @@ def replay(
 
     The firmware is built for the model and the recording's rate if it is not there yet. `target`: this machine, or a
     processor emulated by QEMU. `report_every`: seconds of the recording between reports (default: a hundredth of it on
-    the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `plot`: file for the picture of the run. Numbers
-    are in the recording's units. Raises UserError for what the user can put right.
+    the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `gate`: only rest counts, as the model's
+    stationary gate sees it; while the sensor moves time passes as a gap. `plot`: file for the picture of the run.
+    Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -104,8 +106,13 @@ def replay(
                 f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
                 f"{axis_unit(name)}, so the model must be in that unit"
             )
+    if gate and gate_table(loaded_model, make_tables(loaded_model, recording.rate_hz, tuple(names))) is None:
+        raise UserError(
+            f"{loaded_model.path}: no gate for samples at {recording.rate_hz:g} Hz: it wants an entry `gate`, and two "
+            f"samples or more a bank interval ({loaded_model.bank_rate_hz:g} Hz)"
+        )
     firmware = build(loaded_model, recording.rate_hz, names, target)
-    history = run(firmware, recording, loaded_model, names, report_every, target)
+    history = run(firmware, recording, loaded_model, names, report_every, target, gate)
     document = _document(recording, loaded_model, names, history)
     if json is not None:
         write_json(document, json)
@@ -171,8 +178,10 @@ def run(
     axes: Sequence[str],
     report_every: float | None,
     target: str = "host",
+    gate: bool = False,
 ) -> dict[str, list[AxisReport]]:
-    """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts."""
+    """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts, and the
+    gate's."""
     block = bank_block(recording.rate_hz, model.bank_rate_hz)
     longest_s = recording.duration_s / TARGETS[target].reports
     period_s = report_every or min(max(block / recording.rate_hz, longest_s), LONGEST_PERIOD_S)
@@ -181,7 +190,7 @@ def run(
         rows = Path(name) / "rows.bin"
         write_rows(recording, model, axes, rows)
         finished = False
-        with _module(firmware, rows, period_s, target) as (module, channel, before):
+        with _module(firmware, rows, period_s, target, gate) as (module, channel, before):
             if channel:
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
                 with open_bus("slcan", channel, bitrate=500000, sleep_after_open=0.0) as link:
@@ -195,7 +204,7 @@ def run(
 
 @contextmanager
 def _module(
-    firmware: Path, rows: Path, period_s: float, target: str
+    firmware: Path, rows: Path, period_s: float, target: str, gate: bool
 ) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
     """The running firmware, the serial channel its telemetry comes by, and what it said before; killed at the end.
 
@@ -204,9 +213,10 @@ def _module(
     with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
         if server is None:
             command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--timeout", f"{TIMEOUT_S:g}"]
+            command += ["--gate"] if gate else []
         else:  # QEMU takes over a socket that listens already, so no port can be lost to another program
             uart = f"socket,id=uart,server=on,wait=off,fd={server.fileno()}"
-            command = emulator(firmware, rows.name, period_s, target, uart)
+            command = emulator(firmware, rows.name, period_s, target, uart, gate)
         try:
             module = subprocess.Popen(
                 command,
@@ -238,13 +248,14 @@ def _module(
             module.wait()
 
 
-def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str) -> list[str]:
+def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str, gate: bool = False) -> list[str]:
     """QEMU's command line for a firmware over the file `rows` of its folder; `uart`: a -chardev with id=uart."""
     period_ms = math.ceil(float(f"{period_s:.6f}") * 1000.0)  # as port/posix/main.c rounds it
     return [
         *("qemu-system-arm", "-M", *TARGETS[target].board, "-display", "none", "-monitor", "none"),
         *("-chardev", uart, "-serial", "chardev:uart", "-kernel", str(firmware)),
-        *("-semihosting-config", f"enable=on,target=native,arg=selfcal,arg={rows},arg={period_ms}"),
+        "-semihosting-config",
+        f"enable=on,target=native,arg=selfcal,arg={rows},arg={period_ms}" + (",arg=gate" if gate else ""),
     ]
 
 
@@ -262,7 +273,11 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
             for report in reports:
                 if report.complete:
                     history[report.axis].append(report)
-    Console(stderr=True).print(frame_counts(decoder, link), highlight=False, soft_wrap=True)
+    said = frame_counts(decoder, link)
+    if decoder.status.get("motion", 0.0) > 0.0:
+        alarms, blocks = (decoder.status.get(name, 0.0) for name in ("gate_alarm_count", "blocks_moving_count"))
+        said += f"\ngate: rest ended {alarms:.0f} times; {blocks:.0f} bank intervals begun and given up for motion"
+    Console(stderr=True).print(said, highlight=False, soft_wrap=True)
     return decoder.finished
 
 

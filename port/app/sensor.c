@@ -1,0 +1,78 @@
+#include "sensor.h"
+
+#include <string.h>
+
+static adis16405_t sensor;
+static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
+
+bool sensor_init(const adis16405_bus_t *bus)
+{
+    static const char *const name[ADIS16405_AXES] = {"gx", "gy", "gz", "ax", "ay", "az"};
+    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        uint8_t at = 0;
+        while (at < ADIS16405_AXES && strcmp(selfcal_model_axis_name[axis], name[at]) != 0) {
+            at++;
+        }
+        if (at == ADIS16405_AXES) {
+            return false;
+        }
+        channel[axis] = at;
+    }
+    const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
+    return adis16405_init(&sensor, bus, &config);
+}
+
+void sensor_ready(void)
+{
+    adis16405_ready(&sensor);
+}
+
+void sensor_burst(const uint16_t words[ADIS16405_BURST_WORDS], bool whole)
+{
+    adis16405_burst(&sensor, words, whole);
+}
+
+void sensor_poll(void)
+{
+    adis16405_poll(&sensor);
+}
+
+port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing)
+{
+    (void)context;
+    float all[ADIS16405_AXES];
+    if (!adis16405_sample(&sensor, all, missing)) {
+        return PORT_EMPTY;
+    }
+    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        reading[axis] = all[channel[axis]];
+    }
+    return PORT_SAMPLE;
+}
+
+bool sensor_write_offsets(void *context, const float wanted[], float got[])
+{
+    (void)context;
+    float all[ADIS16405_AXES] = {0.0F}, done[ADIS16405_AXES];
+    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        all[channel[axis]] = wanted[axis];
+    }
+    const bool written = adis16405_offsets(&sensor, all, done);
+    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES && written; axis++) {
+        got[axis] = done[channel[axis]];
+    }
+    return written;
+}
+
+void sensor_tell(selfcal_module_t *told)
+{
+    told->sensor_state = (uint32_t)sensor.state + 1U;
+    told->sensor_fault = (uint32_t)sensor.fault;
+    told->sensor_fault_count = sensor.counters.faults;
+    told->sensor_diagnosis = sensor.diagnosis;
+    told->sensor_stale_count = sensor.counters.stale + sensor.counters.repeated;
+    told->sensor_alarm_count = sensor.counters.alarms;
+    told->sensor_damaged_count = sensor.counters.damaged;
+    told->sensor_anomaly_count = sensor.counters.anomalies;
+    told->sensor_overrun_count = sensor.counters.overruns;
+}

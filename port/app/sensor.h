@@ -1,0 +1,22 @@
+/* The board's ADIS16405 as the application's sensor: axes in the model's order. One a program. */
+#ifndef SENSOR_H
+#define SENSOR_H
+
+#include "adis16405.h"
+#include "port.h"
+#include "selfcal_model.h"
+
+/* False: the model has an axis or a rate that the sensor has not. */
+bool sensor_init(const adis16405_bus_t *bus);
+
+/* From the interrupt handlers, and from the main loop: as adis16405_ready(), _burst() and _poll(). */
+void sensor_ready(void);
+void sensor_burst(const uint16_t words[ADIS16405_BURST_WORDS], bool whole);
+void sensor_poll(void);
+
+/* For port_t and port_module_t. */
+port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing);
+bool sensor_write_offsets(void *context, const float wanted[], float got[]);
+void sensor_tell(selfcal_module_t *told);
+
+#endif

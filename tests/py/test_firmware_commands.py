@@ -1,0 +1,399 @@
+"""The STM32F405 image with the gate, the corrected output and commands, on the board of behavioural models.
+
+Truths: the library on the host over the samples that the sensor made; the sensor's registers; what SipHash's authors
+publish; and for whatever is not a command that nothing happens.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from firmware import AXES, MANY, Board, Tap, image, messages, parts, reports, status, tell
+from gated import Gated
+from typer.testing import CliRunner
+
+from selfcal.cli import app
+from selfcal.errors import UserError
+from selfcal.model import Model
+from selfcal.verbs import command as verb
+from selfcal.wire import Decoder
+
+KEY = bytes(range(16))
+RATE_HZ, BANK_HZ = 102.4, 5.12
+#: A report each 3 s, a corrected sample each 0.2 s.
+FLAGS = f"-DBOARD_REPORT_MS=3000 -DAPP_CORRECTED_MS=200 {verb.build_flag(KEY)}"
+ORDERS: dict[str, Any] = {
+    "name": "orders",
+    "flags": FLAGS,
+    "quiet": True,
+    "bank_hz": BANK_HZ,
+    "laws": ("constant", "random_walk"),
+}
+#: No bank sample within a test, so that time goes by fast.
+IDLE: dict[str, Any] = {"name": "idle", "flags": f"-DBOARD_REPORT_MS=500 {verb.build_flag(KEY)}", "quiet": True}
+SERIAL: dict[str, Any] = IDLE | {
+    "name": "idle-serial",
+    "flags": f"{IDLE['flags']} -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD=1000000",
+}
+RESTING, MOVING = 2, 1
+RESULT, COMMAND = verb.codes("result"), verb.codes("command")
+COMMAND_ID = 0x208
+
+
+def new_answers(board: parts.Board, since: int) -> list[dict[str, float]]:
+    """Answers among the frames heard from the `since`-th on."""
+    found = []
+    for message in messages(board, since):
+        if message.arbitration_id == 0x209:
+            decoder = Decoder()
+            decoder.feed(message)
+            found.append(decoder.answer)
+    return found
+
+
+def challenge(board: parts.Board) -> int:
+    since = len(board.frames)
+    board.can.say(COMMAND_ID, verb.payload("challenge"))
+    board.run(0.05)
+    (answer,) = new_answers(board, since)
+    return int(answer["challenge"])
+
+
+def order(board: parts.Board, data: bytes, seconds: float = 0.05) -> list[int]:
+    """Results that a command frame draws."""
+    since = len(board.frames)
+    board.can.say(COMMAND_ID, data)
+    board.run(seconds)
+    return [int(answer["result"]) for answer in new_answers(board, since) if "result" in answer]
+
+
+def obey(board: parts.Board, name: str, argument: int = 0, seconds: float = 0.05) -> list[int]:
+    return order(board, verb.payload(name, argument, key=KEY, challenge=challenge(board)), seconds)
+
+
+# ------------------------------------------------------------------------------------------------------------ the key
+
+
+def test_siphash_is_that_of_its_authors() -> None:
+    """The paper's appendix A (15 bytes), and the 8-byte entry of the reference implementation's table."""
+    assert verb.siphash(KEY, bytes(range(15))) == 0xA129CA6149BE45E5
+    assert verb.siphash(KEY, bytes(range(8))) == 0x93F5F5799A932462
+
+
+def test_key_files(tmp_path: Path) -> None:
+    runner, key = CliRunner(), tmp_path / "k"
+    assert runner.invoke(app, ["command", "new-key", "--key", str(key)]).exit_code == 0
+    assert len(verb.read_key(key)) == 16
+    assert key.stat().st_mode & 0o77 == 0
+    said = runner.invoke(app, ["command", "build-flag", "--key", str(key)]).output.strip()
+    low, high = (int(word.removesuffix("ULL"), 16) for word in said.removeprefix("-DAPP_COMMAND_KEY=").split(","))
+    assert struct.pack("<2Q", low, high) == verb.read_key(key)
+    with pytest.raises(UserError, match="cannot write the key"):
+        verb.new_key(key)
+    key.write_text("00")
+    with pytest.raises(UserError, match="32 hexadecimal digits"):
+        verb.read_key(key)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("telemetry_period", None, "a number of ms"),
+        ("telemetry_period", "99", "a number of ms"),
+        ("write_offsets", None, "wants axes"),
+        ("write_offsets", "gx,mx", "wants axes"),
+        ("save", "now", "takes nothing"),
+        ("reset", "all", "no word but forget"),
+    ],
+)
+def test_arguments_that_are_refused(name: str, value: str | None, complaint: str) -> None:
+    with pytest.raises(UserError, match=complaint):
+        verb.argument_of(name, value)
+
+
+# ----------------------------------------------------------------------------------------------------------- commands
+
+
+def test_commands_are_obeyed_once() -> None:
+    """Each does what it says, is answered and counted; the same frame again, and one with a bit changed, does
+    nothing."""
+    board = Board(image(**IDLE), seed=31)
+    board.run(0.9)
+    period = verb.payload("telemetry_period", 250, key=KEY, challenge=challenge(board))
+    assert order(board, period) == [RESULT["done"]]
+    assert board.value("app.period_ms") == 250
+    assert order(board, period) == [RESULT["no_challenge"]]
+    spoilt = bytearray(verb.payload("telemetry_period", 300, key=KEY, challenge=challenge(board)))
+    spoilt[1] ^= 1
+    assert order(board, bytes(spoilt)) == [RESULT["wrong_tag"]]
+    # no challenge for a second after a wrong tag
+    assert order(board, verb.payload("challenge")) == [RESULT["not_now"]]
+    board.run(1.0)
+    assert order(board, verb.payload("telemetry_period", 300, key=bytes(16), challenge=challenge(board))) == [
+        RESULT["wrong_tag"]
+    ]
+    board.run(1.0)
+    assert obey(board, "telemetry_period", 99) == [RESULT["out_of_range"]]
+    assert obey(board, "save", 1) == [RESULT["out_of_range"]]
+    assert obey(board, "reset", 2) == [RESULT["out_of_range"]]
+    assert obey(board, "write_offsets", 64) == [RESULT["out_of_range"]]
+    assert obey(board, "write_offsets", 1) == [RESULT["not_now"]]  # there is no report yet
+    assert board.value("app.period_ms") == 250
+    assert obey(board, "save", seconds=1.3) == [RESULT["done"]]
+    assert board.value("app.told.state_saves") == 1
+    stale = verb.payload("save", key=KEY, challenge=challenge(board))
+    board.run(10.1)
+    assert order(board, stale) == [RESULT["no_challenge"]]
+    board.rng.stuck = True  # a random number generator that fails
+    assert order(board, verb.payload("challenge")) == [RESULT["not_now"]]
+    board.rng.stuck = False
+    board.run(0.6)
+    told = status(board)
+    assert (told["command_count"], told["command_refused_count"]) == (2.0, 11.0)
+    assert obey(board, "reset", seconds=0.5) == [RESULT["done"]]
+    assert [cause for _, cause in board.machine.resets] == ["software"]
+    board.run(1.0)
+    assert status(board)["reset_cause"] == 3
+    assert status(board)["state_found"] == 1
+    assert board.machine.violations == board.machine.faults == []
+
+
+def test_commands_over_the_serial_line() -> None:
+    """The same as SLCAN text; only whole lines of the right identifier, length and digits on an open channel."""
+    board = Board(image(**SERIAL), seed=32)
+    board.usart.host_baud = 1e6
+    board.run(0.2)
+
+    def say(line: str, seconds: float = 0.02) -> bytes:
+        board.text.clear()
+        board.usart.say(line.encode() + b"\r")
+        board.run(seconds)
+        return bytes(board.text)
+
+    def line(data: bytes) -> str:
+        return f"t2088{data.hex().upper()}"
+
+    assert say(line(verb.payload("challenge"))) == b"\a"  # the channel is closed
+    assert say("O").startswith(b"\r")
+    for bad in (
+        line(verb.payload("challenge"))[:-1],
+        line(verb.payload("challenge")) + "0",
+        "t2078" + "01" + "0" * 14,
+        "t2087" + "01" + "0" * 12,
+        "T00000208801" + "0" * 14,
+        "t2088" + "0G" + "0" * 14,
+        "r2088",
+    ):
+        assert say(bad).startswith(b"\a"), bad
+    assert board.value("app.told.command_refused_count") == 0
+    answer = say(line(verb.payload("challenge")))
+    assert answer.startswith(b"z\r")
+    (reply,) = [text for text in answer.split(b"\r") if text.startswith(b"t209")]
+    number = struct.unpack("<I", bytes.fromhex(reply[5:13].decode()))[0]
+    answer = say(line(verb.payload("telemetry_period", 200, key=KEY, challenge=number)))
+    assert b"t2098" in answer
+    assert board.value("app.period_ms") == 200
+    assert board.machine.violations == []
+
+
+def test_random_command_frames_do_nothing() -> None:
+    """Random bytes, right codes with random tags, wrong lengths, remote and extended
+    frames, recorded commands; a challenge is kept open as far as the module gives one."""
+    trials = 100_000 if MANY > 1 else 2000
+    rng = random.Random(33)
+    board = Board(image(**IDLE), seed=33)
+    tap = Tap(board)
+    board.run(0.9)
+    recorded = [verb.payload("reset", key=KEY, challenge=challenge(board)) for _ in range(3)]
+    before = {name: board.value(name) for name in ("app.period_ms", "app.told.state_saves", "app.told.command_count")}
+    passed = 0
+    for trial in range(trials):
+        kind = rng.randrange(6)
+        code = bytes((rng.randrange(1, 6),))
+        data = rng.randbytes(8) if kind == 0 else code + rng.randbytes(7) if kind < 3 else rng.choice(recorded)
+        if rng.random() < 0.05:
+            board.can.say(COMMAND_ID, verb.payload("challenge"))
+        if kind == 4:
+            board.can.say(COMMAND_ID, data[: rng.randrange(8)], length=rng.choice((-1, 8 + rng.randrange(8))))
+        elif kind == 5:
+            identifier = rng.choice((COMMAND_ID, rng.randrange(2**11), rng.randrange(2**29)))
+            board.can.say(
+                identifier, data, extended=identifier >= 2**11 or rng.random() < 0.5, remote=rng.random() < 0.5
+            )
+        else:
+            board.can.say(COMMAND_ID, data)
+        passed += 1
+        if trial % 3 == 2:
+            board.run(0.003)
+    board.run(1.5)
+    assert {name: board.value(name) for name in before} == before
+    told = status(board)
+    sound = not (board.machine.violations or board.machine.faults or board.machine.resets)
+    looked_at = told["command_refused_count"]
+    tell("random command frames", passed, passed if sound else 0, f"{looked_at:.0f} looked at, none obeyed")
+    assert told["command_refused_count"] > trials / 10
+    assert told["sensor_state"] == 2
+    assert sound
+    assert tap.wrong() == tap.misplaced(0) == 0
+    board.run(1.0)
+    assert obey(board, "telemetry_period", 400) == [RESULT["done"]]
+
+
+def test_an_image_without_commands_hears_nothing() -> None:
+    board = Board(image("quiet", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0", quiet=True), seed=34)
+    board.run(0.9)
+    board.can.say(COMMAND_ID, verb.payload("challenge"))
+    board.run(0.2)
+    assert board.can.heard == 0
+    assert board.can.fifo == []
+    assert new_answers(board, 0) == []
+
+
+# --------------------------------------------------------------------------------------- corrected output and offsets
+
+
+def host_of(path: Path) -> Gated:
+    return Gated(Model.load(path.parent / "model.yaml"), RATE_HZ, AXES, "cortex-m4f")
+
+
+def test_corrected_samples_equal_the_host_s() -> None:
+    """Reading less selfcal_predict() of the host over the same samples, by the test's own count of the time since the
+    report's last bank interval; sd grows over 3 s without samples. The libms differ by 2e-4 sd (test_firmware_qemu.py),
+    a float32 reading is rounded by 1e-5 sd: 1e-3 is left for both."""
+    path = image(**ORDERS)
+    board = Board(path, seed=35)
+    tap = Tap(board)
+    decoder = Decoder(from_start=True)
+    count: dict[str, int] = {}  # bank samples that each axis's last report rests on
+    heard: list[tuple[dict[str, float], int, dict[str, int]]] = []  # corrected, samples seen by then, `count` then
+    done = 0
+    while board.machine.now_us < 13.0e6:
+        board.sensor.silent = 8.6e6 < board.machine.now_us < 11.6e6
+        board.run(0.002)
+        for message in messages(board, done):
+            for report in decoder.feed(message):
+                if report.complete:
+                    count[report.axis] = int(report.value("count"))
+            if "motion" in decoder.corrected:
+                heard.append((decoder.corrected, len(tap.seen), dict(count)))
+                decoder.corrected = {}
+        done = len(board.frames)
+    assert board.machine.violations == []
+    host, passed = host_of(path), np.cumsum([missing + 1 for missing, _ in tap.seen])
+    compared: dict[str, list[tuple[int, float, float]]] = {axis: [] for axis in AXES}  # n, time in s, sd
+    worst, before = 0.0, 0
+    for at, (missing, sample) in enumerate(tap.seen):
+        host.feed(missing, np.array(sample, dtype=np.float32))
+        n, before = host.bank.raw.count, host.bank.raw.count if host.bank.raw.count != before else -1
+        if before < 0:  # no interval has ended
+            before = n
+            continue
+        for corrected, seen, on in heard:
+            for axis in (name for name in AXES if on.get(name) == n):
+                # which sample was the newest is known to one: its frames took some ms
+                newest = (seen - 2, seen - 1)
+                elapsed = [float(passed[k] - passed[at]) / RATE_HZ for k in newest]
+                errors = []
+                for k, (bias, sd) in zip(newest, host.bank.raw.predict(AXES.index(axis), elapsed), strict=True):
+                    value = tap.seen[k][1][AXES.index(axis)] - bias
+                    errors.append(
+                        max(abs(corrected[f"corrected_{axis}"] - value), abs(corrected[f"sd_{axis}"] - sd)) / sd
+                    )
+                worst = max(worst, min(errors))
+                compared[axis].append((n, corrected["time_ms"] / 1000.0, corrected[f"sd_{axis}"]))
+    print(f"\n{sum(map(len, compared.values()))} corrected readings, within {worst:.1e} sd")
+    assert worst < 1e-3
+    for axis, rows in compared.items():
+        assert len(rows) > 20
+        # those of the report before the gap: it lasts, and sd grows with time
+        n = next(n for n, time_s, _ in reversed(rows) if time_s < 8.6)
+        over_gap = [(time_s, sd) for m, time_s, sd in rows if m == n]
+        assert over_gap[-1][0] - over_gap[0][0] > 2.0, axis
+        assert all(sd <= later for (_, sd), (_, later) in pairwise(over_gap)), axis
+        assert over_gap[0][1] < over_gap[-1][1], axis
+
+
+def test_offsets_are_written_and_taken_out_of_the_estimate() -> None:
+    """The bias goes to the sensor's registers, nearest step: its readings go down by that, the next report's bias too,
+    with all that was learnt; the corrected output goes on, and the gate sees no motion. Kept through a restart of the
+    sensor and of the module. Taken back, all is as before."""
+    board = Board(image(**ORDERS), seed=36)
+    tap = Tap(board)
+    board.run(7.0)
+    before = {report.axis: report for report in reports(messages(board))[1] if report.complete}
+    assert sorted(before) == sorted(AXES)
+    axes = {"gx": -9 * 0.05, "gy": 4 * 0.05, "gz": 13 * 0.05, "ax": 3 * 0.032656145}  # truths of the source
+    mask = sum(1 << AXES.index(axis) for axis in axes)
+    assert obey(board, "write_offsets", mask, seconds=1.6) == [RESULT["done"]]
+    step = {axis: 0.0125 if axis[0] == "g" else 0.032656145 for axis in AXES}
+    register = {}
+    for axis in AXES:
+        word = board.sensor.registers[0x1A + 2 * AXES.index(axis)]
+        register[axis] = (word & 0x1FFF ^ 0x1000) - 0x1000 if axis[0] == "g" else (word & 0xFFF ^ 0x800) - 0x800
+        truth = -axes.get(axis, 0.0) / step[axis]
+        # the last report's bias is within 4 of its sd of the truth, and rounded to a step
+        off = 0.5 + 4.0 * before[axis].value("bias_sd") / step[axis] if axis in axes else 0.0
+        assert abs(register[axis] - truth) <= off, axis
+    board.run(7.0)
+    decoder, found = reports(messages(board))
+    told, after = decoder.status, {report.axis: report for report in found if report.complete}
+    for axis in AXES:
+        offset = told[f"offset_{axis}"]
+        assert offset == pytest.approx(register[axis] * step[axis], abs=1e-6)
+        moved = after[axis].value("bias_mean") - before[axis].value("bias_mean")
+        # the new mean is over about twice the samples: it moves by less than 4 sd of the old one
+        assert abs(moved - offset) < 4.0 * before[axis].value("bias_sd"), axis
+        assert after[axis].value("bias_sd") < 1.05 * before[axis].value("bias_sd")
+        assert after[axis].value("count") > 1.5 * before[axis].value("count")
+    assert told["motion"] == RESTING
+    assert told["gate_alarm_count"] == 0
+    assert told["missing"] < 60 + 10  # three windows before the gate saw rest, and around the writing 6 and its time
+    level = np.mean([sample for _, _, sample in board.sensor.taken[-400:]], axis=0)
+    assert np.all(np.abs(level[:3]) < 0.25 / 0.05 * 4 / math.sqrt(12) + 4 * 18 / 20)
+    assert abs(level[1]) < 4.0 + 4 * 18 / 20
+    # the sensor forgets at a reset; the driver tells it again
+    board.sensor.power_on()
+    board.run(3.0)
+    assert board.sensor.registers[0x1C] & 0x1FFF == register["gy"] & 0x1FFF
+    # so does a saved state after a power cut
+    assert obey(board, "save", seconds=3.5) == [RESULT["done"]]
+    board.power_cycle()
+    board.run(2.0)
+    assert board.value("app.told.state_found") == 1
+    assert board.sensor.registers[0x1C] & 0x1FFF == register["gy"] & 0x1FFF
+    board.run(3.0)
+    assert obey(board, "write_offsets", 0, seconds=3.0) == [RESULT["done"]]
+    assert {board.sensor.registers[address] for address in range(0x1A, 0x26, 2)} == {0}
+    board.run(3.1)
+    assert status(board)["offset_gy"] == 0.0
+    assert tap.wrong() == 0
+    assert board.machine.violations == board.machine.faults == []
+
+
+def test_offsets_that_cannot_be_written() -> None:
+    """A positive bias of x would need a negative XGYRO_OFF, with which the part loses sign bits: refused. Registers
+    that do not read back: the sensor is restarted with what it had. While moving: not now."""
+    board = Board(image(**ORDERS), seed=37)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0] + 30.0, *rest(k)[1:])
+    board.run(7.0)
+    assert obey(board, "write_offsets", 1, seconds=1.6) == [RESULT["failed"]]
+    assert board.sensor.registers[0x1A] == 0
+    board.sensor.writes_fail = True
+    assert obey(board, "write_offsets", 2, seconds=1.6) == [RESULT["failed"]]
+    board.sensor.writes_fail = False
+    board.run(2.0)
+    told = status(board)
+    assert (told["sensor_state"], told["sensor_fault"]) == (2, 2)
+    assert told["offset_gy"] == 0.0
+    board.sensor.source = lambda k: (rest(k)[0] + (900.0 if k % 20 < 10 else 0.0), *rest(k)[1:])
+    board.run(3.0)
+    assert obey(board, "write_offsets", 2, seconds=1.6) == [RESULT["not_now"]]
+    assert board.machine.violations == []

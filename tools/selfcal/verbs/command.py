@@ -1,0 +1,152 @@
+"""`selfcal command`: an order to a module whose image takes commands (port/app/command.h)."""
+
+from __future__ import annotations
+
+import secrets
+import struct
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from selfcal.errors import UserError
+from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus
+
+if TYPE_CHECKING:
+    import can
+
+CHALLENGE = "challenge"
+#: s to wait for a challenge, and for an answer: a module obeys between reports, which take it seconds.
+CHALLENGE_S, ANSWER_S = 5.0, 120.0
+_MASK = 2**64 - 1
+
+
+def siphash(key: bytes, message: bytes) -> int:
+    """SipHash-2-4 of `message` under a key of 16 bytes (Aumasson & Bernstein, INDOCRYPT 2012, 489-508)."""
+    k0, k1 = struct.unpack("<2Q", key)
+    v = [k0 ^ 0x736F6D6570736575, k1 ^ 0x646F72616E646F6D, k0 ^ 0x6C7967656E657261, k1 ^ 0x7465646279746573]
+
+    def rotate(x: int, by: int) -> int:
+        return (x << by | x >> 64 - by) & _MASK
+
+    def half_round(a: int, b: int, c: int, d: int, s: int, t: int) -> None:
+        v[a] = (v[a] + v[b]) & _MASK
+        v[c] = (v[c] + v[d]) & _MASK
+        v[b] = rotate(v[b], s) ^ v[a]
+        v[d] = rotate(v[d], t) ^ v[c]
+        v[a] = rotate(v[a], 32)
+
+    padded = message + bytes(7 - len(message) % 8) + bytes((len(message) & 0xFF,))
+    for (word,) in struct.iter_unpack("<Q", padded):
+        v[3] ^= word
+        for _ in range(2):
+            half_round(0, 1, 2, 3, 13, 16)
+            half_round(2, 1, 0, 3, 17, 21)
+        v[0] ^= word
+    v[2] ^= 0xFF
+    for _ in range(4):
+        half_round(0, 1, 2, 3, 13, 16)
+        half_round(2, 1, 0, 3, 17, 21)
+    return int(v[0] ^ v[1] ^ v[2] ^ v[3])
+
+
+def codes(signal: str) -> dict[str, int]:
+    """Names of an answer's `command` or `result`, with their numbers in the DBC."""
+    choices: Any = load_dbc().get_message_by_name(ANSWER).get_signal_by_name(signal).choices or {}
+    return {str(name): int(number) for number, name in choices.items()}
+
+
+def payload(command: str, argument: int = 0, *, key: bytes | None = None, challenge: int = 0) -> bytes:
+    """The 8 bytes of a command; `key` and `challenge` make its tag, the request for a challenge has none."""
+    said = struct.pack("<I", codes("command")[command] | argument << 8)
+    tag = siphash(key, struct.pack("<I", challenge) + said) & 0xFFFFFFFF if key is not None else 0
+    return said + struct.pack("<I", tag)
+
+
+def frame(data: bytes) -> can.Message:
+    """A message COMMAND."""
+    import can
+
+    identifier = load_dbc().get_message_by_name(COMMAND).frame_id
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+
+def read_key(path: Path | str) -> bytes:
+    """A key file: 32 hexadecimal digits. Raises UserError for anything else."""
+    try:
+        key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: a key is 32 hexadecimal digits") from error
+    if len(key) != 16:
+        raise UserError(f"{path}: a key is 32 hexadecimal digits")
+    return key
+
+
+def new_key(path: Path | str) -> None:
+    """Write a random key, for the owner alone to read. Raises UserError if the file is there or cannot be written."""
+    try:
+        Path(path).touch(mode=0o600, exist_ok=False)
+        Path(path).write_text(secrets.token_hex(16) + "\n", encoding="ascii")
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the key: {error.strerror}") from error
+
+
+def build_flag(key: bytes) -> str:
+    """What gives an image this key: an entry of CFLAGS."""
+    low, high = struct.unpack("<2Q", key)
+    return f"-DAPP_COMMAND_KEY=0x{low:016X}ULL,0x{high:016X}ULL"
+
+
+def argument_of(order: str, value: str | None) -> int:
+    """The number that goes with an order: ms, axes (`gx,gz`; `none` takes offsets back), or nothing."""
+    if order == "telemetry_period":
+        if value is None or not value.isdecimal() or not 100 <= int(value) < 2**24:
+            raise UserError(f"telemetry_period wants a number of ms from 100 to {2**24 - 1}")
+        return int(value)
+    if order == "write_offsets":
+        names = [] if value == "none" else (value or "").split(",")
+        unknown = [name for name in names if name not in AXES]
+        if unknown:
+            raise UserError(f"write_offsets wants axes ({','.join(AXES)}) or none, not '{value or ''}'")
+        return sum(1 << AXES.index(name) for name in set(names))
+    if order == "reset" and value == "forget":
+        return 1
+    if value is not None:
+        raise UserError(f"{order} takes {'no word but forget' if order == 'reset' else 'nothing'} after it")
+    return 0
+
+
+def command(
+    order: str, value: str | None, *, key: bytes, interface: str, channel: str, bitrate: int | None = None
+) -> str:
+    """Have a module do `order`; returns its answer, the name of a result in the DBC.
+
+    Raises UserError for an order or argument that does not exist, a channel that cannot be opened, or no answer.
+    """
+    orders = [name for name in codes("command") if name != CHALLENGE]
+    if order not in orders:
+        raise UserError(f"no such command: {order} (there are {', '.join(orders)})")
+    argument = argument_of(order, value)
+    with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
+        link.bus.send(frame(payload(CHALLENGE)))
+        challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE])
+        link.bus.send(frame(payload(order, argument, key=key, challenge=challenge)))
+        result = _await(link, "result", ANSWER_S, codes("command")[order])
+    return next((name for name, number in codes("result").items() if number == result), str(result))
+
+
+def _await(link: Link, signal: str, timeout_s: float, about: int) -> int:
+    decoder = Decoder()
+    end = time.monotonic() + timeout_s
+    while (left := end - time.monotonic()) > 0 and not link.closed:
+        message = link.recv(left)
+        if message is None:
+            break
+        decoder.feed(message)
+        if signal in decoder.answer:
+            return int(decoder.answer[signal])
+        if decoder.answer.get("command") == about:  # refused
+            raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
+        decoder.answer.clear()
+    raise UserError("the module does not answer: is its image built with a command key?")
