@@ -7,7 +7,7 @@
 
 #define AXES SELFCAL_MODEL_AXES
 /* Samples of the record, given over and over; a power of two. */
-#define RING 64U
+#define RING 32U
 /* Reports are due when 32 bank samples are in: 2 batches, so that pushes carry the nodes' work. */
 #define REPORT_MS 32000U
 /* SysTick counts 16 (M0) or 168 (M4F) ticks a us, an instruction is 64 ns: see bench.py. Of 1 / 819.2 Hz. */

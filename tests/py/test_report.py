@@ -34,7 +34,8 @@ SHARE = 0.9
 
 def dense_tables() -> Tables:
     """The default model's, with 48 nodes of random walk and 40 x 40 of Gauss-Markov."""
-    nodes = {"constant": (None, None), "random_walk": (make_grid(48), None), "gauss_markov": (make_grid(40), make_grid(40))}
+    square = make_grid(40), make_grid(40)
+    nodes = {"constant": (None, None), "random_walk": (make_grid(48), None), "gauss_markov": square}
     hypotheses = (replace(h, rho=nodes[h.name][0], alpha=nodes[h.name][1]) for h in DEFAULT.hypotheses)
     return replace(DEFAULT, hypotheses=tuple(hypotheses))
 
