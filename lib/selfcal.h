@@ -662,7 +662,8 @@ enum {
     SELFCAL_IDENTIFIED = 1,   /* sd of ln(parameter) is below half its prior's, and neither limit holds it */
     SELFCAL_AT_MIN = 2,       /* more than 5 % of the posterior lies in the lowest 2 % of the prior's ln range */
     SELFCAL_AT_MAX = 4,       /* likewise at the top */
-    SELFCAL_OFF_GRID = 8      /* more than 1 % of the posterior lies beyond the last node: extrapolated */
+    SELFCAL_OFF_GRID = 8      /* the grid does not bear it: more than 1 % of the posterior lies beyond the last node, or the nodes are so far apart
+                                 that with a record of this length the interpolation may be off by more than 0.05 nat, 0.05 sd, 3 % of sd */
 };
 
 typedef struct {
