@@ -64,9 +64,10 @@ def test_report_over_the_whole_prior(n: int) -> None:
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
-    """As measured above and in lib/posterior.c: 12 x 7 nodes are too few from the start, 20 x 12 hold to 10^4 samples and not
-    to 10^6, the host's 24 x 16 beyond that. Parameters in the middle of the priors, none of them off the grid itself."""
-    y = simulate_bank_samples("gauss_markov", {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}, 1.0, 1_000_000, 5)[0][:, None]
+    """As measured above and in lib/posterior.c: 12 x 7 nodes are too few from the start, 20 x 12 hold to 10^4 samples
+    and not to 10^6, the host's 24 x 16 beyond that. Parameters in the middle of the priors, none off the grid."""
+    truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
+    y = simulate_bank_samples("gauss_markov", truth, 1.0, 1_000_000, 5)[0][:, None]
     found = {}
     for target in MODEL.nodes:
         bank = Bank(make_tables(MODEL, 1.0, ("gx",), target))
