@@ -54,7 +54,7 @@ class Gated:
         tables = make_tables(model, rate_hz, axes, target)
         self.learning = Learning(model, tables)
         self.gate = self.learning.gate
-        self.bank = Bank(tables)
+        self.bank = Bank(tables, coarse=target != "host")
         self.resting = False
         self.used: list[bool] = []
 

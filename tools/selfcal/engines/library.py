@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _dense, _fixed16, _fixed32, _library32, _library64
+from selfcal import _coarse, _dense, _fixed16, _fixed32, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.model import LAWS, PLACES
 from selfcal.result import AxisResult, Estimate
@@ -33,15 +33,21 @@ def _regressors(tables: Tables) -> tuple[list[float], list[float]] | None:
 class Bank:
     """A bank over the axes of `tables`.
 
-    `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `fixed` the integer kernels by
-    products of so many bits (SELFCAL_FIXED).
+    `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
+    module's reports, `fixed` the integer kernels by products of so many bits (SELFCAL_FIXED).
     """
 
     def __init__(
-        self, tables: Tables, *, double: bool = False, dense: bool = False, fixed: Literal[16, 32] | None = None
+        self,
+        tables: Tables,
+        *,
+        double: bool = False,
+        dense: bool = False,
+        coarse: bool = False,
+        fixed: Literal[16, 32] | None = None,
     ) -> None:
         self.tables = tables
-        build = _dense if dense else _library64 if double else _library32
+        build = _dense if dense else _library64 if double else _coarse if coarse else _library32
         if fixed is not None:
             build = {16: _fixed16, 32: _fixed32}[fixed]
         self.raw: Any = build.Bank(
