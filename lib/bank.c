@@ -282,6 +282,7 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     self->model = model;
     self->variance_ratio = R(1.0);
     self->keep = 1.0;
+    self->beginning = 1.0;
     self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
     self->node = (selfcal_node_t *)(void *)(self->c + cells);

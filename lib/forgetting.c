@@ -13,7 +13,9 @@ static selfcal_wide_t part_kept(selfcal_t *self) {
         intervals += (selfcal_wide_t)batch->gap[i];
     }
     const selfcal_wide_t half_lives = intervals * (selfcal_wide_t)self->model->dt_s / (selfcal_wide_t)self->model->forgetting->half_life_s;
-    return fmin(fmax(exp(-0.69314718055994530942 * half_lives), WEIGHT_MIN / self->weight), 1.0);
+    const selfcal_wide_t keep = fmin(fmax(exp(-0.69314718055994530942 * half_lives), WEIGHT_MIN / self->weight), 1.0);
+    self->beginning *= keep;
+    return keep;
 }
 
 /* What the node has only counted comes due first. Readings and columns each shrink by a factor, and products of them by both, so that

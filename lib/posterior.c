@@ -203,8 +203,8 @@ static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff
     const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis);
     field_t field;
     field.ln_sigma = 0.5 * log(var);
-    field.profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field.ln_sigma) + v.ln_s + n_eff + log1p(p0 * v.a / var) +
-                            miss * miss / (var / v.a + p0));
+    field.profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field.ln_sigma) + v.ln_s + n_eff +
+                            bank->beginning * (log1p(p0 * v.a / var) + miss * miss / (var / v.a + p0)));
     *bias_share = p0 * v.a / (p0 * v.a + var);
     return field;
 }
@@ -775,15 +775,9 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
  * grows as n. The limit is measured: of records over the whole prior, n = 100 to 10^5 on 6 to 24 nodes, 127 of 128 below it kept all
  * three tolerances, above it 0 to 94 % of those of a grid and length, once all. */
 static bool too_coarse(const selfcal_work_t *work) {
-    const selfcal_real_t rho_step = work->bank->rho_step[work->hypothesis], alpha_step = work->bank->alpha_step[work->hypothesis];
+    const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]}; /* 0: has none */
     const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
-    selfcal_real_t rest = R(0.0);
-    if (rho_step > R(0.0)) {
-        rest += r_exp(R(-4.9348022) / rho_step);
-    }
-    if (alpha_step > R(0.0)) {
-        rest += R(0.5) * r_exp(R(-4.9348022) / alpha_step);
-    }
+    const selfcal_real_t rest = r_exp(R(-4.9348022) / r_fmax(step[0], R(0.125))) + R(0.5) * r_exp(R(-4.9348022) / r_fmax(step[1], R(0.125)));
     return rest * (hypothesis_of(work)->law < SELFCAL_FLICKER ? r_sqrt(weight + R(400.0)) : weight) > R(0.08);
 }
 

@@ -487,7 +487,7 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
     make_normal(self, axis, node, mask, &normal);
     make_fit(&normal, variance, &fit);
     *ln_p = -0.5 * (self->weight * (SELFCAL_LN_2PI + 2.0 * log(sigma_v)) + view.ln_s + normal.residual / variance +
-                    fit.ln_det + fit.miss);
+                    self->beginning * (fit.ln_det + fit.miss));
     return SELFCAL_OK;
 }
 
@@ -501,8 +501,8 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_e
     const selfcal_wide_t variance = fmax(normal.residual, least) / n_eff;
     make_fit(&normal, variance, &fit);
     *ln_sigma = 0.5 * log(variance);
-    *profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff + fit.ln_det +
-                       fit.miss);
+    *profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff +
+                       work->bank->beginning * (fit.ln_det + fit.miss));
     *share = fit.share;
 }
 

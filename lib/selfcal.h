@@ -279,7 +279,8 @@ typedef struct selfcal_forgetting_code selfcal_forgetting_code_t;
 extern const selfcal_forgetting_code_t selfcal_forgetting_code;
 
 /* For parts whose parameters change: what a bank sample adds to the ln-likelihood counts for 2^-(age/half_life_s), from one batch to the
- * next. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
+ * next. What the prior of the bias (and of the coefficients) costs an evidence goes with the first batch: a law that remembers the
+ * bias, such as the constant, must not go on paying what one that forgets it, such as the random walk, no longer does. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
  * are up to sqrt(2) wider than need be. O(axes) for each node and batch. */
 typedef struct {
     const selfcal_forgetting_code_t *code; /* &selfcal_forgetting_code: only a model that forgets links what it takes */
@@ -477,6 +478,7 @@ typedef struct {
     uint32_t n;              /* bank samples in all sums */
     selfcal_wide_t weight;   /* what they count for: n without forgetting */
     selfcal_wide_t keep;     /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */
+    selfcal_wide_t beginning; /* what the first batch counts for */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX];     /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
     /* One batch is gathered while the nodes run, some at every push, over the one before. */

@@ -98,6 +98,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, n, U32)                          \
     F(selfcal_t, weight, WIDE)                    \
     F(selfcal_t, keep, WIDE)                      \
+    F(selfcal_t, beginning, WIDE)                 \
     F(selfcal_t, rho_lo, REAL)                    \
     F(selfcal_t, rho_step, REAL)                  \
     F(selfcal_t, alpha_lo, REAL)                  \

@@ -64,11 +64,16 @@ def _header(model: Model, tables: Tables) -> str:
 /* 1: selfcal_model_gate is there. */
 #define SELFCAL_MODEL_GATE {int(gate_table(model, tables) is not None)}
 
-#if SELFCAL_GRID_MAX < {largest} || SELFCAL_AXES_MAX < {axes} || SELFCAL_HYPOTHESES_MAX < {hypotheses}
-#error "SELFCAL_GRID_MAX, SELFCAL_AXES_MAX or SELFCAL_HYPOTHESES_MAX is too small for this model"
+#if SELFCAL_GRID_MAX < {largest}
+#error "set SELFCAL_GRID_MAX to {largest}: this model has a grid of so many nodes"
+#elif SELFCAL_HYPOTHESIS_NODES_MAX < {most}
+#error "set SELFCAL_HYPOTHESIS_NODES_MAX to {most}: this model has a hypothesis of so many nodes"
 #endif
-#if SELFCAL_HYPOTHESIS_NODES_MAX < {most}
-#error "SELFCAL_HYPOTHESIS_NODES_MAX is too small for this model"
+#if SELFCAL_AXES_MAX < {axes}
+#error "set SELFCAL_AXES_MAX to {axes}: this model has so many axes"
+#endif
+#if SELFCAL_HYPOTHESES_MAX < {hypotheses}
+#error "set SELFCAL_HYPOTHESES_MAX to {hypotheses}: this model has so many hypotheses"
 #endif
 {_terms(tables)}
 extern const selfcal_model_t selfcal_model;
