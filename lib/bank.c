@@ -20,10 +20,6 @@
  * less than that many nats. */
 #define CONVERGED R(1e-6)
 
-/* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and neighbours
- * correlated by 1e-3 are beyond telling from white ones. */
-#define ALPHA_DT_MAX 6.9
-
 /* u has settled when e falls to this part of u_inf; where u_inf is 0 (random walk) at U_ZERO: denormals are slow. */
 #define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
@@ -57,13 +53,10 @@ static bool valid_grid(const selfcal_grid_t *grid) {
 
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
-    uint8_t h = 0;
-    while (index >= hypothesis_nodes(&hypothesis[h])) {
-        index = (uint16_t)(index - hypothesis_nodes(&hypothesis[h]));
-        h++;
-    }
+    const node_of_t node = node_of(self->model, index);
+    const uint8_t h = node.hypothesis;
     const uint16_t columns = grid_nodes(hypothesis[h].alpha);
-    const uint16_t row = (uint16_t)(index / columns), column = (uint16_t)(index % columns);
+    const uint16_t row = (uint16_t)(node.index / columns), column = (uint16_t)(node.index % columns);
     selfcal_place_t place = {h, NAN, NAN};
     if (hypothesis[h].rho != NULL) {
         place.ln_rho = r_fma((selfcal_real_t)row, self->rho_step[h], self->rho_lo[h]);

@@ -35,10 +35,6 @@ static bool within(selfcal_real_t value, selfcal_real_t lo, selfcal_real_t hi) {
     return value >= lo && value <= hi;
 }
 
-static bool finite_sum(selfcal_sum_t sum) {
-    return isfinite(sum.hi) && isfinite(sum.lo);
-}
-
 static bool memory_is_laid_out(const selfcal_t *self) {
     const selfcal_model_t *model = self->model;
     if (model == NULL || model->axes == 0U || model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U ||

@@ -122,6 +122,9 @@ static inline const selfcal_prior_t *priors_of(const selfcal_model_t *model, con
 #define LN_RHO_MAX R(13.8)
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
+/* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and neighbours
+ * correlated by 1e-3 are beyond telling from white ones. */
+#define ALPHA_DT_MAX 6.9
 /* `count` bank intervals without a sample. */
 void selfcal_bank_gap(selfcal_t *self, uint64_t count);
 /* Nodes of a hypothesis: those of rho times those of alpha, which changes fastest. */
@@ -131,6 +134,21 @@ static inline uint16_t grid_nodes(const selfcal_grid_t *grid) {
 
 static inline uint16_t hypothesis_nodes(const selfcal_hypothesis_t *hypothesis) {
     return (uint16_t)(grid_nodes(hypothesis->rho) * grid_nodes(hypothesis->alpha));
+}
+
+/* Node `index` of the bank is node `index` of a hypothesis. */
+typedef struct {
+    uint8_t hypothesis;
+    uint16_t index;
+} node_of_t;
+
+static inline node_of_t node_of(const selfcal_model_t *model, size_t index) {
+    node_of_t node = {0, (uint16_t)index};
+    while (node.index >= hypothesis_nodes(&model->hypothesis[node.hypothesis])) {
+        node.index = (uint16_t)(node.index - hypothesis_nodes(&model->hypothesis[node.hypothesis]));
+        node.hypothesis++;
+    }
+    return node;
 }
 
 /* From now on `block` samples make a bank interval: how many nodes a push has to run follows. */

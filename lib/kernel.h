@@ -97,6 +97,10 @@ static inline selfcal_wide_t sum_value(selfcal_sum_t sum) {
     return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
 }
 
+static inline bool finite_sum(selfcal_sum_t sum) {
+    return isfinite(sum.hi) && isfinite(sum.lo);
+}
+
 static inline selfcal_sum_t make_sum(selfcal_wide_t value) {
     const selfcal_real_t hi = (selfcal_real_t)value;
     const selfcal_sum_t sum = {hi, (selfcal_real_t)(value - (selfcal_wide_t)hi)};
@@ -114,6 +118,11 @@ typedef struct {
     selfcal_real_t nu[SELFCAL_BATCH];
     selfcal_real_t weighted[SELFCAL_BATCH], low[SELFCAL_BATCH]; /* nu/s and what it was rounded by */
 } innovations_t;
+
+/* Where a node has the sums B and C of an axis's readings. */
+typedef struct {
+    selfcal_sum_t *b, *c;
+} reading_sums_t;
 
 /* a + b = sum + error (Knuth). */
 static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {

@@ -233,18 +233,14 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
  * where d is common to the nodes of one pole: hence their order. It starts from -x with d_0 = y_0, and d_count = y - beta y of the
  * last gives x = d_count - (nu - g nu). |d| < 3 LIMIT < 2^29. */
 size_t kernel_node(const selfcal_t *self, size_t i) {
-    const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
-    size_t first = 0;
-    while (i - first >= hypothesis_nodes(hypothesis)) {
-        first += hypothesis_nodes(hypothesis);
-        hypothesis++;
-    }
+    const node_of_t node = node_of(self->model, i);
+    const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[node.hypothesis];
     const size_t rows = grid_nodes(hypothesis->rho);
-    size_t row = i - first, column = 0;
+    size_t row = node.index, column = 0;
     for (; row >= rows; row -= rows) {
         column++; /* shorter than a division in software */
     }
-    return first + row * grid_nodes(hypothesis->alpha) + column;
+    return i - node.index + row * grid_nodes(hypothesis->alpha) + column;
 }
 
 /* What a span adds: the sum of nu in 2^SUM_BITS steps, the sum of nu^2 in 2^16 steps^2. */

@@ -53,9 +53,14 @@ static selfcal_parameter_t drift_parameter(selfcal_law_t law) {
     return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
 }
 
+/* ln(N) - ln(sigma_v). */
+static selfcal_real_t half_ln_dt(const selfcal_work_t *work) {
+    return R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);
+}
+
 /* ln(parameter) - ln(rho) - ln(sigma_v): K sqrt(dt) = sigma_w = rho sigma_v, sigma_m = rho sigma_v. */
 static selfcal_real_t drift_shift(const selfcal_work_t *work) {
-    return has_walk(hypothesis_of(work)->law) ? R(-0.5) * r_log((selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+    return has_walk(hypothesis_of(work)->law) ? -half_ln_dt(work) : R(0.0);
 }
 
 /* ------------------------------------------------------------------------------------------------------------ spline */
@@ -359,7 +364,6 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
 static void first_box(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = prior_of(work);
-    const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);
     for (int d = 0; d < 2; d++) {
         work->limit_lo[d] = R(0.0);
         work->limit_hi[d] = R(1.0); /* a dimension the law has not: one cell of unit width */
@@ -370,10 +374,9 @@ static void first_box(selfcal_work_t *work) {
     }
     if (hypothesis->rho != NULL) {
         const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
-        work->limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + half_ln_dt -
-                            drift_shift(work);
-        work->limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + half_ln_dt -
-                            drift_shift(work);
+        const selfcal_real_t shift = half_ln_dt(work) - drift_shift(work);
+        work->limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + shift;
+        work->limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + shift;
     }
     set_box(work, work->limit_lo, work->limit_hi);
 }
@@ -455,8 +458,7 @@ static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t mid
 
 /* ln of the parameters at the conditional mode of a cell. */
 static void cell_parameters(const selfcal_work_t *work, const row_t *row, const cell_t *cell, selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
-    const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);
-    ln_value[SELFCAL_N] = cell->ln_sigma + half_ln_dt;
+    ln_value[SELFCAL_N] = cell->ln_sigma + half_ln_dt(work);
     ln_value[SELFCAL_ALPHA] = row->ln_alpha;
     ln_value[SELFCAL_K] = cell->ln_rho + cell->ln_sigma + row->shift;
     ln_value[SELFCAL_SIGMA_M] = ln_value[SELFCAL_K];
@@ -554,11 +556,23 @@ static bool end_scan(selfcal_work_t *work) {
 
 /* --------------------------------------------------------------------------------------------------------------- sums */
 
+/* Whether the nodes are too far apart for a record so long. What is left to the splines looks, as a function of ln rho or ln alpha, like
+ * white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at the nodes' Nyquist frequency pi/h that is e^(-pi^2/2h).
+ * It grows as sqrt(n), short records have some of their own; of laws without an expectation, all of the ln-likelihood is left, which
+ * grows as n. The limit is measured: of records over the whole prior, n = 100 to 10^5 on 6 to 24 nodes, 127 of 128 below it kept all
+ * three tolerances, above it 0 to 94 % of those of a grid and length, once all. */
+static bool too_coarse(const selfcal_work_t *work) {
+    const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]}; /* 0: has none */
+    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
+    const selfcal_real_t rest = r_exp(R(-4.9348022) / r_fmax(step[0], R(0.125))) + R(0.5) * r_exp(R(-4.9348022) / r_fmax(step[1], R(0.125)));
+    return rest * (hypothesis_of(work)->law < SELFCAL_FLICKER ? r_sqrt(weight + R(400.0)) : weight) > R(0.08);
+}
+
 static void begin_sum(selfcal_work_t *work) {
     work->row = 0;
     work->at = 0;
     work->mass = 0.0;
-    work->off_grid = 0.0;
+    work->off_grid = too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0; /* then all of the mass counts as off the grid */
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
     memset(work->field, 0, sizeof work->field);
@@ -769,18 +783,6 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
     return mass;
 }
 
-/* Whether the nodes are too far apart for a record so long. What is left to the splines looks, as a function of ln rho or ln alpha, like
- * white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at the nodes' Nyquist frequency pi/h that is e^(-pi^2/2h).
- * It grows as sqrt(n), short records have some of their own; of laws without an expectation, all of the ln-likelihood is left, which
- * grows as n. The limit is measured: of records over the whole prior, n = 100 to 10^5 on 6 to 24 nodes, 127 of 128 below it kept all
- * three tolerances, above it 0 to 94 % of those of a grid and length, once all. */
-static bool too_coarse(const selfcal_work_t *work) {
-    const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]}; /* 0: has none */
-    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t rest = r_exp(R(-4.9348022) / r_fmax(step[0], R(0.125))) + R(0.5) * r_exp(R(-4.9348022) / r_fmax(step[1], R(0.125)));
-    return rest * (hypothesis_of(work)->law < SELFCAL_FLICKER ? r_sqrt(weight + R(400.0)) : weight) > R(0.08);
-}
-
 static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_wide_t centre = exp((selfcal_wide_t)work->best_ln[p]);
@@ -814,7 +816,7 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     if (flags == 0U && ln_sd < R(0.5) * (hi - lo) / R(3.4641016)) {
         flags |= SELFCAL_IDENTIFIED;
     }
-    if (work->off_grid > 0.01 * work->mass || too_coarse(work)) {
+    if (work->off_grid > 0.01 * work->mass) {
         flags |= SELFCAL_OFF_GRID;
     }
     estimate->flags = flags;

@@ -59,13 +59,9 @@ static void init(selfcal_t *self, unsigned char *memory) {
 }
 
 /* What a node keeps of the readings of an axis, `at` = node * axes + axis: sums B of "1" and C, and the predicted drift. */
-typedef struct {
-    selfcal_sum_t *b, *c;
-} reading_t;
-
 #ifdef SELFCAL_FIXED
-static reading_t reading_sums(const selfcal_t *self, size_t at) {
-    const reading_t sums = {&self->columns->reading[3U * at], &self->columns->reading[3U * at + 1U]};
+static reading_sums_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_sums_t sums = {&self->columns->reading[3U * at], &self->columns->reading[3U * at + 1U]};
     return sums;
 }
 
@@ -78,14 +74,14 @@ static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
 }
 
 static void view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
-    const reading_t sums = reading_sums(self, k);
+    const reading_sums_t sums = reading_sums(self, k);
     *b = sum_value(*sums.b);
     *c = sum_value(*sums.c);
     *x = sum_value(reading_drift(self, k));
 }
 #else
-static reading_t reading_sums(const selfcal_t *self, size_t at) {
-    const reading_t sums = {&self->b[at], &self->c[at]};
+static reading_sums_t reading_sums(const selfcal_t *self, size_t at) {
+    const reading_sums_t sums = {&self->b[at], &self->c[at]};
     return sums;
 }
 
@@ -129,7 +125,7 @@ static bool sound(const selfcal_t *self) {
     }
 #endif
     for (const selfcal_sum_t *sum = columns->a; sum < end; sum++) {
-        if (!isfinite(sum->hi) || !isfinite(sum->lo)) {
+        if (!finite_sum(*sum)) {
             return false;
         }
     }
@@ -231,7 +227,7 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
-        const reading_t sums = reading_sums(self, at);
+        const reading_sums_t sums = reading_sums(self, at);
         set_reading_drift(self, at, filter(self, j, gains, waiting(self)->y[at - j * axes], reading_drift(self, at), &reading));
         selfcal_add_products(sums.c, gains, &reading, &reading);
         selfcal_add_products(sums.b, gains, &column[0], &reading);
@@ -554,7 +550,7 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
 #ifdef SELFCAL_FIXED
-        const reading_t sums = reading_sums(self, at);
+        const reading_sums_t sums = reading_sums(self, at);
         sum_fade(sums.b, part * part_of_one);
         sum_fade(sums.c, self->keep);
 #endif

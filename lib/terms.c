@@ -18,9 +18,6 @@
 /* P has converged when no variance moves by this part of itself within a sample: at a gain of 1e-4 it then is within 1e-8. */
 #define CONVERGED 1e-12
 
-/* As in bank.c. */
-#define ALPHA_DT_MAX 6.9
-
 /* Products of s are so far from 0 and infinity that the next s cannot reach either. */
 #define PRODUCT_MAX 1e200
 
@@ -51,14 +48,11 @@ typedef struct {
 
 static term_t term_of(const selfcal_t *self, size_t j) {
     const selfcal_hypothesis_t *hypothesis = self->model->hypothesis;
-    size_t others = 0, first = 0;
-    while (j - first >= hypothesis_nodes(hypothesis)) {
-        const size_t nodes = hypothesis_nodes(hypothesis);
-        others += is_sum(hypothesis->law) ? 0U : nodes;
-        first += nodes;
-        hypothesis++;
+    const node_of_t node = node_of(self->model, j);
+    term_t term = {node.index, order_of(hypothesis[node.hypothesis].law)};
+    for (uint8_t h = 0; h < node.hypothesis; h++) {
+        term.index += is_sum(hypothesis[h].law) ? hypothesis_nodes(&hypothesis[h]) : 0U;
     }
-    const term_t term = {j - others, order_of(hypothesis->law)};
     return term;
 }
 
@@ -66,11 +60,6 @@ static term_t term_of(const selfcal_t *self, size_t j) {
 static selfcal_sum_t *states(const selfcal_t *self, size_t index, size_t series) {
     return &self->terms->x[(index * series_of(self) + series) * SELFCAL_TERMS_MAX];
 }
-
-/* Sums of the readings of an axis. */
-typedef struct {
-    selfcal_sum_t *b, *c;
-} reading_sums_t;
 
 static reading_sums_t reading_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
 #ifdef SELFCAL_FIXED
@@ -199,8 +188,9 @@ void selfcal_terms_settle(selfcal_t *self, size_t j) {
 
 #ifdef SELFCAL_FIXED
 void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+    const term_t term = term_of(self, j);
     for (size_t axis = 0; axis < self->model->axes; axis++) {
-        const reading_sums_t sums = reading_sums(self, j, term_of(self, j).index, axis);
+        const reading_sums_t sums = reading_sums(self, j, term.index, axis);
         sum_fade(sums.b, keep_b);
         sum_fade(sums.c, keep_c);
     }
@@ -406,7 +396,7 @@ bool selfcal_terms_sound(const selfcal_t *self) {
         return false;
     }
     for (size_t k = 0; k < values; k++) {
-        if (!isfinite(terms->x[k].hi) || !isfinite(terms->x[k].lo)) {
+        if (!finite_sum(terms->x[k])) {
             return false;
         }
     }
@@ -415,7 +405,7 @@ bool selfcal_terms_sound(const selfcal_t *self) {
         return false;
     }
     for (size_t k = 0; k < nodes * self->model->axes * 2U; k++) {
-        if (!isfinite(terms->bc[k].hi) || !isfinite(terms->bc[k].lo) || (k % 2U == 1U && !(terms->bc[k].hi >= R(0.0)))) {
+        if (!finite_sum(terms->bc[k]) || (k % 2U == 1U && !(terms->bc[k].hi >= R(0.0)))) {
             return false;
         }
     }
