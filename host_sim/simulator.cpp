@@ -163,9 +163,15 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
     const double dt_s = 1.0 / scene.rate_hz;
     Random random = stream(scene.seed, index, drift);
     std::vector<double> out(scene.samples, 0.0);
-    if (axis.law == Law::random_walk || axis.law == Law::moving_average) {
+    if (axis.law == Law::random_walk || axis.law == Law::moving_average || axis.law == Law::walk_and_markov) {
         double x = 0.0;
         std::generate(out.begin(), out.end(), [&] { return x += axis.K * std::sqrt(dt_s) * random.normal(); });
+    }
+    if (axis.law == Law::walk_and_markov) {
+        GaussMarkov x(axis.markov_ratio * axis.K * std::sqrt(axis.correlation_time_s), 1.0 / axis.correlation_time_s, dt_s, random);
+        for (double &value : out) {
+            value += x.next();
+        }
     } else if (axis.law == Law::gauss_markov) {
         GaussMarkov x(axis.sigma_m, axis.alpha, dt_s, random);
         std::generate(out.begin(), out.end(), [&] { return x.next(); });

@@ -25,6 +25,8 @@ struct Axis {
     double alpha = 0.0;   // 1/s, Gauss-Markov and flicker
     double B = 0.0;       // unit, flicker: the law of three terms, not the effect below
     double spectral_ratio = 1.0; // moving average
+    double markov_ratio = 0.0;   // walk and Markov: sigma_m over K sqrt(correlation_time_s)
+    double correlation_time_s = 1.0;
     double range = 0.0;   // unit, readings are clipped to +-range; 0: none
     double lsb = 0.0;     // unit, readings are whole multiples of it; 0: none
 

@@ -34,6 +34,9 @@
 /* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
 #define LN_RATIO_MAX 6.91F
 
+/* Bank intervals that a stated correlation time lasts at most: 1 - phi keeps its digits. */
+#define TIME_MAX 1e6F
+
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
 }
@@ -89,8 +92,13 @@ static bool valid_model(const selfcal_model_t *model) {
         if (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes)) {
             return false;
         }
-        for (uint8_t a = 0; hypothesis->law == SELFCAL_MOVING_AVERAGE && a < model->axes; a++) {
-            const selfcal_prior_t *ratio = &priors_of(model, hypothesis, a)[SELFCAL_SPECTRAL_RATIO];
+        if (hypothesis->law == SELFCAL_WALK_AND_MARKOV &&
+            (!((selfcal_wide_t)hypothesis->correlation_time_s * ALPHA_DT_MAX >= (selfcal_wide_t)model->dt_s) ||
+             !(hypothesis->correlation_time_s <= TIME_MAX * model->dt_s))) {
+            return false;
+        }
+        for (uint8_t a = 0; has_ratio(hypothesis->law) && a < model->axes; a++) {
+            const selfcal_prior_t *ratio = &priors_of(model, hypothesis, a)[SELFCAL_ALPHA];
             if (ratio->ln_min < -LN_RATIO_MAX || ratio->ln_max > LN_RATIO_MAX) {
                 return false;
             }

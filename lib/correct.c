@@ -11,13 +11,15 @@ static moments_t predict_law(selfcal_law_t law, const selfcal_posterior_t *poste
         const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
         const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
         now.var = r_fma(r_fma(mean, mean, sd * sd), elapsed_s, now.var);
-    } else if (has_deviation(law)) {
+    }
+    if (has_decay(law)) {
         selfcal_real_t fall = R(0.0), growth = R(0.0);
         for (unsigned j = 0; j < SELFCAL_GRID_MAX; j++) {
             const selfcal_decay_t *decay = &posterior->decay[j];
             selfcal_real_t psi[SELFCAL_TERMS_MAX];
             for (unsigned a = 0; a < SELFCAL_TERMS_MAX; a++) { /* of terms that a law has not, all else is 0 */
-                static const selfcal_real_t faster[] = {R(0.1), R(1.0), R(10.0)};
+                static const selfcal_real_t flicker[] = {R(0.1), R(1.0), R(10.0)}, walk_and_markov[] = {R(0.0), R(1.0), R(0.0)};
+                const selfcal_real_t *faster = law == SELFCAL_FLICKER ? flicker : walk_and_markov;
                 const selfcal_real_t alpha = (selfcal_real_t)decay->alpha * (is_sum(law) ? faster[a] : R(1.0));
                 psi[a] = -r_expm1(-alpha * elapsed_s);
                 fall = r_fma(psi[a], (selfcal_real_t)decay->mean[a], fall);

@@ -91,13 +91,23 @@ static inline bool is_sum(selfcal_law_t law) {
     return SELFCAL_TERMS_MAX > 1 && law >= SELFCAL_FLICKER;
 }
 
+/* The second grid dimension of these is a ratio within 1e-3 to 1e3, no bandwidth. */
+static inline bool has_ratio(selfcal_law_t law) {
+    return is_sum(law) && law >= SELFCAL_MOVING_AVERAGE;
+}
+
 /* A deviation goes with rho, sigma_m or B; else K, if anything. */
 static inline bool has_deviation(selfcal_law_t law) {
     return law == SELFCAL_GAUSS_MARKOV || (is_sum(law) && law == SELFCAL_FLICKER);
 }
 
 static inline bool has_walk(selfcal_law_t law) {
-    return law == SELFCAL_RANDOM_WALK || (is_sum(law) && law == SELFCAL_MOVING_AVERAGE);
+    return law == SELFCAL_RANDOM_WALK || has_ratio(law);
+}
+
+/* Terms of the drift decay. */
+static inline bool has_decay(selfcal_law_t law) {
+    return has_deviation(law) || (is_sum(law) && law == SELFCAL_WALK_AND_MARKOV);
 }
 
 static inline bool has_alpha(selfcal_law_t law) {

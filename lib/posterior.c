@@ -823,7 +823,7 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
 }
 
 #if SELFCAL_TERMS_MAX > 1
-/* What of `now` belongs to the terms of a node of flicker, x0 given with its variance. */
+/* What of `now` belongs to the terms of a node of a sum, x0 given with its variance. */
 static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance, selfcal_wide_t bias_left,
                       selfcal_now_t *now) {
     const size_t index = (size_t)work->first_node + k;
@@ -865,7 +865,7 @@ static void step_bias(selfcal_work_t *work) {
             now.own[1] = v.bias_left * lost * variance;
             now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
 #if SELFCAL_TERMS_MAX > 1
-            if (v.law == SELFCAL_FLICKER) {
+            if (is_sum(v.law)) {
                 now_terms(work, k, x0, variance, v.bias_left, &now);
             }
 #endif
@@ -878,7 +878,7 @@ static void step_bias(selfcal_work_t *work) {
         work->bias_first += weighed;
         work->bias_second += weighed * off;
         work->bias_own += (selfcal_wide_t)work->spline[1][k] * (v.drift_var + now.own[0]);
-        if (has_deviation(v.law)) {
+        if (has_decay(v.law)) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
@@ -887,9 +887,11 @@ static void step_bias(selfcal_work_t *work) {
             selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
             size_t terms = 1;
 #if SELFCAL_TERMS_MAX > 1
-            if (v.law == SELFCAL_FLICKER) {
+            if (is_sum(v.law)) {
                 terms = SELFCAL_TERMS_MAX;
-                stationary *= SELFCAL_FLICKER_TERM;
+                stationary *= v.law == SELFCAL_FLICKER ? SELFCAL_FLICKER_TERM
+                                                       : exp(2.0 * v.ln_alpha) * (selfcal_wide_t)hypothesis_of(work)->correlation_time_s /
+                                                             (selfcal_wide_t)work->bank->model->dt_s; /* of the term that decays */
                 selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
             }
 #endif
@@ -922,6 +924,11 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
         const selfcal_wide_t *decay = work->bias_decay[j];
         posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
+#if SELFCAL_TERMS_MAX > 1
+        if (hypothesis_of(work)->law == SELFCAL_WALK_AND_MARKOV) {
+            posterior->decay[j].alpha = 1.0F / hypothesis_of(work)->correlation_time_s;
+        }
+#endif
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             posterior->decay[j].mean[a] = (float)(decay[a] / work->bias_weight);
             posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias_weight);

@@ -29,6 +29,7 @@
  *       alpha    Gauss-Markov bandwidth     1/s            flicker: that of the middle term
  *       B        flicker coefficient        unit           Allan deviation 0.664 B on its plateau
  *       spectral_ratio                      1              white noise: amplitude at 0 Hz over that at 1/(2 dt)
+ *       markov_ratio                        1              sigma_m over K sqrt(correlation time), of a Gauss-Markov drift beside a walk
  *   Per bank interval dt: sigma_v = N/sqrt(dt), random-walk step sigma_w = K*sqrt(dt).
  *
  * THREE KINDS OF TROUBLE
@@ -213,7 +214,9 @@ typedef enum {
                             spectrum of B^2 / (2 pi f) within 12 % where 2 pi f is between the outer ones */
     SELFCAL_MOVING_AVERAGE = 4, /* random walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, sigma_v^2): N is
                                    the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta), prior within 1e-3 to 1e3 */
-    SELFCAL_LAWS = 5
+    SELFCAL_WALK_AND_MARKOV = 5, /* random walk, and a Gauss-Markov drift beside it, whose correlation time 1/alpha the hypothesis states
+                                    and whose sigma_m is markov_ratio K / sqrt(alpha), prior within 1e-3 to 1e3 */
+    SELFCAL_LAWS = 6
 } selfcal_law_t;
 
 /* Two share a place where no law has both. */
@@ -224,6 +227,7 @@ typedef enum {
     SELFCAL_B = 2,
     SELFCAL_ALPHA = 3,
     SELFCAL_SPECTRAL_RATIO = 3,
+    SELFCAL_MARKOV_RATIO = 3,
     SELFCAL_PARAMETERS = 4
 } selfcal_parameter_t;
 
@@ -255,9 +259,10 @@ typedef struct {
     selfcal_law_t law;
     float ln_probability;        /* prior */
     const selfcal_grid_t *rho;   /* NULL for SELFCAL_CONSTANT */
-    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV and the sums; of spectral_ratio where the law has that */
+    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV and the sums; of a ratio where the law has one */
 #if SELFCAL_TERMS_MAX > 1
     const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
+    float correlation_time_s;     /* of SELFCAL_WALK_AND_MARKOV, s: from dt_s/6 to 1e6 dt_s. List the law once for each time in question */
 #endif
 } selfcal_hypothesis_t;
 
@@ -675,7 +680,8 @@ typedef struct {
 
 /* What a decaying drift does to the bias, for selfcal_predict(): with psi = 1 - e^(-alpha t) of each alpha node, t after the
  * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var + psi^2 var_sq) - f^2. Flicker:
- * the same for each of its terms, of alpha/10, alpha and 10 alpha, with psi psi' var_sq for each pair of them, b <= a at a (a + 1)/2 + b. */
+ * the same for each of its terms, of alpha/10, alpha and 10 alpha, with psi psi' var_sq for each pair of them, b <= a at a (a + 1)/2 + b.
+ * A walk beside a Gauss-Markov drift: the second term decays, the first stays. */
 typedef struct {
     float alpha; /* 1/s */
     float mean[SELFCAL_TERMS_MAX];
@@ -688,7 +694,7 @@ typedef struct {
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
-    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* Gauss-Markov and flicker: of each alpha node; else 0 */
+    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* where a term decays: of each node of alpha or of the ratio; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {

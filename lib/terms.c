@@ -100,7 +100,8 @@ static selfcal_wide_t white_of(const selfcal_term_node_t *node) {
 }
 
 void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
-    const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
+    const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[place.hypothesis];
+    const selfcal_law_t law = hypothesis->law;
     const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
     selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
     memset(node, 0, sizeof *node);
@@ -114,10 +115,19 @@ void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
             node->p[term_pair(a, a)] = variance;
             alpha_dt *= 10.0;
         }
+        return;
+    }
+    node->q[0] = (selfcal_real_t)square;
+    node->p[term_pair(0, 0)] = square; /* x_0 = 0 */
+    if (law == SELFCAL_WALK_AND_MARKOV) {
+        const selfcal_wide_t interval = (selfcal_wide_t)self->model->dt_s / (selfcal_wide_t)hypothesis->correlation_time_s;
+        const selfcal_wide_t variance = exp(2.0 * (selfcal_wide_t)place.ln_alpha) * square / interval; /* ratio^2 K^2 / alpha */
+        node->beta[1] = (selfcal_real_t)-expm1(-interval);
+        const selfcal_wide_t beta = (selfcal_wide_t)node->beta[1];
+        node->q[1] = (selfcal_real_t)(variance * beta * (2.0 - beta));
+        node->p[term_pair(1, 1)] = variance;
     } else {
         node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
-        node->q[0] = (selfcal_real_t)square;
-        node->p[term_pair(0, 0)] = square; /* x_0 = 0 */
         node->beta[1] = R(1.0);
         node->p[term_pair(1, 1)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
     }

@@ -44,7 +44,7 @@ typedef struct {
 static selfcal_axis_t axis_table[SELFCAL_AXES_MAX];
 static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {
     {-6.9F, -0.7F, false}, {-10.0F, -3.0F, false}, {-7.0F, -1.0F, false}, {-2.0F, 2.0F, false}};
-static selfcal_prior_t moving_average[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
+static selfcal_prior_t of_ratio[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
@@ -138,7 +138,7 @@ static void make_model(input_t *in) {
     model.axis = axis_table;
     model.hypothesis = hypothesis_table;
     for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
-        memcpy(moving_average[axis], some_priors, sizeof some_priors);
+        memcpy(of_ratio[axis], some_priors, sizeof some_priors);
         selfcal_axis_t *a = &axis_table[axis];
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
             const unsigned set = kind >> 3 & 3U;
@@ -157,7 +157,7 @@ static void make_model(input_t *in) {
     }
     unsigned laws = (kind & 7U) == 0U ? 7U : kind & 7U;
     if (SELFCAL_TERMS_MAX > 1) {
-        laws |= (limits >> 4 & 3U) << SELFCAL_FLICKER;
+        laws |= (limits >> 4 & 3U) << SELFCAL_FLICKER | (limits >> 6 & 1U) << SELFCAL_WALK_AND_MARKOV;
     }
     for (unsigned law = 0; law < SELFCAL_LAWS; law++) {
         if ((laws >> law & 1U) != 0U) {
@@ -167,7 +167,8 @@ static void make_model(input_t *in) {
             h->rho = law != SELFCAL_CONSTANT ? &grid : NULL;
             h->alpha = law >= SELFCAL_GAUSS_MARKOV ? &grid : NULL;
 #if SELFCAL_TERMS_MAX > 1
-            h->prior = law == SELFCAL_MOVING_AVERAGE ? &moving_average[0][0] : NULL;
+            h->prior = law >= SELFCAL_MOVING_AVERAGE ? &of_ratio[0][0] : NULL;
+            h->correlation_time_s = ((limits >> 7 & 1U) != 0U ? 0.2F : 100.0F) * model.dt_s;
 #endif
             model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
         }
@@ -217,9 +218,14 @@ static void make_model(input_t *in) {
     case 18: coefficient_sd[0] = any_float(in); break;
     case 19: forgetting.half_life_s = any_float(in); break;
     case 20: forgetting.code = NULL; break;
-    case 21: moving_average[0][byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
-    case 22: moving_average[0][byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
-    default: hypothesis_table[0].ln_probability = any_float(in); break;
+    case 21: of_ratio[0][byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
+    case 22: of_ratio[0][byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
+    default:
+        hypothesis_table[0].ln_probability = any_float(in);
+#if SELFCAL_TERMS_MAX > 1
+        hypothesis_table[model.hypotheses - 1U].correlation_time_s = any_float(in);
+#endif
+        break;
     }
 }
 
@@ -409,6 +415,16 @@ static void moving(void) {
     if (twinned) {
         HOLDS(selfcal_moving(&twin.self) == SELFCAL_OK);
     }
+}
+
+static void shift(input_t *in) {
+    const uint8_t which = byte(in);
+    const float amount = (which & 0x80U) != 0U ? any_float(in) : moderate(in);
+    const uint8_t axis = which & 3U;
+    const selfcal_status_t status = selfcal_shift(&bank.self, axis, amount);
+    HOLDS(status == SELFCAL_OK || status == SELFCAL_BAD_ARGUMENT || status == SELFCAL_AXIS_RETIRED);
+    HOLDS(!twinned || selfcal_shift(&twin.self, axis, amount) == status);
+    reporting = false;
 }
 
 static void rate(input_t *in) {
@@ -689,6 +705,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 16: begin_gate(&in); break;
         case 17: look_at_gate(&in); break;
         case 18: set_values(&in); break;
+        case 19: shift(&in); break;
         default: push_moderate(&in); break;
         }
         check_counters();

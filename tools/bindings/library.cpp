@@ -22,7 +22,8 @@ using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
 using PriorTuple = std::tuple<double, double, bool>; // ln_min, ln_max, uniform
 using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>,
-                                   std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none: the axes'
+                                   std::vector<std::vector<PriorTuple>>, // priors [axes][parameters], or none: the axes'
+                                   double>;                              // correlation_time_s
 
 using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -55,8 +56,9 @@ public:
             axes_.push_back(axis);
         }
         size_t nodes = 0;
-        for (const auto &[law, ln_probability, rho, alpha, priors] : hypotheses) {
-            const selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha), add(priors)};
+        for (const auto &[law, ln_probability, rho, alpha, priors, time_s] : hypotheses) {
+            const selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha),
+                                         add(priors), static_cast<float>(time_s)};
             const size_t count = size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
             nodes += count;
             term_nodes_ += law >= SELFCAL_FLICKER ? count : 0;

@@ -222,8 +222,8 @@ NB_MODULE(_reference, m) {
         .def_prop_rw(
             "law", [](const sr::Axis &axis) { return static_cast<int>(axis.law); },
             [](sr::Axis &axis, int law) {
-                if (law < 0 || law > static_cast<int>(sr::Law::moving_average))
-                    throw std::invalid_argument("law must be 0 to 4");
+                if (law < 0 || law >= static_cast<int>(sr::laws))
+                    throw std::invalid_argument("law must be 0 to 5");
                 axis.law = static_cast<sr::Law>(law);
             })
         .def_rw("bias", &sr::Axis::bias)
@@ -233,6 +233,8 @@ NB_MODULE(_reference, m) {
         .def_rw("alpha", &sr::Axis::alpha)
         .def_rw("B", &sr::Axis::B)
         .def_rw("spectral_ratio", &sr::Axis::spectral_ratio)
+        .def_rw("markov_ratio", &sr::Axis::markov_ratio)
+        .def_rw("correlation_time_s", &sr::Axis::correlation_time_s)
         .def_rw("range", &sr::Axis::range)
         .def_rw("lsb", &sr::Axis::lsb)
         .def_rw("temperature_coefficient", &sr::Axis::temperature_coefficient)

@@ -101,6 +101,8 @@ class Axis:
     alpha: float
     B: float
     spectral_ratio: float
+    markov_ratio: float
+    correlation_time_s: float
     range: float
     lsb: float
     temperature_coefficient: float

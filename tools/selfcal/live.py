@@ -21,6 +21,7 @@ SHORT = {
     "gauss_markov": "G-M",
     "flicker": "flicker",
     "moving_average": "r.w.+MA",
+    "walk_and_markov": "r.w.+G-M",
 }
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 BAR = 6  # characters of a probability bar

@@ -23,19 +23,21 @@ LAWS: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("N", "sigma_m", "alpha"),
     "flicker": ("N", "B", "alpha"),
     "moving_average": ("N", "K", "spectral_ratio"),
+    "walk_and_markov": ("N", "K", "markov_ratio"),
 }
 #: Those that are sums of several terms: SELFCAL_TERMS_MAX of 3.
-SUMS = ("flicker", "moving_average")
+SUMS = ("flicker", "moving_average", "walk_and_markov")
 #: The others: the paper's.
 PLAIN = tuple(law for law in LAWS if law not in SUMS)
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
 #: Parameter names in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
-#: Limits of spectral_ratio: beyond, 1 + theta or 1 - theta is no longer a float.
-RATIOS = (1e-3, 1e3)
+#: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
+RATIOS = ("spectral_ratio", "markov_ratio")
+RATIO_LIMITS = (1e-3, 1e3)
 #: Place of each parameter there; two share one where no law has both.
-PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3}
+PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
@@ -60,8 +62,8 @@ class Prior:
 
 @dataclass(frozen=True)
 class Group:
-    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and spectral_ratio if a
-    hypothesis has them; units of `units.py`)."""
+    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and the ratios if a
+    hypothesis has them; units of `units.py`). `correlation_time_s`: the model's, of walk_and_markov."""
 
     name: str
     axes: tuple[str, ...]
@@ -70,6 +72,7 @@ class Group:
     lsb: float
     stuck_limit: int
     priors: Mapping[str, Prior]
+    correlation_time_s: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -113,8 +116,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class GridNodes:
-    """Filter nodes of one target: random walk (rho) and by law (rho, alpha), the moving average's (rho,
-    spectral_ratio)."""
+    """Filter nodes of one target: random walk (rho) and by law (rho, alpha or a ratio)."""
 
     random_walk: int
     pairs: Mapping[str, tuple[int, int]]
@@ -236,11 +238,12 @@ class _Reader:
             raise self.fail(where, f"unknown law '{law}' (log_uniform or uniform)")
         low = self.number(self.entry(fields, "min", where), f"{where}.min")
         high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
-        if where.endswith(".spectral_ratio") and not (RATIOS[0] <= low and high <= RATIOS[1]):
-            raise self.fail(where, f"must lie within {RATIOS[0]:g} to {RATIOS[1]:g}")
+        least, most = RATIO_LIMITS
+        if where.rpartition(".")[2] in RATIOS and not (least <= low and high <= most):
+            raise self.fail(where, f"must lie within {least:g} to {most:g}")
         return Prior(law, min=low, max=high)
 
-    def group(self, name: str, tree: Any, laws: Collection[str]) -> Group:
+    def group(self, name: str, tree: Any, laws: Collection[str], correlation_time_s: float) -> Group:
         where = f"groups.{name}"
         fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors"), where)
         axes = self.entry(fields, "axes", where)
@@ -262,6 +265,7 @@ class _Reader:
                 )
                 for key in names
             },
+            correlation_time_s=correlation_time_s,
         )
 
     def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
@@ -340,8 +344,7 @@ class _Reader:
                 continue
             pair = self.entry(fields, law, where)
             if not isinstance(pair, list) or len(pair) != 2:
-                second = "spectral_ratio" if law == "moving_average" else "alpha"
-                raise self.fail(f"{where}.{law}", f"must be [rho nodes, {second} nodes]")
+                raise self.fail(f"{where}.{law}", f"must be [rho nodes, {LAWS[law][2]} nodes]")
             pairs[law] = (
                 self.count(pair[0], f"{where}.{law}", *NODES),
                 self.count(pair[1], f"{where}.{law}", *NODES),
@@ -353,16 +356,19 @@ class _Reader:
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
-        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate"), "")
+        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
         if not weights:
             raise self.fail("hypotheses", f"must name at least one of {', '.join(LAWS)}")
+        time = math.nan
+        if "walk_and_markov" in weights:
+            time = self.number(self.entry(tree, "correlation_time_s", ""), "correlation_time_s")
         groups_tree = self.entry(tree, "groups", "")
         if not isinstance(groups_tree, dict) or not groups_tree:
             raise self.fail("groups", "must be a mapping of at least one group")
-        groups = tuple(self.group(str(name), fields, weights) for name, fields in groups_tree.items())
+        groups = tuple(self.group(str(name), fields, weights, time) for name, fields in groups_tree.items())
         axes = [axis for group in groups for axis in group.axes]
         for axis in axes:
             if axes.count(axis) > 1:

@@ -18,6 +18,7 @@ COLORS = {
     "gauss_markov": "tab:red",
     "flicker": "tab:purple",
     "moving_average": "tab:orange",
+    "walk_and_markov": "tab:olive",
 }
 #: Columns after the probabilities: parameter, and the laws whose estimates of it are drawn.
 PANELS = {

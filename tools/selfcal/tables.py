@@ -20,6 +20,8 @@ from selfcal.units import same_kind
 RATE_LIMITS = (1e-6, 1e6)
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
+#: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/internal.h, TIME_MAX in lib/bank.c.
+ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class RegressorTable:
 @dataclass(frozen=True)
 class HypothesisTable:
     """One hypothesis: its law (index into LAWS), prior probability and grids; of a sum also each axis's priors (ln
-    limits, whether uniform) in the order of PARAMETERS."""
+    limits, whether uniform) in the order of PARAMETERS, and the correlation time that it states."""
 
     name: str
     law: int
@@ -73,6 +75,7 @@ class HypothesisTable:
     rho: Grid | None
     alpha: Grid | None
     priors: tuple[tuple[tuple[float, float, bool], ...], ...] = ()
+    correlation_time_s: float = 0.0  # of walk_and_markov
 
     @property
     def nodes(self) -> int:
@@ -119,7 +122,14 @@ class Tables:
     def id(self) -> int:
         """32-bit checksum of everything that decides what the sums mean."""
         hypotheses = [
-            (h.name, h.ln_probability, h.rho.nodes if h.rho else 0, h.alpha.nodes if h.alpha else 0, *h.priors)
+            (
+                h.name,
+                h.ln_probability,
+                h.rho.nodes if h.rho else 0,
+                h.alpha.nodes if h.alpha else 0,
+                *h.priors,
+                *([h.correlation_time_s] if h.correlation_time_s else []),
+            )
             for h in self.hypotheses
         ]
         extras = (*self.regressors, *([self.half_life_s] if self.half_life_s else []))
@@ -194,6 +204,12 @@ def make_tables(
             f"{model.path}: half_life_s: {model.half_life_s:g} s are less than {_library32.BATCH} bank intervals "
             f"({_library32.BATCH * block / rate_hz:g} s)"
         )
+    time, dt = model.groups[0].correlation_time_s, block / rate_hz
+    if not math.isnan(time) and not dt / ALPHA_DT_MAX <= time <= TIME_MAX * dt:
+        raise UserError(
+            f"{model.path}: correlation_time_s: must be from {dt / ALPHA_DT_MAX:.3g} to {TIME_MAX * dt:.3g} s at bank "
+            f"intervals of {dt:g} s, not {time:g}"
+        )
     grids: dict[str, tuple[Grid | None, Grid | None]] = {
         "constant": (None, None),
         "random_walk": (make_grid(nodes.random_walk), None),
@@ -210,6 +226,7 @@ def make_tables(
                 math.log(probability),
                 *grids[name],
                 priors=tuple(_priors(model.group_of(axis), name) for axis in names) if name in SUMS else (),
+                correlation_time_s=model.groups[0].correlation_time_s if name == "walk_and_markov" else 0.0,
             )
             for name, probability in model.hypotheses.items()
         ),

@@ -146,7 +146,7 @@ def per_second(unit: str) -> str:
 
 
 def parameter_unit(parameter: str, unit: str) -> str:
-    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, spectral_ratio) of an axis that reads in `unit`."""
+    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios) of an axis that reads in `unit`."""
     match parameter:
         case "bias" | "sigma_m" | "B":
             return unit
@@ -156,6 +156,6 @@ def parameter_unit(parameter: str, unit: str) -> str:
             return f"{per_second(unit)}/sqrt(Hz)"
         case "alpha":
             return "1/s"
-        case "spectral_ratio":
+        case "spectral_ratio" | "markov_ratio":
             return "1"
     raise ValueError(f"no such parameter: {parameter}")

@@ -57,7 +57,10 @@ class Bank:
                 (list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit)
                 for a in tables.axes
             ],
-            [(h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
+            [
+                (h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors, h.correlation_time_s)
+                for h in tables.hypotheses
+            ],
             tables.id,
             _regressors(tables),
             tables.half_life_s,

@@ -40,7 +40,7 @@ _MOST = 1_000_000
 #: Scan for modes: points in each drift parameter, by the number of those.
 _SCAN = {0: (), 1: (25,), 2: (11, 9)}
 #: What of a law's states is drift, where that is not the one it has.
-_DRIFT = {"flicker": (1.0, 1.0, 1.0), "moving_average": (1.0, 0.0, 0.0)}
+_DRIFT = {"flicker": (1.0, 1.0, 1.0), "moving_average": (1.0, 0.0, 0.0), "walk_and_markov": (1.0, 1.0)}
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -61,6 +61,18 @@ class _Posterior:
     parameters: dict[str, Estimate]
     mean: _Floats
     var: _Floats
+
+
+def textbook_node(
+    law: str, parameters: Mapping[str, _Floats], correlation_time_s: float = math.nan
+) -> tuple[_Floats, _Floats, _Floats]:
+    """`drift`, `alpha` and `walk` of the textbook's nodes (_reference.pyi) from a law's `parameters`, [m] each."""
+    none = np.zeros_like(parameters["N"])
+    second = [parameters[name] for name in LAWS[law][1:]]
+    if law != "walk_and_markov":
+        return second[0] if second else none, second[1] if len(second) > 1 else none + 1.0, none
+    walk, ratio = second
+    return ratio * walk * math.sqrt(correlation_time_s), none + 1.0 / correlation_time_s, walk
 
 
 def identify_axis(
@@ -126,20 +138,21 @@ def _posterior(
 
     def filtered(x: _Floats) -> _Filtered:
         """x [m, parameters]: ln of each parameter."""
-        theta = np.exp(x)
-        m = len(x)
+        theta = {name: np.ascontiguousarray(column) for name, column in zip(names, np.exp(x).T, strict=True)}
+        drift_of, alpha, walk = textbook_node(law, theta, group.correlation_time_s)
         ln_p, mean, covariance = _reference.run_filters(
             y,
             dt,
             -offset,
             group.priors["bias"].sd,
-            np.full(m, index, np.int32),
-            np.ascontiguousarray(theta[:, 1]) if len(names) > 1 else np.zeros(m),
-            np.ascontiguousarray(theta[:, 2]) if len(names) > 2 else np.ones(m),
-            theta[:, 0] / math.sqrt(dt),
+            np.full(len(x), index, np.int32),
+            drift_of,
+            alpha,
+            theta["N"] / math.sqrt(dt),
             r,
             z,
             sd,
+            walk,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
         own = np.diagonal(covariance, axis1=1, axis2=2)[:, len(drift) + 1 :]

@@ -96,6 +96,8 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
     return max(math.ceil(math.log2(span / FIXED_LIMIT)), math.floor(math.log2(sigma) + 1e-5) - FIXED_SIGMA_BITS)
+
+
 def _terms(tables: Tables) -> str:
     if not tables.term_nodes:
         return ""
@@ -201,5 +203,7 @@ def _hypothesis(hypothesis: HypothesisTable) -> str:
     law = f"SELFCAL_{list(LAWS)[hypothesis.law].upper()}"
     rho, alpha = (f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
     prior = f", .prior = priors_of_{hypothesis.name}" if hypothesis.priors else ""
+    if hypothesis.correlation_time_s:
+        prior += f", .correlation_time_s = {_f(hypothesis.correlation_time_s)}"
     chance = _f(hypothesis.ln_probability)
     return f"    {{.law = {law}, .ln_probability = {chance}, .rho = {rho}, .alpha = {alpha}{prior}}},"

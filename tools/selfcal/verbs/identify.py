@@ -20,7 +20,7 @@ from rich.table import Table
 from selfcal import units as unit_module
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
-from selfcal.model import LAWS, Group, Model
+from selfcal.model import LAWS, RATIOS, SUMS, Group, Model
 from selfcal.recording import Recording, Scale, load
 from selfcal.regressors import Scored, choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult
@@ -263,11 +263,13 @@ def _checks(
     """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, white, normal
     and of one variance?"""
     from selfcal import _reference
+    from selfcal.engines.reference import textbook_node
 
     if blocks.mean.size > MOST_DENSE:
         return {}
     law = max(result.probability, key=lambda name: result.probability[name])
-    at = {name: estimate.median for name, estimate in result.parameters[law].items()}
+    at = {name: np.array([estimate.median]) for name, estimate in result.parameters[law].items()}
+    drift, alpha, walk = (float(value[0]) for value in textbook_node(law, at, group.correlation_time_s))
     offset = float(np.nanmean(blocks.mean))
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
@@ -277,12 +279,13 @@ def _checks(
         -offset,
         group.priors["bias"].sd,
         list(LAWS).index(law),
-        at.get("K", at.get("sigma_m", at.get("B", 0.0))),
-        at.get("alpha", at.get("spectral_ratio", 1.0)),
-        at["N"] / math.sqrt(tables.dt_s),
+        drift,
+        alpha,
+        float(at["N"][0]) / math.sqrt(tables.dt_s),
         blocks.r,
         np.ascontiguousarray(z[:, used]) if used else None,
         sd[used] if used else None,
+        walk,
     )[1 + len(used) :]  # the first ones are the bias and the coefficients
     pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
     whole = nu[np.isfinite(nu)]
@@ -306,14 +309,15 @@ def _checks(
 
 
 def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
-    """The result in `to` instead of `unit`: every number but alpha, and the evidence, as a density per unit."""
+    """The result in `to` instead of `unit`: every number but alpha and the ratios, and the evidence, as a density per
+    unit."""
     factor = unit_module.factor(unit, to)
     return AxisResult(
         result.n,
         {name: value - result.n * math.log(factor) for name, value in result.log_evidence.items()},
         result.probability,
         {
-            law: {name: e if name == "alpha" else e.scaled(factor) for name, e in estimates.items()}
+            law: {name: e if name in ("alpha", *RATIOS) else e.scaled(factor) for name, e in estimates.items()}
             for law, estimates in result.parameters.items()
         },
         result.bias_mean * factor,
@@ -416,7 +420,10 @@ def show(document: Mapping[str, Any]) -> None:
         caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it",
         caption_justify="left",
     )
-    for heading in ("law", "P", "N", "K, sigma_m or B", "1/alpha, s, or ratio"):
+    laws = {law for axis in document["axes"].values() for law in axis["hypotheses"]}
+    drift = "K or sigma_m" if "flicker" not in laws else "K, sigma_m or B"
+    second = "1/alpha, s" + (", or ratio" if laws & {law for law in SUMS if LAWS[law][2] in RATIOS} else "")
+    for heading in ("law", "P", "N", drift, second):
         table.add_column(heading, no_wrap=True)
     failed: list[str] = []
     kept: list[str] = []
@@ -431,8 +438,8 @@ def show(document: Mapping[str, Any]) -> None:
                 law,
                 f"{probability:.4f}",
                 _interval(parameters["N"]),
-                _interval(parameters.get("K") or parameters.get("sigma_m") or parameters.get("B")),
-                _interval(parameters.get("alpha"), inverse=True) or _interval(parameters.get("spectral_ratio")),
+                _interval(_first(parameters, ("K", "sigma_m", "B"))),
+                _interval(parameters.get("alpha"), inverse=True) or _interval(_first(parameters, RATIOS)),
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
@@ -473,6 +480,10 @@ def _regressor_table(document: Mapping[str, Any]) -> Table:
                     end_section=(regressor, entry) == entries[-1],
                 )
     return table
+
+
+def _first(parameters: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Any] | None:
+    return next((parameters[name] for name in names if name in parameters), None)
 
 
 def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> str:

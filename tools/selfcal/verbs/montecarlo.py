@@ -81,9 +81,10 @@ def montecarlo(
 
 
 def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of a law and the bias, drawn from the group's priors."""
+    """Parameters of a law and the bias, drawn from the group's priors; the correlation time where the law states it."""
     truth = {name: _draw(group.priors[name], rng) for name in LAWS[law]}
-    return {**truth, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
+    stated = {"correlation_time_s": group.correlation_time_s} if law == "walk_and_markov" else {}
+    return {**truth, **stated, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> float:

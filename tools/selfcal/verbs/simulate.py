@@ -182,7 +182,14 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
                 continue
             drawn[key] = _positive(model, fields[key], f"{where}.{key}", signed=key == "bias")
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
-        truth[name] |= {parameter: drawn[parameter] for parameter in LAWS[law]}
+        for parameter in LAWS[law]:
+            if parameter not in drawn:
+                raise UserError(f"{model.path}: simulate.{where}.{parameter}: is missing, and the model has no prior of it")
+            truth[name][parameter] = drawn[parameter]
+        if law == "walk_and_markov":
+            if law not in model.hypotheses:
+                raise UserError(f"{model.path}: simulate.{where}.hypothesis: '{law}' must be among the model's hypotheses")
+            truth[name]["correlation_time_s"] = model.group_of(name).correlation_time_s
     return truth
 
 
@@ -204,7 +211,7 @@ def _draw(prior: Prior, u: float) -> float:
 def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
     axis = _reference.Axis()
     axis.law = list(LAWS).index(truth["hypothesis"])
-    for key in ("bias", *LAWS[truth["hypothesis"]]):
+    for key in truth.keys() - {"hypothesis", "unit"}:
         setattr(axis, key, truth[key])
     axis.range, axis.lsb = group.range, group.lsb
     return axis
