@@ -29,8 +29,7 @@ static int error_of(int which) {
     }
 }
 
-float erring_float(float value, float x, int which) {
-    (void)x;
+float erring_float(float value, int which) {
     if (value == 0.0F || !isfinite(value)) {
         return value;
     }
@@ -41,8 +40,7 @@ float erring_float(float value, float x, int which) {
     return value;
 }
 
-double erring_double(double value, double x, int which) {
-    (void)x;
+double erring_double(double value, int which) {
     if (value == 0.0 || !isfinite(value)) {
         return value;
     }

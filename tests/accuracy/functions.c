@@ -52,6 +52,7 @@ static void put(const void *bytes, uint32_t count) {
 }
 #endif
 
+/* A function between two arguments of one sign, in either width. */
 typedef struct {
     float (*f)(float);
     float from, to;
@@ -72,41 +73,47 @@ static const double_t_ doubles[] = {
     {log1p, -0.9999999, -1e-17}, {log1p, 1e-17, 1e300},    {sqrt, 1e-300, 1e300},
 };
 
-int main(void) {
-    static float single[512];
-    static double wide[512];
-    open_file();
-    for (unsigned k = 0; k < LENGTH(singles); k++) {
-        uint32_t from, to, at = 0;
-        memcpy(&from, &singles[k].from, sizeof from);
-        memcpy(&to, &singles[k].to, sizeof to);
-        for (uint32_t i = 0; i < COUNT; i++) {
-            const uint32_t bits = (uint32_t)((int64_t)from + ((int64_t)to - (int64_t)from) * (int64_t)i / (int64_t)COUNT);
-            memcpy(&single[at], &bits, sizeof bits);
-            single[at + 1U] = singles[k].f(single[at]);
-            at += 2U;
-            if (at == LENGTH(single) || i + 1U == COUNT) {
-                put(single, at * (uint32_t)sizeof single[0]);
-                at = 0;
-            }
+/* COUNT bit patterns of `size` bytes from `from` on, each with what a function makes of it. */
+static void put_all(const void *from, const void *to, size_t size, void (*evaluate)(uint32_t kind, void *pair), uint32_t kind) {
+    static unsigned char pairs[4096];
+    int64_t first = 0, last = 0; /* little-endian: a float's pattern is in the lower half */
+    memcpy(&first, from, size);
+    memcpy(&last, to, size);
+    const int64_t step = (last - first) / (int64_t)COUNT;
+    size_t at = 0;
+    for (uint32_t i = 0; i < COUNT; i++) {
+        const int64_t bits = first + step * (int64_t)i;
+        memcpy(&pairs[at], &bits, size);
+        evaluate(kind, &pairs[at]);
+        at += 2U * size;
+        if (at == sizeof pairs || i + 1U == COUNT) {
+            put(pairs, (uint32_t)at);
+            at = 0;
         }
     }
-    for (unsigned k = 0; k < LENGTH(doubles); k++) {
-        int64_t from, to;
-        uint32_t at = 0;
-        memcpy(&from, &doubles[k].from, sizeof from);
-        memcpy(&to, &doubles[k].to, sizeof to);
-        const int64_t step = (to - from) / (int64_t)COUNT;
-        for (uint32_t i = 0; i < COUNT; i++) {
-            const int64_t bits = from + step * (int64_t)i;
-            memcpy(&wide[at], &bits, sizeof bits);
-            wide[at + 1U] = doubles[k].f(wide[at]);
-            at += 2U;
-            if (at == LENGTH(wide) || i + 1U == COUNT) {
-                put(wide, at * (uint32_t)sizeof wide[0]);
-                at = 0;
-            }
-        }
+}
+
+static void evaluate_single(uint32_t kind, void *pair) {
+    float x[2];
+    memcpy(x, pair, sizeof x[0]);
+    x[1] = singles[kind].f(x[0]);
+    memcpy(pair, x, sizeof x);
+}
+
+static void evaluate_double(uint32_t kind, void *pair) {
+    double x[2];
+    memcpy(x, pair, sizeof x[0]);
+    x[1] = doubles[kind].f(x[0]);
+    memcpy(pair, x, sizeof x);
+}
+
+int main(void) {
+    open_file();
+    for (uint32_t k = 0; k < LENGTH(singles); k++) {
+        put_all(&singles[k].from, &singles[k].to, sizeof(float), evaluate_single, k);
+    }
+    for (uint32_t k = 0; k < LENGTH(doubles); k++) {
+        put_all(&doubles[k].from, &doubles[k].to, sizeof(double), evaluate_double, k);
     }
     return 0;
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,68 +13,20 @@ import pytest
 from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import Model, Regressor
+from selfcal.model import LAWS, Model, Regressor
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
+from agreement import MODEL, Filter, faded, fading
 from conftest import ROOT, worst_difference
 
-MODEL = Model.load()
 RECORDING = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 TIME = Regressor("time", "time", "s", {"gyro": 1e-4}, 0.5)
 
 
 def tables(half_life_s: float, model: Model = MODEL) -> Tables:
     return make_tables(replace(model, half_life_s=half_life_s), 1.0, ("gx",))
-
-
-def weights(missing: np.ndarray, half_life: float) -> np.ndarray:
-    """What every sample [n] counts for, as selfcal.h has it: by the intervals of the later batches."""
-    n, batch = len(missing), _library32.BATCH
-    ends = np.cumsum(missing + 1)[[min(at + batch, n) - 1 for at in range(0, n, batch)]]  # of each batch
-    return np.repeat(2.0 ** (-(ends[-1] - ends) / half_life), batch)[:n]
-
-
-@dataclass(frozen=True)
-class Filter:
-    """Relative to sigma_v^2: pole, variance added per interval, predicted variance of the drift at the first sample."""
-
-    phi: float
-    q: float
-    first: float
-
-
-def faded(
-    node: Filter,
-    y: np.ndarray,
-    columns: np.ndarray,
-    missing: np.ndarray,
-    half_life: float,
-    sd: np.ndarray,
-    sigma: float,
-) -> float:
-    """ln-likelihood of `y` [n] under weights, by the printed recursions with a filter each for y and every column
-    [n, c], and the coefficients ~ N(0, sd^2) out of the weighted normal equations."""
-    n, series = len(y), np.column_stack([y, columns])
-    x, p, sums, ln_s = np.zeros(series.shape[1]), node.first, np.zeros((series.shape[1],) * 2), 0.0
-    w = weights(missing, half_life)
-    for i in range(n):
-        for _ in range(int(missing[i])):
-            x, p = node.phi * x, node.phi**2 * p + node.q
-        nu, s = series[i] - x, 1.0 + p
-        sums += w[i] * np.outer(nu, nu) / s
-        ln_s += w[i] * math.log(s)
-        x, p = node.phi * (x + p / s * nu), node.phi**2 * p / s + node.q
-    a, b, c = sums[1:, 1:] / sigma**2, sums[1:, 0] / sigma**2, sums[0, 0] / sigma**2
-    precision = a + np.diag(1.0 / sd**2)
-    _, ln_det = np.linalg.slogdet(precision * np.outer(sd, sd))
-    fitted = np.linalg.solve(a, b)
-    shrunk = np.linalg.solve(precision, b)
-    of_prior = (
-        b @ fitted - b @ shrunk + ln_det
-    )  # what the coefficients' priors cost: it counts as the first sample does
-    return float(-0.5 * (w.sum() * math.log(2 * math.pi * sigma**2) + ln_s + c - b @ fitted + w[0] * of_prior))
 
 
 @pytest.mark.parametrize("with_time", [False, True], ids=["plain", "regressor"])
@@ -95,17 +47,13 @@ def test_the_likelihood_is_that_of_the_weighted_record(with_time: bool) -> None:
     sigma, worst = 0.06, 0.0
     for index in range(0, made.nodes, 7):
         view = bank.raw.node(0, index)
-        rho, alpha = math.exp(view["ln_rho"]), math.exp(view["ln_alpha"])
-        law = view["law"]
-        phi = math.exp(-alpha) if law == 2 else 1.0
-        q = {0: 0.0, 1: rho**2, 2: rho**2 * -math.expm1(-2 * alpha)}[law]
-        first = {0: 0.0, 1: rho**2, 2: rho**2}[law]
-        truth = faded(Filter(phi, q, first), y, columns, missing, half_life, sd, sigma)
+        node = Filter.of(list(LAWS)[view["law"]], math.exp(view["ln_rho"]), math.exp(view["ln_alpha"]))
+        truth = faded(node, y, columns, missing, half_life, sd, sigma)
         found = bank.raw.log_likelihood_subset(0, index, int(with_time), sigma)
         worst = max(worst, abs(found - truth))
     print(f"\nworst |d ln p| {worst:.1e}")
     assert worst < 1e-3
-    assert bank.raw.weight == pytest.approx(weights(missing, half_life).sum(), rel=1e-12)
+    assert bank.raw.weight == pytest.approx(fading(missing, half_life).sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("fixed", [None, 16, 32])

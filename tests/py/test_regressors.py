@@ -1,13 +1,9 @@
 """Regressors: the library's sums against the textbook bank, where the coefficients are filter states with a row of H
-each; reports, `identify` and the model file.
-
-The two share no code. Tolerances are those of the design on equal nodes: for the double build |d ln p| <= 1e-3 and
-|dP| <= 1e-6, for the float build |dP| <= 1e-3 and parameter means within 0.02 posterior sd.
+each (agreement.py, as are the tolerances); reports, `identify` and the model file.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import subprocess
@@ -16,68 +12,35 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
-from selfcal import _library32, _reference
+from selfcal import _library32
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import LAWS, MOST_COLUMNS, PLAIN, Model, Regressor
+from selfcal.model import MOST_COLUMNS, PLAIN, Model
 from selfcal.recording import save
-from selfcal.tables import Tables, make_tables
+from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.replay import replay
 
-LN_P_DOUBLE = 1e-3
-PROBABILITY_DOUBLE = 1e-6
-#: |dP| and |d mean| / sd of each build that is not double.
-LIMITS = {"float": (1e-3, 0.02), "fixed16": (5e-3, 0.05)}
-#: Nodes this far below the best carry e^-30 of the weight.
-DEPTH = 30.0
-
-#: Six columns as a recording has them; priors so that every one moves the reading by some ten times its white noise.
-REGRESSORS = (
-    Regressor("temperature", "column", "degC", {"gyro": 0.05}, column="temp", reference=25.0),
-    Regressor("time", "time", "s", {"gyro": 3e-4}),
-    Regressor("step", "step", "1", {"gyro": 0.5}, time_s=0.0),
-    Regressor("period", "periodic", "1", {"gyro": 0.3}, frequency_hz=0.01),
-    Regressor("supply", "column", "V", {"gyro": 1.0}, column="supply", reference=5.0),
+from agreement import (
+    MODEL as PLAIN_MODEL,
 )
-MODEL = replace(Model.load(), regressors=REGRESSORS)
+from agreement import (
+    REGRESSORS,
+    a_record,
+    columns_of,
+    compare,
+    hold,
+    push,
+    tables_of,
+)
+
+MODEL = replace(PLAIN_MODEL, regressors=REGRESSORS)
 GROUP = MODEL.group_of("gx")
-
-
-def columns(n: int, seed: int) -> NDArray[np.float64]:
-    """[n, 6] in the order of REGRESSORS, as float32 holds them: a warm-up off its reference, a wandering supply."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(float(n))
-    supply = 5.0 + 0.02 * np.cumsum(rng.normal(size=n)) / math.sqrt(n) + 0.01 * rng.normal(size=n)
-    warm = 40.0 - 8.0 * np.exp(-t / (0.3 * n)) + 0.02 * rng.normal(size=n)
-    turn = 2.0 * math.pi * 0.01 * t
-    z = np.column_stack([warm, t, t >= 0.6 * n, np.sin(turn), np.cos(turn), supply])
-    return z.astype(np.float32).astype(np.float64)
-
-
-def with_columns(tables: Tables, count: int) -> Tables:
-    return replace(tables, regressors=tables.regressors[:count])
-
-
-def a_record(law: str, n: int, count: int, *, gaps: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """y [n] (NaN: missing) with coefficients drawn from the priors, z [n, count], and sigma_v."""
-    seed = 1000 * n + 10 * count + list(LAWS).index(law)
-    rng = np.random.default_rng(seed)
-    truth = draw(GROUP, law, rng)
-    z = columns(n, seed)[:, :count]
-    sd = np.array([column.coefficient_sd[0] for column in make_tables(MODEL, 1.0, ("gx",)).regressors[:count]])
-    y = simulate_bank_samples(law, truth, 1.0, n, seed=seed)[0] + z @ (sd * rng.normal(size=count))
-    y = y.astype(np.float32).astype(np.float64)
-    if gaps:
-        for start, length in zip(rng.integers(1, n - 1, 3), (1, max(n // 20, 1), max(n // 5, 1)), strict=True):
-            y[start : min(start + length, n - 1)] = np.nan
-    return y, z, truth["N"]
 
 
 @pytest.mark.parametrize("gaps", [False, True], ids=["whole", "gaps"])
@@ -85,68 +48,11 @@ def a_record(law: str, n: int, count: int, *, gaps: bool) -> tuple[NDArray[np.fl
 @pytest.mark.parametrize("count", [1, 3, 6])
 def test_parity_with_the_textbook_bank(count: int, n: int, gaps: bool) -> None:
     """Every law; all regressors in use, none, and one subset, each with flat weights over the nodes and sigma_v."""
-    worst = {"double d ln p": 0.0, "double dP": 0.0}
-    for build in LIMITS:
-        worst |= {f"{build} dP": 0.0, f"{build} d mean / sd": 0.0}
-    tables = with_columns(make_tables(MODEL, 1.0, ("gx",), "cortex-m0"), count)
-    sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
-    reference = np.array([column.reference for column in tables.regressors])
-    for law in PLAIN:
-        y, z, sigma_v = a_record(law, n, count, gaps=gaps)
-        present = np.isfinite(y)
-        missing = np.diff(np.flatnonzero(present), prepend=-1) - 1
-        banks = {"double": Bank(tables, double=True), "float": Bank(tables), "fixed16": Bank(tables, fixed=16)}
-        for bank in banks.values():
-            bank.push(y[present, None], missing, z[present])
-        nodes = [banks["double"].raw.node(0, j) for j in range(tables.nodes)]
-        laws = np.array([node["law"] for node in nodes])
-        sigma = sigma_v * np.exp(np.linspace(-4.0, 4.0, 9) / math.sqrt(2.0 * n))
-        rho = np.exp(np.nan_to_num([node["ln_rho"] for node in nodes]))
-        alpha = np.exp(np.nan_to_num([node["ln_alpha"] for node in nodes]))
-        drift = np.outer(rho, sigma)
-        offset = float(np.nanmean(y))
-        for mask in {2**count - 1, 0, 0b101101 & (2**count - 1)}:
-            used = [k for k in range(count) if mask >> k & 1]
-            theirs, _, _ = _reference.run_filters(
-                y - offset,
-                1.0,
-                -offset,
-                GROUP.priors["bias"].sd,
-                np.repeat(laws, sigma.size).astype(np.int32),
-                drift.ravel(),
-                np.repeat(alpha, sigma.size),
-                np.tile(sigma, len(nodes)),
-                z=np.ascontiguousarray((z - reference)[:, used]),
-                coefficient_sd=sd[used],
-            )
-            theirs = theirs.reshape(drift.shape)
-            values = (np.broadcast_to(sigma, drift.shape), drift, np.repeat(alpha, sigma.size).reshape(drift.shape))
-            for name, bank in banks.items():
-                ours = np.array(
-                    [[bank.raw.log_likelihood_subset(0, j, mask, s) for s in sigma] for j in range(len(nodes))]
-                )
-                near = theirs > theirs.max() - DEPTH
-                if name == "double":
-                    worst["double d ln p"] = max(worst["double d ln p"], float(np.abs(ours - theirs)[near].max()))
-                weights = [np.exp(ln_p - ln_p.max()) for ln_p in (ours, theirs)]
-                weights = [w / w.sum() for w in weights]
-                p = max(abs(float((weights[0] - weights[1])[laws == k].sum())) for k in range(len(PLAIN)))
-                worst[f"{name} dP"] = max(worst[f"{name} dP"], p)
-                for k, value in itertools.product(range(len(PLAIN)), values):
-                    share = weights[1][laws == k].sum()
-                    if name == "double" or share < 1e-3:
-                        continue
-                    a, b = ((value * w)[laws == k].sum() / w[laws == k].sum() for w in weights)
-                    spread = math.sqrt(max((weights[1] * (value - b) ** 2)[laws == k].sum() / share, 0.0))
-                    if spread > 1e-9 * abs(b):
-                        key = f"{name} d mean / sd"
-                        worst[key] = max(worst[key], abs(float(a - b)) / spread)
-    limits = (LN_P_DOUBLE, PROBABILITY_DOUBLE, *(limit for pair in LIMITS.values() for limit in pair))
-    found = list(zip(worst.items(), limits, strict=True))
-    text = ", ".join(f"{key} {value:.2g} (<= {limit:g})" for (key, value), limit in found)
-    print(f"\np={count} n={n} gaps={gaps}: {text}")
-    for (key, value), limit in found:
-        assert value <= limit, key
+    tables = tables_of(PLAIN_MODEL, "cortex-m0", count)
+    masks = {2**count - 1, 0, 0b101101 & (2**count - 1)}
+    records = [a_record(law, n, 0, gaps=gaps, columns=count) for law in PLAIN]
+    builds = ("double", "float", "fixed16")
+    hold(f"p={count} n={n} gaps={gaps}", [compare(y, tables, z, builds=builds, masks=masks) for y, z in records])
 
 
 def test_the_model_allows_what_the_library_holds() -> None:
@@ -161,11 +67,12 @@ def test_report_of_a_subset_against_the_continuous_reference(law: str) -> None:
     """The float library's interpolated report with three columns in use, against the textbook bank refined until it
     settles. Tolerances as for a report without: 0.05 in ln evidence, 0.05 sd in means; sd to 5 %."""
     n, count = 300, 3
-    tables = with_columns(make_tables(MODEL, 1.0, ("gx",)), count)
-    y, z, _ = a_record(law, n, count, gaps=True)
+    tables = tables_of(PLAIN_MODEL, columns=count)
+    y, z = a_record(law, n, 0, gaps=True, columns=count)
+    assert z is not None
     present = np.isfinite(y)
     bank = Bank(tables)
-    bank.push(y[present, None], np.diff(np.flatnonzero(present), prepend=-1) - 1, z[present])
+    push(bank, y, z)
     last = int(np.flatnonzero(present)[-1]) + 1
     sd = [column.coefficient_sd[0] for column in tables.regressors]
     centred = z - np.array([column.reference for column in tables.regressors])
@@ -186,13 +93,13 @@ def test_report_of_a_subset_against_the_continuous_reference(law: str) -> None:
 def test_intervals_of_a_coefficient_hold_the_truth_as_often_as_they_say() -> None:
     """Random walk with a temperature, parameters and coefficient drawn from their priors: 200 records of 200 samples,
     one set of seeds; the bounds are the central 99.8 % of the binomial law of 200 and 0.9."""
-    tables = with_columns(make_tables(MODEL, 1.0, ("gx",)), 1)
+    tables = tables_of(PLAIN_MODEL, columns=1)
     held = 0
     for seed in range(200):
         rng = np.random.default_rng([seed, 5])
         truth = draw(GROUP, "random_walk", rng)
         coefficient = tables.regressors[0].coefficient_sd[0] * rng.normal()
-        z = columns(200, seed)[:, :1]
+        z = columns_of(200, seed)[:, :1]
         y = simulate_bank_samples("random_walk", truth, 1.0, 200, seed=seed)[0] + coefficient * z[:, 0]
         bank = Bank(replace(tables, hypotheses=tables.hypotheses[1:2]))
         bank.push(y[:, None], None, z)
@@ -205,9 +112,9 @@ def test_intervals_of_a_coefficient_hold_the_truth_as_often_as_they_say() -> Non
 
 def test_a_model_without_regressors_pays_nothing() -> None:
     """The bytes of selfcal.h's formulas, without and with; and the empty subset gives the report of a bank without."""
-    plain = make_tables(Model.load(), 1.0, ("gx",))
+    plain = make_tables(PLAIN_MODEL, 1.0, ("gx",))
     offered = make_tables(MODEL, 1.0, ("gx",))
-    y, z, _ = a_record("random_walk", 300, 6, gaps=False)
+    y, z = a_record("random_walk", 300, 0, columns=6)
     bank, beside = Bank(plain), Bank(offered)
     bank.push(y[:, None])
     beside.push(y[:, None], None, z)

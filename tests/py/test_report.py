@@ -8,53 +8,27 @@ test_identify.py's. SELFCAL_DRAWS sets the records per law and length (default 4
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from selfcal import _library32
 from selfcal.engines.library import Bank
-from selfcal.model import Model
-from selfcal.tables import Tables, make_grid, make_tables
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.tables import make_tables
+from selfcal.verbs.montecarlo import simulate_bank_samples
 
-from conftest import worst_difference
+from agreement import MODEL, REPORT_LIMIT, a_record, report_differences, tables_of
 
-MODEL = Model.load()
-GROUP = MODEL.group_of("gx")
 DRAWS = int(os.environ.get("SELFCAL_DRAWS", "4"))
 LENGTHS = [int(float(n)) for n in os.environ.get("SELFCAL_LENGTHS", "10,100,1000,10000,100000").split(",")]
-#: The design's tolerances: |d ln evidence|, |d mean| / sd, |sd ratio - 1|.
-TOLERANCE = np.array([0.05, 0.05, 0.03])
-
-
-def dense_tables() -> Tables:
-    """The default model's, with 48 nodes of random walk and 40 x 40 of Gauss-Markov."""
-    square = make_grid(40), make_grid(40)
-    nodes = {"constant": (None, None), "random_walk": (make_grid(48), None), "gauss_markov": square}
-    hypotheses = (replace(h, rho=nodes[h.name][0], alpha=nodes[h.name][1]) for h in DEFAULT.hypotheses)
-    return replace(DEFAULT, hypotheses=tuple(hypotheses))
-
-
-DEFAULT = make_tables(MODEL, 1.0, ("gx",))
-DENSE = dense_tables()
 
 
 @pytest.mark.parametrize("n", LENGTHS)
 def test_report_over_the_whole_prior(n: int) -> None:
-    found = []
-    for law in MODEL.hypotheses:
-        for index in range(DRAWS):
-            truth = draw(GROUP, law, np.random.default_rng([n, index, 7]))
-            y = simulate_bank_samples(law, truth, 1.0, n, seed=100 + index)[0].astype(np.float32)
-            banks = Bank(DEFAULT), Bank(DENSE, dense=True)
-            for bank in banks:
-                bank.push(y[:, None])
-            evidence, _, mean, sd = worst_difference(*(bank.report(0) for bank in banks))
-            found.append([evidence, mean, sd])
-    values = np.array(found)
-    good = (values <= TOLERANCE).all(axis=1).mean()
+    tables = tables_of(MODEL)
+    records = (a_record(law, n, seed)[0] for law in MODEL.hypotheses for seed in range(DRAWS))
+    values = np.array([report_differences(y, tables)[0] for y in records])
+    good = (values <= REPORT_LIMIT).all(axis=1).mean()
     (e, m, s), (we, wm, ws) = np.quantile(values, 0.9, axis=0), values.max(axis=0)
     print(
         f"\nn={n}: 9 records in 10 within d ln evidence {e:.3f}, d mean {m:.3f} sd, sd {100 * s:.1f} %; "
