@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from selfcal import _library32, _reference
 from selfcal.engines.library import Bank
+from selfcal.engines.reference import textbook_node
 from selfcal.model import DEFAULT, LAWS, PLACES, SUMS, Model, Regressor
 from selfcal.tables import Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
@@ -154,6 +155,7 @@ def a_record(
     else:
         truth = {name: math.sqrt(group.priors[name].min * group.priors[name].max) for name in LAWS[law]}
         truth |= {"N": 1e-3 if rho > 0.1 else 0.1, "bias": 0.0}
+        truth |= {"correlation_time_s": group.correlation_time_s} if law == "walk_and_markov" else {}
         truth[LAWS[law][1]] = rho * truth["N"]
     y, _ = simulate_bank_samples(law, truth, 1.0, n, seed=seed)
     z = None
@@ -221,9 +223,12 @@ def textbook(y: Floats, tables: Tables, nodes: Nodes, sigma: Floats, z: Floats |
     offset = float(np.nanmean(y))
     values = nodes.values(sigma, tables.dt_s)
     found = np.empty(values[0].shape)
+    times = {h.law: h.correlation_time_s for h in tables.hypotheses}
     for law in np.unique(nodes.law):
-        mine = nodes.law == law
-        sigma_v, drift, alpha = (np.ascontiguousarray(value[mine].ravel()) for value in values)
+        mine, names = nodes.law == law, LAWS[list(LAWS)[law]]
+        sigma_v, *others = (np.ascontiguousarray(value[mine].ravel()) for value in values)
+        parameters = {"N": sigma_v} | dict(zip(names[1:], others, strict=False))
+        drift, alpha, walk = textbook_node(list(LAWS)[law], parameters, times[law])
         ln_p, _, _ = _reference.run_filters(
             y - offset,
             tables.dt_s,
@@ -235,6 +240,7 @@ def textbook(y: Floats, tables: Tables, nodes: Nodes, sigma: Floats, z: Floats |
             sigma_v,
             z=centred,
             coefficient_sd=coefficient_sd,
+            walk=walk,
         )
         found[mine] = ln_p.reshape(-1, sigma.size)
     return found

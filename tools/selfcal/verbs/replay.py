@@ -97,7 +97,7 @@ def replay(
         raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
     sums = [law for law in loaded_model.hypotheses if law in SUMS]
     if sums:
-        raise UserError(f"{loaded_model.path}: telemetry has no items for {' and '.join(sums)}; take `identify`")
+        raise UserError(f"{loaded_model.path}: telemetry has no items for {', '.join(sums)}; take `identify`")
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded_model, axes)
     for name in names:
