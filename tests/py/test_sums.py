@@ -237,7 +237,7 @@ def test_a_model_file_that_does_not_fit(tmp_path: Path, old: str, new: str, comp
 def test_a_correlation_time_fits_the_bank_interval(tmp_path: Path, time: str) -> None:
     path = tmp_path / "model.yaml"
     path.write_text(MODEL.path.read_text().replace("correlation_time_s: 100.0", f"correlation_time_s: {time}"))
-    with pytest.raises(UserError, match="correlation_time_s: must be from 0.145 to 1e"):
+    with pytest.raises(UserError, match=r"correlation_time_s: must be from 0\.145 to 1e"):
         make_tables(Model.load(path), 1.0)
 
 

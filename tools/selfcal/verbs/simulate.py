@@ -184,11 +184,11 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
         for parameter in LAWS[law]:
             if parameter not in drawn:
-                raise UserError(f"{model.path}: simulate.{where}.{parameter}: is missing, and the model has no prior of it")
+                raise UserError(f"{model.path}: simulate.{where}: '{parameter}' is missing and has no prior")
             truth[name][parameter] = drawn[parameter]
         if law == "walk_and_markov":
             if law not in model.hypotheses:
-                raise UserError(f"{model.path}: simulate.{where}.hypothesis: '{law}' must be among the model's hypotheses")
+                raise UserError(f"{model.path}: simulate.{where}.hypothesis: the model has no hypothesis '{law}'")
             truth[name]["correlation_time_s"] = model.group_of(name).correlation_time_s
     return truth
 
