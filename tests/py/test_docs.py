@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from selfcal.verbs.codegen import codegen
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -21,6 +23,21 @@ def test_the_guide_has_the_cost_table_of_the_bench() -> None:
     bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), "--table"]
     table = subprocess.run(bench, capture_output=True, text=True, check=True).stdout.strip()
     assert table in (ROOT / "GUIDE.md").read_text(encoding="utf-8")
+
+
+def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
+    """As a function's body, with warnings as errors, against the header that `codegen` makes."""
+    programs = re.findall(r"^```c\n(.*?)^```$", (ROOT / "GUIDE.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    program = next(text for text in programs if "selfcal_model.h" in text)
+    lines = program.splitlines()
+    includes = [line for line in lines if line.startswith("#include")]
+    body = [line for line in lines if not line.startswith("#include")]
+    declared = ["void fault(void);", "void read_sensor(float sample[]);", "int run(uint8_t axis);"]
+    source = tmp_path / "program.c"
+    source.write_text("\n".join([*includes, *declared, "int run(uint8_t axis) {", *body, "return 0;", "}"]))
+    codegen(None, tmp_path)
+    flags = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-fsyntax-only"]
+    subprocess.run(["cc", *flags, f"-I{ROOT / 'lib'}", f"-I{tmp_path}", str(source)], check=True)
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:

@@ -59,6 +59,11 @@ def _header(model: Model, tables: Tables) -> str:
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
 #define SELFCAL_MODEL_EXPONENTS {{{", ".join(str(coarsest_exponent(axis, tables.dt_s)) for axis in tables.axes)}}}
 #define SELFCAL_MODEL_TERM_NODES {tables.term_nodes}U
+/* What selfcal_init() wants. */
+#define SELFCAL_MODEL_BYTES \
+    (SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) + \
+     SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) + \
+     SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
 /* 1: selfcal_model_gate is there. */

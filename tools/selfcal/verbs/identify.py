@@ -142,12 +142,13 @@ def identify_axis(
     )
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = REPORT_MIN + len(tables.regressors)
+    kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
     if present.size < needed:
-        kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
         found = f"{present.size} averages of {tables.dt_s:g} s"
         raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
     if not present.std() > 0.0:
-        raise UserError(f"all averages are equal ({present[0]:g} {group.unit}): a stuck or too coarse reading")
+        equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
+        raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     choices = choices_of(regressors)
