@@ -2,7 +2,7 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
-#   make tolerances             what must agree with what, as measured: sums, reports, regressors, long records
+#   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
@@ -86,10 +86,9 @@ test: setup
 soak: setup
 	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
 
-# Each line that the tests print is a row: what, its errors. SELFCAL_DRAWS and SELFCAL_LENGTHS widen the report's.
+# SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup
-	$(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_bank.py tests/py/test_report.py \
-	    tests/py/test_regressors.py tests/py/test_sums.py tests/py/test_long.py tests/py/test_identify.py tests/py/test_math.py -k "not two_rates"
+	@$(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty

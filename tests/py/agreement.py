@@ -19,6 +19,7 @@ from selfcal import _library32, _reference
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import textbook_node
 from selfcal.model import DEFAULT, LAWS, PLACES, SUMS, Model, Regressor
+from selfcal.result import AxisResult
 from selfcal.tables import Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
@@ -315,13 +316,14 @@ def report_differences(y: Floats, tables: Tables) -> tuple[Floats, bool]:
         push(bank, y)
     found, exact = (bank.report(0) for bank in banks)
     evidence, _, mean, sd = worst_difference(found, exact)
-    entries = zip(tables.hypotheses, banks[0].raw.report(0)["hypotheses"], strict=True)
-    flagged = any(
-        entry["parameters"][PLACES["N"]][-1] & _library32.OFF_GRID
-        for h, entry in entries
-        if exact.probability[h.name] >= 0.01
-    )
-    return np.array([evidence, mean, sd]), flagged
+    return np.array([evidence, mean, sd]), off_grid(banks[0], 0, exact)
+
+
+def off_grid(bank: Bank, axis: int, exact: AxisResult) -> bool:
+    """Whether a report says itself that its grid does not bear the record, of a law that is not ruled out."""
+    entries = zip(bank.tables.hypotheses, bank.raw.report(axis)["hypotheses"], strict=True)
+    flags = [entry["parameters"][PLACES["N"]][-1] for h, entry in entries if exact.probability[h.name] >= 0.01]
+    return any(flag & _library32.OFF_GRID for flag in flags)
 
 
 # ----------------------------------------------------------------------------------------------------------- forgetting
