@@ -270,7 +270,7 @@ def table(bench: Bench) -> str:
         title = f"random walk alone, {columns or 'no'} regressor{'s' if columns != 1 else ''}, per (node, sample, axis)"
         per(f"{title}: settled", f"regressors.p{columns}.steady", ".1f")
         per("… varying", f"regressors.p{columns}.varying", ".1f")
-    for law in ("flicker", "moving_average"):
+    for law in ("flicker", "moving_average", "walk_and_markov"):
         per(f"{law} alone, per (node, sample, axis): settled", f"sums.{law}.steady", ".1f")
         per("… varying", f"sums.{law}.varying", ".1f")
     shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}

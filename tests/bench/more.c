@@ -5,8 +5,8 @@
 #include "record.h"
 
 #define AXES SELFCAL_MODEL_AXES
-/* Bank samples counted at a time: whole batches, and the sums are folded once. */
-#define WINDOW 64U
+/* Bank samples counted at a time: whole batches. Of sums fewer, since they take an emulated Cortex-M0 a while. */
+#define WINDOW (SELFCAL_TERMS_MAX > 1 ? 32U : 64U)
 /* Bank samples within which the filters of fast drifts settle. */
 #define SETTLED_BY 5000U
 #if SELFCAL_TERMS_MAX > 1
@@ -83,10 +83,11 @@ static void measure_sum(const char *name, selfcal_law_t law, bool fast) {
     selfcal_model_t model = record_narrow_model(fast, axis);
     for (unsigned a = 0; a < AXES; a++) {
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            prior[a][p] = law == SELFCAL_MOVING_AVERAGE && p == SELFCAL_SPECTRAL_RATIO ? ratio : axis[a].prior[p];
+            prior[a][p] = law != SELFCAL_FLICKER && p == SELFCAL_SPECTRAL_RATIO ? ratio : axis[a].prior[p];
         }
     }
-    const selfcal_hypothesis_t hypothesis = {law, 0.0F, &grid, &grid, &prior[0][0]};
+    /* a correlation time of 100 s */
+    const selfcal_hypothesis_t hypothesis = {law, 0.0F, &grid, &grid, &prior[0][0], 100.0F};
     model.hypothesis = &hypothesis;
     model.hypotheses = 1;
     model.nodes = SUM_GRID * SUM_GRID;
@@ -98,6 +99,8 @@ static void measure_all(void) {
     measure_sum("flicker.varying", SELFCAL_FLICKER, false);
     measure_sum("moving_average.steady", SELFCAL_MOVING_AVERAGE, true);
     measure_sum("moving_average.varying", SELFCAL_MOVING_AVERAGE, false);
+    measure_sum("walk_and_markov.steady", SELFCAL_WALK_AND_MARKOV, true);
+    measure_sum("walk_and_markov.varying", SELFCAL_WALK_AND_MARKOV, false);
 }
 
 #elif defined(BENCH_PLAIN)
