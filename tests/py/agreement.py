@@ -98,17 +98,18 @@ def tables_of(
     return replace(made, axes=(one,), hypotheses=hypotheses, regressors=made.regressors[:columns])
 
 
+def on_nodes(tables: Tables, alone: int, pair: tuple[int, int]) -> Tables:
+    """The same on other nodes: of rho alone, and of [rho, alpha]."""
+    hypotheses = []
+    for h in tables.hypotheses:
+        rho = None if h.rho is None else make_grid(alone if h.alpha is None else pair[0])
+        hypotheses.append(replace(h, rho=rho, alpha=None if h.alpha is None else make_grid(pair[1])))
+    return replace(tables, hypotheses=tuple(hypotheses))
+
+
 def dense(tables: Tables) -> Tables:
     """The same on so many nodes that theirs no longer counts; for Bank(dense=True)."""
-    hypotheses = (
-        h
-        if h.rho is None
-        else replace(h, rho=make_grid(DENSE))
-        if h.alpha is None
-        else replace(h, rho=make_grid(DENSE_PAIR[0]), alpha=make_grid(DENSE_PAIR[1]))
-        for h in tables.hypotheses
-    )
-    return replace(tables, hypotheses=tuple(hypotheses))
+    return on_nodes(tables, DENSE, DENSE_PAIR)
 
 
 def a_bank(tables: Tables, build: str) -> Bank:
