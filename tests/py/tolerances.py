@@ -86,7 +86,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Job:
-    """One cell: what it costs about (filter steps, for the order), and what makes its rows."""
+    """One cell: what it costs about, for the order, and what makes its rows."""
 
     cost: float
     work: Callable[..., list[Row]] = field(compare=False)
@@ -362,22 +362,26 @@ def main() -> int:
     pairs = arguments.only or PAIRS
     cells = jobs(10_000 if arguments.quick else 1_000_000, arguments.seeds)
     todo = [job for job in cells if job.work.__name__ in pairs]
-    todo.sort(key=lambda job: -job.cost)
-    start = time.monotonic()
+    todo.sort(key=lambda job: job.cost)  # an interrupted table has most rows
+    start, whole = time.monotonic(), True
     rows: list[Row] = []
-    with multiprocessing.get_context("spawn").Pool() as pool:
-        for done, found in enumerate(pool.imap_unordered(Job.run, todo), 1):
-            rows += found
-            print(f"{done} of {len(todo)} cells, {time.monotonic() - start:.0f} s", file=sys.stderr)
-            for row in found:
-                if row.kept is False:
-                    print(f"not kept: {row}", file=sys.stderr)
-    if "ensemble" in pairs:
-        rows += ensemble()
+    try:
+        with multiprocessing.get_context("spawn").Pool() as pool:
+            for done, found in enumerate(pool.imap_unordered(Job.run, todo), 1):
+                rows += found
+                print(f"{done} of {len(todo)} cells, {time.monotonic() - start:.0f} s", file=sys.stderr)
+                for row in found:
+                    if row.kept is False:
+                        print(f"not kept: {row}", file=sys.stderr)
+        if "ensemble" in pairs:
+            rows += ensemble()
+    except KeyboardInterrupt:
+        print("interrupted: what was done so far", file=sys.stderr)
+        whole = False
     show(rows)
     lost = sum(row.kept is False for row in rows)
     print(f"{len(rows)} rows, {lost} of them not kept; {time.monotonic() - start:.0f} s")
-    return 1 if lost else 0
+    return 1 if lost or not whole else 0
 
 
 if __name__ == "__main__":
