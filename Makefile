@@ -2,7 +2,7 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
-#   make tolerances             what must agree with what, as measured: sums, reports, regressors, long records
+#   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
@@ -86,10 +86,9 @@ test: setup
 soak: setup
 	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
 
-# Each line that the tests print is a row: what, its errors. SELFCAL_DRAWS and SELFCAL_LENGTHS widen the report's.
+# SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup
-	$(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_bank.py tests/py/test_report.py \
-	    tests/py/test_regressors.py tests/py/test_sums.py tests/py/test_long.py tests/py/test_identify.py tests/py/test_math.py -k "not two_rates"
+	@$(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
@@ -201,8 +200,8 @@ $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c
 	    $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
-$(BENCH)/$(1)/image.elf: LEFT_OUT := module app
-$(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float
+$(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
+$(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float more
 $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
 	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
 	    $$(addprefix $$(@D)/objects/,$$(addsuffix .o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model))) -lm -o $$@
@@ -212,6 +211,20 @@ $(eval $(call BENCH_IMAGE,cortex-m4f))
 $(eval $(call BENCH_IMAGE,cortex-m4f-portable))
 $(eval $(call BENCH_IMAGE,cortex-m0))
 $(eval $(call BENCH_IMAGE,cortex-m0-32bit))
+
+# more.c without regressors' code, with it, and with the laws that are sums.
+MORE_plain := -DBENCH_PLAIN
+MORE_regressors :=
+MORE_sums := -DSELFCAL_TERMS_MAX=3
+define BENCH_MORE
+bench-images: $(BENCH)/$(1)/$(2).elf
+$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk tests/bench/image.ld
+	@rm -rf $$(@D)/$(2) && mkdir -p $$(@D)/$(2)
+	cd $$(@D)/$(2) && $$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -I$(CURDIR)/lib -I$$(CURDIR)/$$(@D), \
+	    $(addprefix $(CURDIR)/,$(wildcard lib/*.c) $(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
+	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
+endef
+$(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))
 
 $(BENCH)/host/O2/bench: HOST := -O2
 $(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma

@@ -55,7 +55,7 @@ static void add_sample(selfcal_t *self, const float sample[], uint32_t live) {
 static selfcal_real_t block_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter) {
     const selfcal_real_t mean = self->sum[axis] / (selfcal_real_t)self->used;
     *scatter = (selfcal_wide_t)r_fmax(r_fma(-self->sum[axis], mean, self->sum_sq[axis]), R(0.0));
-    return (selfcal_real_t)(self->first[axis] - self->origin[axis]) + mean;
+    return (selfcal_real_t)self->first[axis] - (selfcal_real_t)self->origin[axis] + mean;
 }
 
 #endif

@@ -1,8 +1,6 @@
-/* Counts the instructions of the library on a Cortex-M. Prints, for bench.py,
- *   count NAME TICKS PARTS ROUNDS PER   of SysTick, in PARTS measurements (see image_time_t for ROUNDS), for PER units of work
- *   value NAME NUMBER
- * and ends with exit code 0. Every run is the same. */
-#include "image.h"
+/* Counts the instructions of the library on a Cortex-M, prints them as count.h says, and ends with exit code 0. Every run is the
+ * same. */
+#include "count.h"
 #include "internal.h"
 #include "paper_float.h"
 #include "record.h"
@@ -21,59 +19,6 @@ static selfcal_t bank;
 static selfcal_work_t work;
 static selfcal_report_t report;
 static selfcal_telemetry_t telemetry;
-
-/* ------------------------------------------------------------------------------------------------------------ printing */
-
-/* Some measurements together. */
-typedef struct {
-    uint64_t ticks;
-    uint32_t rounds, parts;
-} taken_t;
-
-static void print_name(const char *kind, const char *name) {
-    image_print(kind);
-    image_print(" ");
-    image_print(name);
-    image_print(" ");
-}
-
-static void print_value(const char *name, uint64_t number) {
-    print_name("value", name);
-    image_print_number(number);
-    image_print("\n");
-}
-
-static void print_count(const char *name, taken_t taken, uint64_t per) {
-    print_name("count", name);
-    image_print_number(taken.ticks);
-    image_print(" ");
-    image_print_number(taken.parts);
-    image_print(" ");
-    image_print_number(taken.rounds);
-    image_print(" ");
-    image_print_number(per);
-    image_print("\n");
-}
-
-static taken_t since(image_time_t start) {
-    const image_time_t now = image_now();
-    const taken_t taken = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
-    return taken;
-}
-
-static void add(taken_t *sum, taken_t part) {
-    sum->ticks += part.ticks;
-    sum->rounds += part.rounds;
-    sum->parts += part.parts;
-}
-
-static void require(bool holds, const char *what) {
-    if (!holds) {
-        print_name("failed", what);
-        image_print("\n");
-        image_exit(2U);
-    }
-}
 
 /* ------------------------------------------------------------------------------------------------------------ measures */
 
@@ -95,18 +40,17 @@ static void push_window(unsigned samples) {
 
 static void init(const selfcal_model_t *which) {
     record_init(&record);
-    require(selfcal_init(&bank, which, memory, sizeof memory) == SELFCAL_OK, "init");
+    count_require(selfcal_init(&bank, which, memory, sizeof memory) == SELFCAL_OK, "init");
 }
 
 static void measure_clock(void) {
+    count_print_empty();
     image_time_t start = image_now();
-    print_count("clock.empty", since(start), 1U);
-    start = image_now();
     image_known_loop(1000U);
-    print_count("clock.loop_1000", since(start), 1U);
+    count_print("clock.loop_1000", count_since(start), 1U);
     start = image_now();
     image_known_loop(2001000U);
-    print_count("clock.loop_2001000", since(start), 1U);
+    count_print("clock.loop_2001000", count_since(start), 1U);
 }
 
 /* The averager alone: one block of the default model. */
@@ -119,18 +63,18 @@ static void measure_push(void) {
         make_window();
         const image_time_t start = image_now();
         push_window(samples);
-        add(&taken, since(start));
+        count_add(&taken, count_since(start));
         left -= samples;
     }
-    require(selfcal_count(&bank) == 1U, "one block");
-    print_count("push", taken, selfcal_model.block);
+    count_require(selfcal_count(&bank) == 1U, "one block");
+    count_print("push", taken, selfcal_model.block);
 }
 
 static void measure_window(const char *name) {
     make_window();
     const image_time_t start = image_now();
     push_window(WINDOW);
-    print_count(name, since(start), (uint64_t)WINDOW * SELFCAL_MODEL_NODES * AXES);
+    count_print(name, count_since(start), (uint64_t)WINDOW * SELFCAL_MODEL_NODES * AXES);
 }
 
 /* A batch without the averager: gains, kernels and long sums, from the last sample that fills it. */
@@ -149,11 +93,11 @@ static taken_t run_one_batch(void) {
         selfcal_bank_sample(&bank, y, 1.0F);
     }
     (void)selfcal_bank_run(&bank, SELFCAL_MODEL_NODES);
-    return since(start);
+    return count_since(start);
 }
 
 static void measure_kernels(void) {
-    print_count("bank.steady.alone", run_one_batch(), (uint64_t)SELFCAL_BATCH * SELFCAL_MODEL_NODES * AXES);
+    count_print("bank.steady.alone", run_one_batch(), (uint64_t)SELFCAL_BATCH * SELFCAL_MODEL_NODES * AXES);
 }
 
 /* The dearest of the next pushes. */
@@ -163,10 +107,10 @@ static void print_worst_push(const char *name, unsigned samples) {
     for (unsigned i = 0; i < samples; i++) {
         const image_time_t start = image_now();
         (void)selfcal_push(&bank, window[i]);
-        const taken_t taken = since(start);
+        const taken_t taken = count_since(start);
         worst = taken.ticks > worst.ticks ? taken : worst;
     }
-    print_count(name, worst, 1U);
+    count_print(name, worst, 1U);
 }
 
 /* At 819.2 Hz averaged to 1 Hz, where the nodes have time: from the first sample over the batch that places the nodes. */
@@ -177,10 +121,10 @@ static void measure_first_push(void) {
     for (unsigned i = 0; i < (SELFCAL_BATCH + 1U) * selfcal_model.block; i++) {
         const image_time_t start = image_now();
         (void)selfcal_push(&bank, window[i % WINDOW]);
-        const taken_t taken = since(start);
+        const taken_t taken = count_since(start);
         worst = taken.ticks > worst.ticks ? taken : worst;
     }
-    print_count("push.worst", worst, 1U);
+    count_print("push.worst", worst, 1U);
 }
 
 static void measure_steady(void) {
@@ -188,7 +132,7 @@ static void measure_steady(void) {
     const selfcal_model_t fast = record_narrow_model(true, axis);
     init(&fast);
     while (record_settled(&bank) < SELFCAL_MODEL_NODES) {
-        require(selfcal_count(&bank) < 5000U, "every filter settles");
+        count_require(selfcal_count(&bank) < 5000U, "every filter settles");
         make_window();
         push_window(WINDOW);
     }
@@ -200,7 +144,7 @@ static void measure_steady(void) {
     (void)selfcal_skip(&bank, 10U);
     const image_time_t start = image_now();
     (void)selfcal_node(&bank, 0U, 0U, &view); /* runs the gap; the view itself is small beside it */
-    print_count("bank.gap", since(start), 1U);
+    count_print("bank.gap", count_since(start), 1U);
 }
 
 static void measure_varying(void) {
@@ -211,7 +155,7 @@ static void measure_varying(void) {
     make_window();
     push_window(WINDOW - 2U * SELFCAL_BATCH);
     measure_window("bank.varying");
-    require(record_settled(&bank) == 1U, "all filters but the constant one vary");
+    count_require(record_settled(&bank) == 1U, "all filters but the constant one vary");
 }
 
 /* An hour at 1 Hz under the default priors. */
@@ -223,10 +167,10 @@ static void measure_hour(void) {
         const unsigned left = HOUR - selfcal_count(&bank);
         const image_time_t start = image_now();
         push_window(left < WINDOW ? left : WINDOW);
-        add(&hour, since(start));
+        count_add(&hour, count_since(start));
     }
-    print_count("bank.hour", hour, (uint64_t)HOUR * SELFCAL_MODEL_NODES * AXES);
-    print_value("bank.hour.settled", record_settled(&bank));
+    count_print("bank.hour", hour, (uint64_t)HOUR * SELFCAL_MODEL_NODES * AXES);
+    count_print_value("bank.hour.settled", record_settled(&bank));
 }
 
 static void measure_report(void) {
@@ -253,33 +197,33 @@ static void measure_report(void) {
     taken_t sum[STAGES] = {{0, 0, 0}}, worst[STAGES] = {{0, 0, 0}};
     unsigned steps[STAGES] = {0};
     image_time_t start = image_now();
-    require(selfcal_report_begin(&work, &bank, 0U, &report) == SELFCAL_OK, "report begins");
-    taken_t total = since(start);
+    count_require(selfcal_report_begin(&work, &bank, 0U, &report) == SELFCAL_OK, "report begins");
+    taken_t total = count_since(start);
     selfcal_status_t status = SELFCAL_BUSY;
     while (status == SELFCAL_BUSY) {
         const unsigned stage = work.stage;
-        require(stage < STAGES, "the stages of posterior.c");
+        count_require(stage < STAGES, "the stages of posterior.c");
         start = image_now();
         status = selfcal_report_step(&work, &report);
-        const taken_t taken = since(start);
+        const taken_t taken = count_since(start);
         steps[stage]++;
-        add(&sum[stage], taken);
-        add(&total, taken);
+        count_add(&sum[stage], taken);
+        count_add(&total, taken);
         if (taken.ticks > worst[stage].ticks) {
             worst[stage] = taken;
         }
     }
-    require(status == SELFCAL_OK, "report ends");
-    print_count("report", total, 1U);
+    count_require(status == SELFCAL_OK, "report ends");
+    count_print("report", total, 1U);
     for (unsigned stage = 0; stage < STAGES; stage++) {
-        print_count(stage_name[stage][0], sum[stage], 1U);
-        print_count(stage_name[stage][1], worst[stage], 1U);
-        print_value(stage_name[stage][2], steps[stage]);
+        count_print(stage_name[stage][0], sum[stage], 1U);
+        count_print(stage_name[stage][1], worst[stage], 1U);
+        count_print_value(stage_name[stage][2], steps[stage]);
     }
 }
 
 static void measure_telemetry(void) {
-    require(selfcal_telemetry_init(&telemetry, &selfcal_model, selfcal_model_axis_name) == SELFCAL_OK, "telemetry");
+    count_require(selfcal_telemetry_init(&telemetry, &selfcal_model, selfcal_model_axis_name) == SELFCAL_OK, "telemetry");
     const image_time_t start = image_now();
     (void)selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank), HOUR * 1000U);
     unsigned frames = 0;
@@ -287,7 +231,7 @@ static void measure_telemetry(void) {
     while (selfcal_telemetry_next(&telemetry, &frame)) {
         frames++;
     }
-    print_count("telemetry", since(start), frames);
+    count_print("telemetry", count_since(start), frames);
 }
 
 #ifdef __ARM_FP
@@ -333,11 +277,12 @@ static void measure_paper(void) {
     }
     for (unsigned i = 0; i < PAPER_NODES; i++) {
         selfcal_node_view_t node;
-        require(selfcal_node(&bank, 0U, paper_node(i), &node) == SELFCAL_OK, "node");
+        count_require(selfcal_node(&bank, 0U, paper_node(i), &node) == SELFCAL_OK, "node");
         for (unsigned k = 0; k < PAPER_SIGMAS; k++) {
             const unsigned j = i * PAPER_SIGMAS + k;
             paper_init(&paper[j], &node, paper_sigma(k));
-            require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k), &ln_likelihood[j]) == SELFCAL_OK, "likelihood");
+            count_require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k), &ln_likelihood[j]) == SELFCAL_OK,
+                          "likelihood");
         }
     }
     record_init(&record);
@@ -347,9 +292,9 @@ static void measure_paper(void) {
         record_next(&record, sample);
         const image_time_t start = image_now();
         paper_sample(paper, PAPER_FILTERS, sample[0]);
-        add(&taken, since(start));
+        count_add(&taken, count_since(start));
     }
-    print_count("paper", taken, (uint64_t)PAPER_SAMPLES * PAPER_FILTERS);
+    count_print("paper", taken, (uint64_t)PAPER_SAMPLES * PAPER_FILTERS);
 
     selfcal_wide_t highest = (selfcal_wide_t)-INFINITY, sum = 0.0, worst = 0.0, heaviest = 0.0;
     for (unsigned j = 0; j < PAPER_FILTERS; j++) {
@@ -363,20 +308,20 @@ static void measure_paper(void) {
         heaviest = fmax(heaviest, weight);
         worst = fmax(worst, fabs(weight - exp((selfcal_wide_t)paper[j].ln_weight)));
     }
-    print_value("paper.worst_weight_difference_1e9", (uint64_t)(1e9 * worst));
-    print_value("paper.heaviest_weight_1e9", (uint64_t)(1e9 * heaviest));
+    count_print_value("paper.worst_weight_difference_1e9", (uint64_t)(1e9 * worst));
+    count_print_value("paper.heaviest_weight_1e9", (uint64_t)(1e9 * heaviest));
 }
 
 #endif
 
 static void measure_sizes(void) {
-    print_value("ram.selfcal_t", sizeof bank);
-    print_value("ram.selfcal_work_t", sizeof work);
-    print_value("ram.selfcal_report_t", sizeof report);
-    print_value("ram.selfcal_telemetry_t", sizeof telemetry);
-    print_value("ram.SELFCAL_SIZE", SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES));
-    print_value("nodes", SELFCAL_MODEL_NODES);
-    print_value("block", selfcal_model.block);
+    count_print_value("ram.selfcal_t", sizeof bank);
+    count_print_value("ram.selfcal_work_t", sizeof work);
+    count_print_value("ram.selfcal_report_t", sizeof report);
+    count_print_value("ram.selfcal_telemetry_t", sizeof telemetry);
+    count_print_value("ram.SELFCAL_SIZE", SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES));
+    count_print_value("nodes", SELFCAL_MODEL_NODES);
+    count_print_value("block", selfcal_model.block);
 }
 
 int main(void) {

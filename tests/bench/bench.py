@@ -175,12 +175,23 @@ def measure(target: str) -> Figures:
                 f"more than {WEIGHT_TOLERANCE:g} of the heaviest, {heaviest}e-9"
             )
     if MACHINES[target].image:
+        counts |= measure_more(target)
         try:
             image, _ = image_sizes.measure(MACHINES[target].image)
         except image_sizes.FirmwareError as error:
             raise BenchError(f"{MACHINES[target].image}: {error}") from error
         sizes |= {f"firmware.{kind}": size for kind, size in image.items()}
     return {"counts": counts, "sizes": text_sizes(target) | sizes, "facts": facts}
+
+
+def measure_more(target: str) -> dict[str, list[int]]:
+    """Regressors and sums (more.c). Raises BenchError if a model without regressors pays for their code."""
+    plain, regressors, sums = (run_image(target, image)[0] for image in ("plain", "regressors", "sums"))
+    before, after = plain["without"][0], regressors.pop("without")[0]
+    if abs(after - before) > 1:  # the rounding of the clock
+        raise BenchError(f"{target}: {before} instructions without regressors, {after} with their code linked")
+    found = {f"regressors.{name}": count for name, count in regressors.items()}
+    return plain | found | {f"sums.{name}": count for name, count in sums.items()}
 
 
 def measure_host() -> dict[str, dict[str, float]]:
@@ -253,6 +264,15 @@ def table(bench: Bench) -> str:
     per("bank, every filter but one varying, per (node, sample, axis)", "bank.varying", ".2f")
     per("bank, first 3600 samples, per (node, sample, axis)", "bank.hour", ".2f")
     number("filters settled after them", "facts", "bank.hour.settled")
+    per("… all settled, regressors' code linked and not used", "without", ".2f")
+    per("… and with `SELFCAL_TERMS_MAX` of 3", "sums.without", ".2f")
+    for columns in (0, 1, 3, 6):
+        title = f"random walk alone, {columns or 'no'} regressor{'s' if columns != 1 else ''}, per (node, sample, axis)"
+        per(f"{title}: settled", f"regressors.p{columns}.steady", ".1f")
+        per("… varying", f"regressors.p{columns}.varying", ".1f")
+    for law in ("flicker", "moving_average", "walk_and_markov"):
+        per(f"{law} alone, per (node, sample, axis): settled", f"sums.{law}.steady", ".1f")
+        per("… varying", f"sums.{law}.varying", ".1f")
     shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}
     for target, figures in targets.items():
         seconds = RATE_HZ / MACHINES[target].systick_hz

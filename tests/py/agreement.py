@@ -19,6 +19,7 @@ from selfcal import _library32, _reference
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import textbook_node
 from selfcal.model import DEFAULT, LAWS, PLACES, SUMS, Model, Regressor
+from selfcal.result import AxisResult
 from selfcal.tables import Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
@@ -97,17 +98,18 @@ def tables_of(
     return replace(made, axes=(one,), hypotheses=hypotheses, regressors=made.regressors[:columns])
 
 
+def on_nodes(tables: Tables, alone: int, pair: tuple[int, int]) -> Tables:
+    """The same on other nodes: of rho alone, and of [rho, alpha]."""
+    hypotheses = []
+    for h in tables.hypotheses:
+        rho = None if h.rho is None else make_grid(alone if h.alpha is None else pair[0])
+        hypotheses.append(replace(h, rho=rho, alpha=None if h.alpha is None else make_grid(pair[1])))
+    return replace(tables, hypotheses=tuple(hypotheses))
+
+
 def dense(tables: Tables) -> Tables:
     """The same on so many nodes that theirs no longer counts; for Bank(dense=True)."""
-    hypotheses = (
-        h
-        if h.rho is None
-        else replace(h, rho=make_grid(DENSE))
-        if h.alpha is None
-        else replace(h, rho=make_grid(DENSE_PAIR[0]), alpha=make_grid(DENSE_PAIR[1]))
-        for h in tables.hypotheses
-    )
-    return replace(tables, hypotheses=tuple(hypotheses))
+    return on_nodes(tables, DENSE, DENSE_PAIR)
 
 
 def a_bank(tables: Tables, build: str) -> Bank:
@@ -315,13 +317,14 @@ def report_differences(y: Floats, tables: Tables) -> tuple[Floats, bool]:
         push(bank, y)
     found, exact = (bank.report(0) for bank in banks)
     evidence, _, mean, sd = worst_difference(found, exact)
-    entries = zip(tables.hypotheses, banks[0].raw.report(0)["hypotheses"], strict=True)
-    flagged = any(
-        entry["parameters"][PLACES["N"]][-1] & _library32.OFF_GRID
-        for h, entry in entries
-        if exact.probability[h.name] >= 0.01
-    )
-    return np.array([evidence, mean, sd]), flagged
+    return np.array([evidence, mean, sd]), off_grid(banks[0], 0, exact)
+
+
+def off_grid(bank: Bank, axis: int, exact: AxisResult) -> bool:
+    """Whether a report says itself that its grid does not bear the record, of a law that is not ruled out."""
+    entries = zip(bank.tables.hypotheses, bank.raw.report(axis)["hypotheses"], strict=True)
+    flags = [entry["parameters"][PLACES["N"]][-1] for h, entry in entries if exact.probability[h.name] >= 0.01]
+    return any(flag & _library32.OFF_GRID for flag in flags)
 
 
 # ----------------------------------------------------------------------------------------------------------- forgetting

@@ -2,7 +2,7 @@
 
 The functions are evaluated by the C library of this machine and by newlib's in emulated images of either core, and
 judged against long double. That the bound is enough, test_reports_stand_such_errors shows: the library, built with
-functions that err by twice as much, gives the same reports. `make tolerances` prints both.
+functions that err by twice as much, gives the same reports. With -s both are printed.
 SELFCAL_ARGUMENTS=1e6 sets the arguments of each function and sign (`tests/accuracy/functions.c`).
 """
 

@@ -1,0 +1,151 @@
+/* Counts per (node, sample, axis) what regressors cost, or with SELFCAL_TERMS_MAX of 3 the laws that are sums; and the default
+ * model, which has neither, in such an image and in one without their code (-DBENCH_PLAIN). Prints as count.h says. */
+#include "count.h"
+#include "internal.h"
+#include "record.h"
+
+#define AXES SELFCAL_MODEL_AXES
+/* Bank samples counted at a time: whole batches. Of sums fewer, since they take an emulated Cortex-M0 a while. */
+#define WINDOW (SELFCAL_TERMS_MAX > 1 ? 32U : 64U)
+/* Bank samples within which the filters of fast drifts settle. */
+#define SETTLED_BY 5000U
+#if SELFCAL_TERMS_MAX > 1
+#define SUM_GRID 6U /* nodes a dimension; none costs more or less than another */
+#define BYTES (SELFCAL_SIZE(SUM_GRID * SUM_GRID, AXES) + SELFCAL_TERMS_SIZE(SUM_GRID * SUM_GRID, AXES, 0U))
+#elif defined(BENCH_PLAIN)
+#define BYTES 0U
+#else
+#define MOST_COLUMNS SELFCAL_REGRESSORS_MAX
+#define WALK_NODES 20U /* of the random walk, at most */
+#define BYTES (SELFCAL_SIZE(WALK_NODES, AXES) + SELFCAL_REGRESSORS_SIZE(WALK_NODES, AXES, MOST_COLUMNS))
+#endif
+#define PLAIN_BYTES SELFCAL_SIZE(SELFCAL_MODEL_NODES, AXES)
+
+static uint64_t memory[((BYTES > PLAIN_BYTES ? BYTES : PLAIN_BYTES) + 7U) / 8U];
+static selfcal_t bank;
+static record_t record;
+static float window[WINDOW][AXES];
+static selfcal_axis_t axis[AXES];
+
+/* Pushes a window of new samples, with as many values of regressors as the model has. */
+static taken_t push_window(void) {
+    static float z[WINDOW][SELFCAL_REGRESSORS_MAX];
+    const unsigned columns = bank.model->regressors != NULL ? bank.model->regressors->count : 0U;
+    for (unsigned i = 0; i < WINDOW; i++) {
+        record_next(&record, window[i]);
+        for (unsigned k = 0; k < columns; k++) {
+            z[i][k] = window[i][k] + (float)(k + 1U);
+        }
+    }
+    const image_time_t start = image_now();
+    for (unsigned i = 0; i < WINDOW; i++) {
+        (void)selfcal_push_with(&bank, window[i], z[i]);
+    }
+    return count_since(start);
+}
+
+/* Node samples with gains that rest. Filters over readings alone go on to level, where u rests too. */
+static uint64_t steady_samples(void) {
+    uint64_t sum = 0;
+    for (unsigned j = 0; j < bank.model->nodes; j++) {
+        sum += bank.node[j].steady;
+    }
+    return sum;
+}
+
+/* One window of a new bank over `model`: with fast drifts once all filters have settled, with slow ones near its beginning. */
+static void measure(const char *name, const selfcal_model_t *model, bool fast, bool levels) {
+    record_init(&record);
+    count_require(selfcal_init(&bank, model, memory, sizeof memory) == SELFCAL_OK, "init");
+    (void)push_window();
+    const uint64_t whole = (uint64_t)WINDOW * model->nodes;
+    for (;;) {
+        const bool level = !levels || record_settled(&bank) == model->nodes;
+        const uint64_t before = steady_samples();
+        const taken_t taken = push_window();
+        const uint64_t steady = steady_samples() - before;
+        if (!fast || (level && steady == whole)) {
+            count_require(fast || steady < whole, "filters vary");
+            count_print(name, taken, whole * AXES);
+            return;
+        }
+        count_require(selfcal_count(&bank) <= SETTLED_BY, "every filter settles");
+    }
+}
+
+#if SELFCAL_TERMS_MAX > 1
+
+static void measure_sum(const char *name, selfcal_law_t law, bool fast) {
+    static const selfcal_real_t fit[SUM_GRID * SUM_GRID] = {0}; /* for reports, which there are none of */
+    static const selfcal_grid_t grid = {SUM_GRID, fit};
+    static const selfcal_prior_t ratio = {-1.0F, 1.0F, false};
+    selfcal_prior_t prior[AXES][SELFCAL_PARAMETERS];
+    selfcal_model_t model = record_narrow_model(fast, axis);
+    for (unsigned a = 0; a < AXES; a++) {
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            prior[a][p] = law != SELFCAL_FLICKER && p == SELFCAL_SPECTRAL_RATIO ? ratio : axis[a].prior[p];
+        }
+    }
+    /* a correlation time of 100 s */
+    const selfcal_hypothesis_t hypothesis = {law, 0.0F, &grid, &grid, &prior[0][0], 100.0F};
+    model.hypothesis = &hypothesis;
+    model.hypotheses = 1;
+    model.nodes = SUM_GRID * SUM_GRID;
+    measure(name, &model, fast, false);
+}
+
+static void measure_all(void) {
+    measure_sum("flicker.steady", SELFCAL_FLICKER, true);
+    measure_sum("flicker.varying", SELFCAL_FLICKER, false);
+    measure_sum("moving_average.steady", SELFCAL_MOVING_AVERAGE, true);
+    measure_sum("moving_average.varying", SELFCAL_MOVING_AVERAGE, false);
+    measure_sum("walk_and_markov.steady", SELFCAL_WALK_AND_MARKOV, true);
+    measure_sum("walk_and_markov.varying", SELFCAL_WALK_AND_MARKOV, false);
+}
+
+#elif defined(BENCH_PLAIN)
+
+static void measure_all(void) {
+}
+
+#else
+
+/* The default model's random walk with so many regressors. */
+static void measure_columns(const char *name, uint8_t columns, bool fast) {
+    float zero[MOST_COLUMNS] = {0.0F}, sd[AXES * MOST_COLUMNS];
+    for (unsigned k = 0; k < AXES * MOST_COLUMNS; k++) {
+        sd[k] = 1.0F;
+    }
+    selfcal_model_t model = record_narrow_model(fast, axis);
+    const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd};
+    model.regressors = columns > 0U ? &regressors : NULL;
+    while (model.hypothesis->law != SELFCAL_RANDOM_WALK) {
+        model.hypothesis++;
+    }
+    model.hypotheses = 1;
+    model.nodes = model.hypothesis->rho->nodes;
+    count_require(model.nodes <= WALK_NODES, "WALK_NODES");
+    measure(name, &model, fast, columns == 0U);
+}
+
+static void measure_all(void) {
+    measure_columns("p0.steady", 0U, true);
+    measure_columns("p0.varying", 0U, false);
+    measure_columns("p1.steady", 1U, true);
+    measure_columns("p1.varying", 1U, false);
+    measure_columns("p3.steady", 3U, true);
+    measure_columns("p3.varying", 3U, false);
+    measure_columns("p6.steady", 6U, true);
+    measure_columns("p6.varying", 6U, false);
+}
+
+#endif
+
+int main(void) {
+    image_start_clock();
+    count_print_empty();
+    const selfcal_model_t fast = record_narrow_model(true, axis);
+    measure("without", &fast, true, true);
+    measure_all();
+    return 0;
+}
