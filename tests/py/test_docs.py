@@ -27,7 +27,8 @@ def test_the_guide_has_the_cost_table_of_the_bench() -> None:
 
 def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
     """As a function's body, with warnings as errors, against the header that `codegen` makes."""
-    programs = re.findall(r"^```c\n(.*?)^```$", (ROOT / "GUIDE.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    guide = (ROOT / "GUIDE.md").read_text(encoding="utf-8")
+    programs = re.findall(r"^```c\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
     program = next(text for text in programs if "selfcal_model.h" in text)
     lines = program.splitlines()
     includes = [line for line in lines if line.startswith("#include")]
