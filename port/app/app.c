@@ -534,15 +534,33 @@ static bool begin_frames(app_t *app)
     return false;
 }
 
+/* Windows so far whose end was dear. */
+static uint32_t dear_windows(const app_t *app)
+{
+#if SELFCAL_MODEL_GATE
+    return app->gate.at_once;
+#else
+    (void)app;
+    return 0;
+#endif
+}
+
 bool app_step(app_t *app)
 {
     /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. On a slow core
      * several come during one slice. */
-    bool busy = app->computing && compute(app);
+    const uint32_t dear = dear_windows(app);
+    bool busy = false;
     for (unsigned taken = 0; taken < SAMPLES_A_TURN && (!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app);
          taken++) {
         busy = true;
     }
+    /* Such a sample and a slice do not add up in one turn; but a report is not put off twice in a row. */
+    app->put_off = dear_windows(app) != dear && !app->put_off;
+    if (app->put_off) {
+        return true;
+    }
+    busy = (app->computing && compute(app)) || busy;
     busy = send_frames(app) || busy;
     if (!app->waiting) {
         busy = begin_frames(app) || (!app->computing && advance(app)) || busy;
