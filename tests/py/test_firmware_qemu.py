@@ -184,6 +184,12 @@ def test_the_json_is_that_of_the_host(core: str, tmp_path: Path) -> None:
             assert abs(probability - host["axes"][axis]["hypotheses"][law]) <= (2e-3 if core == "cortex-m4f" else 1e-2)
 
 
+@pytest.mark.parametrize("core", EMULATED)
+def test_six_axes_at_the_full_rate_fit(core: str) -> None:
+    """The default model as `make firmware` has it."""
+    assert build(Model.load(), 819.2, SIX, core).exists()
+
+
 @pytest.mark.parametrize(
     ("damage", "complaint"),
     [
