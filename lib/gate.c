@@ -309,7 +309,7 @@ static void blind_window(selfcal_gate_t *gate) {
 
 static void judge(selfcal_gate_t *gate) {
     const uint32_t n = gate->used;
-    float mean[SELFCAL_AXES_MAX], scatter[SELFCAL_AXES_MAX], t1 = 0.0F;
+    float mean[SELFCAL_AXES_MAX] = {0.0F}, scatter[SELFCAL_AXES_MAX] = {0.0F}, t1 = 0.0F;
     const selfcal_real_t inv_n = R(1.0) / (selfcal_real_t)n;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         const selfcal_real_t about_first = gate->sum[axis] * inv_n;
