@@ -273,11 +273,11 @@ TIDY := clang-tidy --quiet
 TIDY_ARM := --checks=-performance-no-int-to-ptr
 TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h"))
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
-check-tidy: $(MODEL)/selfcal_model.c
+check-tidy: $(MODEL)/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
 	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16 -DSELFCAL_TERMS_MAX=3)
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
-	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES) -DQEMU_MICROBIT)
+	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT)
 
 # lib/ has no heap, no I/O and no double but selfcal_wide_t. Comments do not count.
 BANNED := (malloc|calloc|realloc|free|alloca|[a-z]*printf|puts|putchar|fopen|exit|abort)[[:space:]]*\(

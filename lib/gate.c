@@ -22,50 +22,83 @@
 
 /* ln Gamma(a), a > 0, to 1e-10: Stirling's series above 8. lgamma() has a global, signgam. */
 static selfcal_wide_t ln_gamma(selfcal_wide_t a) {
-    selfcal_wide_t result = 0.5 * SELFCAL_LN_2PI;
+    selfcal_wide_t below = 1.0; /* Gamma(a + k)/Gamma(a) = a (a + 1) .. (a + k - 1) */
     while (a < 8.0) {
-        result -= log(a);
+        below *= a;
         a += 1.0;
     }
     const selfcal_wide_t sq = 1.0 / (a * a);
-    return result + (a - 0.5) * log(a) - a + (1.0 / 12.0 - sq * (1.0 / 360.0 - sq * (1.0 / 1260.0 - sq / 1680.0))) / a;
+    return 0.5 * SELFCAL_LN_2PI - log(below) + (a - 0.5) * log(a) - a +
+           (1.0 / 12.0 - sq * (1.0 / 360.0 - sq * (1.0 / 1260.0 - sq / 1680.0))) / a;
 }
 
-/* h in Q(a, x) = e^-x x^a / Gamma(a) h, the upper tail of the gamma distribution, x well above a: Legendre's continued fraction
- * (Abramowitz & Stegun 6.5.31, even part) from its first term on (modified Lentz). */
-static selfcal_wide_t tail_fraction(selfcal_wide_t a, selfcal_wide_t x) {
-    selfcal_wide_t b = x + 1.0 - a, c = 1e300, d = 1.0 / b, h = d;
-    for (int i = 1; i < 1000; i++) {
-        const selfcal_wide_t an = -(selfcal_wide_t)i * ((selfcal_wide_t)i - a);
-        b += 2.0;
-        d = 1.0 / (an * d + b);
-        c = b + an / c;
-        h *= d * c;
-        if (fabs(d * c - 1.0) < 1e-12) {
-            break;
-        }
-    }
-    return h;
+/* What a chi-square variable of `nu` degrees of freedom exceeds with the probability p <= 0.1, in steps: Newton's iteration on the
+ * ln of the upper tail of the gamma distribution
+ *     Q(a, x) = e^-x x^a / Gamma(a) h,   a = nu/2,   x half the threshold, above a,   slope of ln Q: -1/(x h),
+ * from Wilson & Hilferty's cube root of a normal variable; h by Legendre's continued fraction (Abramowitz & Stegun 6.5.31, even
+ * part) from its first term on (modified Lentz). To 1e-9 of the threshold: its tolerances are what float keeps, with a margin. */
+enum { AT_START, AT_GAMMA, AT_FRACTION, AT_NEWTON, AT_END };
+enum { TERMS_A_STEP = 4, TERMS_MOST = 1000, NEWTON_MOST = 20 };
+
+static void begin_quantile(selfcal_quantile_t *q, selfcal_wide_t nu, selfcal_wide_t p) {
+    q->a = 0.5 * nu;
+    q->ln_p = log(p);
+    q->rounds = 0;
+    q->at = AT_START;
 }
 
-/* What a chi-square variable of `nu` degrees of freedom exceeds with the probability p <= 0.1: Newton's iteration on ln Q, whose
- * slope is -1/(x h), from Wilson & Hilferty's cube root of a normal variable. */
-static selfcal_wide_t chi_square_above(selfcal_wide_t nu, selfcal_wide_t p) {
-    const selfcal_wide_t a = 0.5 * nu, ln_p = log(p);
-    /* Normal quantile to 4.5e-4 (Abramowitz & Stegun 26.2.23). */
-    const selfcal_wide_t t = sqrt(-2.0 * ln_p);
-    const selfcal_wide_t z = t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)));
-    const selfcal_wide_t root = 1.0 - 2.0 / (9.0 * nu) + z * sqrt(2.0 / (9.0 * nu));
-    selfcal_wide_t x = fmax(a * root * root * root, a + 0.5);
-    for (int i = 0; i < 20; i++) {
-        const selfcal_wide_t h = tail_fraction(a, x);
-        const selfcal_wide_t step = (a * log(x) - x - ln_gamma(a) + log(h) - ln_p) * x * h;
-        x = fmax(x + step, a + 0.5 * (x - a));
-        if (fabs(step) < 1e-9 * x) {
-            break;
-        }
+static void begin_fraction(selfcal_quantile_t *q) {
+    q->b = q->x + 1.0 - q->a;
+    q->c = 1e300;
+    q->d = 1.0 / q->b;
+    q->h = q->d;
+    q->term = 1;
+    q->at = AT_FRACTION;
+}
+
+/* One step; false: it was the last one. */
+static bool step_quantile(selfcal_quantile_t *q) {
+    switch (q->at) {
+    case AT_START: {
+        /* Normal quantile to 4.5e-4 (Abramowitz & Stegun 26.2.23). */
+        const selfcal_wide_t t = sqrt(-2.0 * q->ln_p), width = 1.0 / (9.0 * q->a);
+        const selfcal_wide_t z = t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)));
+        const selfcal_wide_t root = 1.0 - width + z * sqrt(width);
+        q->x = fmax(q->a * root * root * root, q->a + 0.5);
+        q->at = AT_GAMMA;
+        break;
     }
-    return 2.0 * x;
+    case AT_GAMMA:
+        q->ln_gamma = ln_gamma(q->a);
+        begin_fraction(q);
+        break;
+    case AT_FRACTION:
+        for (int i = 0; i < TERMS_A_STEP && q->at == AT_FRACTION; i++) {
+            const selfcal_wide_t an = -(selfcal_wide_t)q->term * ((selfcal_wide_t)q->term - q->a);
+            q->b += 2.0;
+            q->d = 1.0 / (an * q->d + q->b);
+            q->c = q->b + an / q->c;
+            q->h *= q->d * q->c;
+            q->term++;
+            if (fabs(q->d * q->c - 1.0) < 1e-9 || q->term == TERMS_MOST) {
+                q->at = AT_NEWTON;
+            }
+        }
+        break;
+    case AT_NEWTON: {
+        const selfcal_wide_t step = (q->a * log(q->x) - q->x - q->ln_gamma + log(q->h) - q->ln_p) * q->x * q->h;
+        q->x = fmax(q->x + step, q->a + 0.5 * (q->x - q->a));
+        q->rounds++;
+        if (fabs(step) < 1e-5 * q->x || q->rounds == NEWTON_MOST) { /* the next one would be the square of it */
+            q->at = AT_END;
+        } else {
+            begin_fraction(q);
+        }
+        break;
+    }
+    default: break;
+    }
+    return q->at != AT_END;
 }
 
 /* An axis of infinite sigma is left out. */
@@ -73,26 +106,95 @@ static bool present(const selfcal_gate_t *gate, uint8_t axis) {
     return isfinite(gate->axis[axis].sigma);
 }
 
-/* Thresholds for windows of `n` samples; O(sqrt(axes * n)) in selfcal_wide_t, so kept until n or the noise changes. */
-static void set_thresholds(selfcal_gate_t *gate, uint32_t n) {
-    const selfcal_wide_t p = 0.5 * (selfcal_wide_t)gate->config.false_alarm;
-    selfcal_wide_t axes = 0.0, rates = 0.0, spread = 0.0;
+/* Thresholds are worked out a step with each sample, from the start and from a change of noise on, those of T1 for whole windows;
+ * they depend on the noise by `spread` alone, those of T2 on the axes present. */
+enum { THRESHOLDS_KNOWN, WORK_BEGIN, WORK_SHAKEN, WORK_MOVED, WORK_RATE_MOVED };
+
+/* T1 of a window of `n` samples: degrees of freedom, and by what to multiply the chi-square threshold. */
+static selfcal_wide_t freedom(const selfcal_gate_t *gate, uint32_t n, selfcal_wide_t *scale) {
+    selfcal_wide_t axes = 0.0, spread = 0.0;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         if (present(gate, axis)) {
             axes += 1.0;
-            rates += gate->config.is_rate[axis] ? 1.0 : 0.0;
             spread += (selfcal_wide_t)gate->axis[axis].spread;
         }
     }
-    gate->threshold_n = n;
-    /* Without an axis there is no rest to be seen. */
-    gate->shaken_above = gate->moved_above = gate->rate_moved_above = axes > 0.0 ? INFINITY : -1.0F;
-    if (p > 0.0 && axes > 0.0) {
-        const selfcal_wide_t dof = axes * (selfcal_wide_t)(n - 1U);
-        const selfcal_wide_t nu = axes * dof / spread;
-        gate->shaken_above = (float)(dof / nu * chi_square_above(nu, p));
-        gate->moved_above = (float)chi_square_above(axes, p);
-        gate->rate_moved_above = rates > 0.0 ? (float)chi_square_above(rates, p) : INFINITY;
+    *scale = spread / axes;
+    return axes * axes * (selfcal_wide_t)(n - 1U) / spread;
+}
+
+static uint8_t count_present(const selfcal_gate_t *gate, bool rates) {
+    uint8_t count = 0;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        count = (uint8_t)(count + (present(gate, axis) && (gate->config.is_rate[axis] || !rates)));
+    }
+    return count;
+}
+
+static void begin_thresholds(selfcal_gate_t *gate) {
+    const uint8_t axes = count_present(gate, false);
+    if (axes == 0U || gate->config.false_alarm == 0.0F) {
+        /* Without an axis there is no rest to be seen. */
+        gate->whole_above = gate->moved_above = gate->rate_moved_above = axes > 0U ? INFINITY : -1.0F;
+        gate->judged_axes = gate->judged_rates = 0;
+        gate->work = THRESHOLDS_KNOWN;
+        return;
+    }
+    selfcal_wide_t scale;
+    begin_quantile(&gate->quantile, freedom(gate, gate->config.window, &scale), 0.5 * (selfcal_wide_t)gate->config.false_alarm);
+    gate->work = WORK_SHAKEN;
+}
+
+/* Those of T2 only if their axes are others than before. */
+static void step_thresholds(selfcal_gate_t *gate) {
+    if (gate->work == WORK_BEGIN) {
+        begin_thresholds(gate);
+        return;
+    }
+    if (step_quantile(&gate->quantile)) {
+        return;
+    }
+    const selfcal_wide_t p = 0.5 * (selfcal_wide_t)gate->config.false_alarm, found = 2.0 * gate->quantile.x;
+    const uint8_t axes = count_present(gate, false), rates = count_present(gate, true);
+    if (gate->work == WORK_SHAKEN) {
+        selfcal_wide_t scale;
+        (void)freedom(gate, gate->config.window, &scale);
+        gate->whole_above = (float)(scale * found);
+    } else if (gate->work == WORK_MOVED) {
+        gate->moved_above = (float)found;
+        gate->judged_axes = axes;
+    } else {
+        gate->rate_moved_above = (float)found;
+        gate->judged_rates = rates;
+    }
+    if (gate->judged_axes != axes) {
+        begin_quantile(&gate->quantile, (selfcal_wide_t)axes, p);
+        gate->work = WORK_MOVED;
+    } else if (gate->judged_rates != rates && rates > 0U) {
+        begin_quantile(&gate->quantile, (selfcal_wide_t)rates, p);
+        gate->work = WORK_RATE_MOVED;
+    } else {
+        gate->rate_moved_above = rates > 0U ? gate->rate_moved_above : INFINITY;
+        gate->judged_rates = rates;
+        gate->work = THRESHOLDS_KNOWN;
+    }
+}
+
+/* Those for a window of `n` samples. What is not known yet is worked out at once: T1's for a window with missing samples, and all where
+ * windows are shorter than the steps are many. */
+static void set_thresholds(selfcal_gate_t *gate, uint32_t n) {
+    gate->at_once += gate->work != THRESHOLDS_KNOWN || n != gate->config.window;
+    while (gate->work != THRESHOLDS_KNOWN) {
+        step_thresholds(gate);
+    }
+    gate->shaken_above = gate->whole_above;
+    if (n != gate->config.window && gate->judged_axes > 0U) {
+        selfcal_wide_t scale;
+        const selfcal_wide_t nu = freedom(gate, n, &scale);
+        begin_quantile(&gate->quantile, nu, 0.5 * (selfcal_wide_t)gate->config.false_alarm);
+        while (step_quantile(&gate->quantile)) {
+        }
+        gate->shaken_above = (float)(scale * 2.0 * gate->quantile.x);
     }
 }
 
@@ -119,6 +221,7 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
         const selfcal_gate_noise_t white = {config->sigma[axis], 1.0F, 1.0F, 1.0F};
         gate->axis[axis] = white;
     }
+    gate->work = WORK_BEGIN;
     start_window(gate);
     return SELFCAL_OK;
 }
@@ -130,7 +233,7 @@ selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const se
         return SELFCAL_BAD_ARGUMENT;
     }
     gate->axis[axis] = *noise;
-    gate->threshold_n = 0;
+    gate->work = WORK_BEGIN;
     return SELFCAL_OK;
 }
 
@@ -206,7 +309,7 @@ static void blind_window(selfcal_gate_t *gate) {
 
 static void judge(selfcal_gate_t *gate) {
     const uint32_t n = gate->used;
-    float mean[SELFCAL_AXES_MAX], scatter[SELFCAL_AXES_MAX], t1 = 0.0F;
+    float mean[SELFCAL_AXES_MAX] = {0.0F}, scatter[SELFCAL_AXES_MAX] = {0.0F}, t1 = 0.0F;
     const selfcal_real_t inv_n = R(1.0) / (selfcal_real_t)n;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         const selfcal_real_t about_first = gate->sum[axis] * inv_n;
@@ -216,9 +319,7 @@ static void judge(selfcal_gate_t *gate) {
             t1 += scatter[axis] / gate->axis[axis].sigma / gate->axis[axis].sigma / gate->axis[axis].within;
         }
     }
-    if (gate->threshold_n != n) {
-        set_thresholds(gate, n);
-    }
+    set_thresholds(gate, n);
     const bool shaken = !(t1 <= gate->shaken_above);
     gate->t1 = t1;
     gate->counters.shaken += shaken;
@@ -277,6 +378,9 @@ selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]) {
     SELFCAL_ASSERT(gate != NULL && sample != NULL);
     const uint8_t axes = gate->config.axes;
     bool sound = true;
+    if (gate->work != THRESHOLDS_KNOWN) {
+        step_thresholds(gate);
+    }
     for (uint8_t axis = 0; axis < axes; axis++) {
         sound = sound && (!present(gate, axis) || fabsf(sample[axis]) < SELFCAL_SAMPLE_MAX); /* false for a NaN */
     }

@@ -827,6 +827,14 @@ typedef struct {
     selfcal_real_t gamma;
 } selfcal_level_t;
 
+/* A chi-square threshold under way. Private. */
+typedef struct {
+    selfcal_wide_t a, ln_p, ln_gamma, x; /* half the degrees of freedom, ln of the probability, half the threshold */
+    selfcal_wide_t b, c, d, h;           /* of the continued fraction */
+    uint16_t term;
+    uint8_t rounds, at;
+} selfcal_quantile_t;
+
 /* Private but for reading `state`, `counters`, and the last window's statistics with their thresholds. */
 typedef struct {
     selfcal_gate_config_t config;
@@ -834,8 +842,12 @@ typedef struct {
     selfcal_motion_t state;
     selfcal_gate_counters_t counters;
     float t1, t2;
-    float shaken_above, moved_above, rate_moved_above; /* for windows of threshold_n samples */
-    uint32_t threshold_n;                              /* 0: to be worked out */
+    float shaken_above, moved_above, rate_moved_above;
+    float whole_above;                  /* shaken_above of a window without missing samples */
+    uint8_t work;                       /* which threshold is being worked out; 0: none */
+    uint8_t judged_axes, judged_rates;  /* axes that moved_above is for, gyros that rate_moved_above is for */
+    selfcal_quantile_t quantile;
+    uint32_t at_once;                   /* windows that had to have theirs worked out at their end */
     bool started;
     float origin[SELFCAL_AXES_MAX]; /* the first sample: gravity or a turn-on bias costs no digits */
     /* window in progress */
@@ -860,8 +872,10 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
  *   resting -> moving: one window that scatters too much or is off the level of the rest; a blind window.
  *   moving -> resting: `hold` windows after a first quiet one, all on one level, the gyros' that of the last rest. A gyro that
  *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro.
- * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes); the first window with another count of samples, or after a change of noise,
- * works out its thresholds: O(sqrt(axes * window)) in selfcal_wide_t. */
+ * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes). Thresholds are worked out a step
+ * with each sample, below 10 000 instructions on a Cortex-M4F: up to 60 steps from the start on, 30 from a change of noise on. What is
+ * not known at a window's end is worked out there: all of them where windows are shorter than that, and one, 70 000 instructions,
+ * O(sqrt(axes * window)) in selfcal_wide_t, for a window with missing samples. */
 selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]);
 
 /* `count` samples are missing; windows keep their grid. One with half or more of its samples is judged by those. O(1) + a window's. */

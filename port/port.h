@@ -9,6 +9,11 @@
 
 #include "selfcal.h"
 
+/* Place of an axis of the model among gx gy gz ax ay az, the order of the sensor's channels and of the bits in commands and telemetry;
+ * PORT_AXES: it is none of them. */
+enum { PORT_AXES = 6 };
+unsigned port_axis(const char *name);
+
 typedef enum {
     PORT_SAMPLE, /* one was taken from the queue */
     PORT_EMPTY,  /* none is waiting */
@@ -44,11 +49,11 @@ typedef struct {
     /* The newest saved state that is whole, or the one before it; NULL: there is none. */
     const void *(*stored)(void *context, bool older, size_t *length);
 
-    /* A save: begin, put until all is put, end; false: it has failed and what was saved before stands. May block for 2 s; samples
-     * lost meanwhile are counted by the sensor's driver. */
+    /* A save: begin, put until all is put, end, also after one of the others has failed (then the state is not `whole`); false: it
+     * has failed and what was saved before stands. May block for 2 s; samples lost meanwhile are counted by the sensor's driver. */
     bool (*save_begin)(void *context);
     bool (*save_put)(void *context, const void *bytes, size_t count);
-    bool (*save_end)(void *context);
+    bool (*save_end)(void *context, bool whole);
 
     /* Has the sensor add `wanted` to each axis of the model, as nearly as it can, reads that back, and says in `got` what it adds
      * now; kept through a restart of the sensor. Samples of before are given no more. False: it cannot, and adds what it did. */

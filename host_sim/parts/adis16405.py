@@ -175,6 +175,18 @@ class Adis16405:
             self.answer = self._read(address & ~1)
         return answer
 
+    def shifting_out(self) -> int:
+        """What it will answer the next frame with: for a master that takes a frame in two halves."""
+        if not self.listening or not self.selected:
+            return 0xFFFF if self.floating_high else 0x0000
+        if self.burst_at is None or self.burst_at >= len(OUTPUTS):
+            return self.answer
+        return self._word(OUTPUTS[self.burst_at])
+
+    def _word(self, address: int) -> int:
+        """An output register as it is read."""
+        return self.out[address] | self.new[address] << 15 | (self.registers[0x3C] != 0) << 14
+
     def _burst_word(self, sck_hz: float) -> int:
         if sck_hz > 1e6:
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz in a burst")
@@ -191,7 +203,7 @@ class Adis16405:
 
     def _read(self, address: int) -> int:
         if address in self.out:
-            word = self.out[address] | self.new[address] << 15 | (self.registers[0x3C] != 0) << 14
+            word = self._word(address)
             self.new[address] = False
             return word
         value = self.registers.get(address, 0)

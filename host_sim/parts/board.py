@@ -12,7 +12,10 @@ from unicorn import arm_const as arm
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
 from .flash import Flash
-from .machine import SRAM, SRAM_BYTES, Machine, SystemControl
+from .machine import NRF51822, SRAM, STM32F405, Core, Machine, SystemControl
+from .nrf51 import Gpio as NrfGpio
+from .nrf51 import Gpiote, Nvmc, PowerClock, Spi0, Timer0, Uart0, Wdt
+from .nrf51 import Rng as NrfRng
 from .spi import Dma2, Spi
 from .symbols import place
 from .system import Exti, Gpio, Iwdg, Pwr, Rcc, Rng, Tim2
@@ -32,10 +35,35 @@ def resting(seed: int) -> Callable[[int], Sample]:
     return sample
 
 
-class Board:
-    """`frames`: what was heard on the CAN bus, with the time in us; also sent to the python-can channel if one is
-    given. `text`: what the USART said. `retained`: content of the flash's two last sectors to start with.
+class Bench:
+    """What every board has. `frames`: the telemetry heard, with the time in us. `SLOTS`: where the flash keeps the
+    saved state, two slots `STRIDE` apart."""
+
+    SLOTS = STRIDE = 0
+
+    def __init__(self, elf: Path, seed: int, core: Core, source: Callable[[int], Sample] | None) -> None:
+        self.elf = elf
+        self.machine = Machine(elf, seed, core)
+        self.frames: list[tuple[float, Frame]] = []
+        self.text = bytearray()
+        self._source = source or resting(seed)
+
+    def run(self, seconds: float) -> None:
+        """Let time go by."""
+        self.machine.run(self.machine.now_us + seconds * 1e6)
+
+    def value(self, name: str) -> int:
+        """A scalar variable of the firmware: `sensor.counters.stale`."""
+        address, size = place(self.elf, name)
+        return int.from_bytes(self.machine.uc.mem_read(address, size), "little")
+
+
+class Board(Bench):
+    """An STM32F405's. What is heard on the CAN bus is sent to the python-can channel too if one is given.
+    `text`: what the USART said. `retained`: content of the flash's two last sectors to start with.
     `clock_broken`: "crystal" or "pll"."""
+
+    SLOTS, STRIDE = 0x080C0000, 0x20000
 
     def __init__(
         self,
@@ -47,8 +75,8 @@ class Board:
         retained: bytes | None = None,
         clock_broken: str = "",
     ) -> None:
-        self.elf = elf
-        self.machine = machine = Machine(elf, seed)
+        super().__init__(elf, seed, STM32F405, source)
+        machine = self.machine
         self.rcc = Rcc(machine)
         self.rcc.crystal = clock_broken != "crystal"
         self.rcc.pll_works = clock_broken != "pll"
@@ -65,20 +93,18 @@ class Board:
         self.can = Bxcan(machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9)
         self.usart = Usart(machine, self.rcc)
         self.flash = Flash(machine)
-        self.sensor = Adis16405(machine, source or resting(seed))
+        self.sensor = Adis16405(machine, self._source)
         machine.on_reset = self.rcc.note_reset
 
         self.sensor.on_ready = lambda level: self.exti.edge(1, 0, level)
         self.spi.device = self._spi_frame
         self.port_a.on_output = self._port_a
         self.port_b.on_output = self._port_b
-        self.frames: list[tuple[float, Frame]] = []
-        self.text = bytearray()
         self.usart.on_byte = self.text.append
         self.can.on_frame = self._can_frame
         self.bus = can.Bus(interface="virtual", channel=channel) if channel else None
         if retained is not None:
-            machine.uc.mem_write(0x080C0000, retained)
+            machine.uc.mem_write(self.SLOTS, retained)
         machine.start()
 
     def _spi_frame(self, word: int, mode: int, sck_hz: float, end_us: float) -> int:
@@ -99,30 +125,25 @@ class Board:
         if self.bus is not None:
             self.bus.send(can.Message(timestamp=us / 1e6, arbitration_id=frame[0], data=frame[1], is_extended_id=False))
 
-    def run(self, seconds: float) -> None:
-        """Let time go by."""
-        self.machine.run(self.machine.now_us + seconds * 1e6)
-
     def power_cycle(self, retained: bytes | None = None) -> None:
         """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
         machine = self.machine
-        machine.uc.mem_write(SRAM, machine.random.randbytes(SRAM_BYTES))
+        machine.uc.mem_write(SRAM, machine.random.randbytes(machine.core.sram_bytes))
         if retained is not None:
-            machine.uc.mem_write(0x080C0000, retained)
+            machine.uc.mem_write(self.SLOTS, retained)
         self.flash.cut_at = -1
         self.rcc.csr = self.rcc.FLAG["power"]
         machine.power_cycle()
         self.sensor.power_on()
 
+    def erases(self, slot: int) -> int:
+        """Times that a slot's beginning was erased."""
+        return self.flash.erases[10 + slot]
+
     def retained(self) -> bytes:
         """Content of the flash's two last sectors."""
         self.flash.settle()
-        return bytes(self.machine.uc.mem_read(0x080C0000, 0x40000))
-
-    def value(self, name: str) -> int:
-        """A scalar variable of the firmware: `sensor.counters.stale`."""
-        address, size = place(self.elf, name)
-        return int.from_bytes(self.machine.uc.mem_read(address, size), "little")
+        return bytes(self.machine.uc.mem_read(self.SLOTS, 2 * self.STRIDE))
 
     def close(self) -> None:
         """Leave the python-can channel."""
@@ -130,4 +151,83 @@ class Board:
             self.bus.shutdown()
 
 
-__all__ = ["Adis16405", "Board", "arm", "place", "resting"]
+class NrfBoard(Bench):
+    """An nRF51822's: telemetry as SLCAN. `retained`: content of the flash's last 64 KB to start with."""
+
+    SLOTS, STRIDE = 0x30000, 0x8000
+    READY, RESET, CS = 20, 18, 16
+
+    def __init__(
+        self,
+        elf: Path,
+        source: Callable[[int], Sample] | None = None,
+        *,
+        seed: int = 0,
+        retained: bytes | None = None,
+        crystal: bool = True,
+    ) -> None:
+        super().__init__(elf, seed, NRF51822, source)
+        machine = self.machine
+        self.system = SystemControl(machine)
+        self.power = PowerClock(machine)
+        self.power.crystal = crystal
+        self.pins = NrfGpio(machine)
+        self.gpiote = Gpiote(machine)
+        self.timer = Timer0(machine)
+        self.wdt = Wdt(machine)
+        self.rng = NrfRng(machine)
+        self.spi = Spi0(machine)
+        self.usart = Uart0(machine)
+        self.flash = Nvmc(machine)
+        self.sensor = Adis16405(machine, self._source)
+        machine.on_reset = self.power.note_reset
+        self.sensor.on_ready = lambda level: self.gpiote.edge(self.READY, level)
+        self.spi.device = self.sensor.frame
+        self.spi.answer = self.sensor.shifting_out
+        self.pins.on_output = self._output
+        self.usart.on_byte = self._byte
+        self._line = bytearray()
+        if retained is not None:
+            machine.uc.mem_write(self.SLOTS, retained)
+        machine.start()
+
+    def _output(self, pin: int, level: bool) -> None:
+        if pin == self.CS:
+            self.sensor.select(not level)
+            self.spi.begin_frames()
+        elif pin == self.RESET:
+            self.sensor.reset_line(level)
+
+    def _byte(self, byte: int) -> None:
+        self.text.append(byte)
+        self._line.append(byte)
+        if byte in b"\r\a":
+            line, self._line = self._line, bytearray()
+            if line[:1] == b"t" and len(line) == 22:
+                data = bytes.fromhex(line[5:21].decode())
+                self.frames.append((self.machine.time_us, (int(line[1:4], 16), data)))
+
+    def power_cycle(self, retained: bytes | None = None) -> None:
+        """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
+        machine = self.machine
+        machine.uc.mem_write(SRAM, machine.random.randbytes(machine.core.sram_bytes))
+        if retained is not None:
+            machine.uc.mem_write(self.SLOTS, retained)
+        self.flash.cut_at = -1
+        self.flash.settle()
+        self.power.power_on()
+        self._line.clear()
+        machine.power_cycle()
+        self.sensor.power_on()
+
+    def erases(self, slot: int) -> int:
+        """Times that a slot's beginning was erased."""
+        return self.flash.erases.get(self.SLOTS + slot * self.STRIDE, 0)
+
+    def retained(self) -> bytes:
+        """Content of the flash's slots."""
+        self.flash.settle()
+        return bytes(self.machine.uc.mem_read(self.SLOTS, 2 * self.STRIDE))
+
+
+__all__ = ["Adis16405", "Board", "NrfBoard", "arm", "place", "resting"]

@@ -6,8 +6,9 @@ import random
 
 from unicorn.unicorn_const import UC_HOOK_MEM_WRITE
 
-from .machine import FLASH, FLASH_BYTES, Machine, Part, Uc
+from .machine import STM32F405, Machine, Part, Uc
 
+FLASH, FLASH_BYTES = STM32F405.flash, STM32F405.flash_bytes
 #: Start and size of every sector, RM0090 table 5.
 SECTORS = [(FLASH + 0x4000 * i, 0x4000) for i in range(4)]
 SECTORS += [(FLASH + 0x10000, 0x10000)]

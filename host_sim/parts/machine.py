@@ -1,4 +1,4 @@
-"""The processor: Unicorn's Cortex-M4F with the NVIC, SysTick and system control block that it lacks, and virtual time.
+"""The processor: Unicorn's Cortex-M4F or -M0 with the NVIC, SysTick and system control block that it lacks, and time.
 
 Time goes by one cycle an instruction while the processor runs, and jumps to the next event while it sleeps (WFI).
 Interrupts are taken between any two instructions, where their event falls, at one priority: handlers do not nest.
@@ -10,6 +10,7 @@ import heapq
 import itertools
 import random
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import unicorn.arm_const as arm
@@ -18,13 +19,31 @@ from elftools.elf.sections import SymbolTableSection
 from unicorn import Uc, UcError  # type: ignore[attr-defined]  # the package re-exports them without saying so
 from unicorn.unicorn_const import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_INTR, UC_MODE_MCLASS, UC_MODE_THUMB
 
-FLASH, FLASH_BYTES = 0x08000000, 0x100000
-SRAM, SRAM_BYTES = 0x20000000, 0x20000
-# Instructions at a stretch: within one, only accesses and known delays let time go by. Short while the firmware is busy
-# with peripherals (9 us), longer while it computes.
-SLICE, LONG_SLICE = 1500, 24_000
-FINE = 100  # instructions at a stretch in handlers, so that their delays are measured
-HANDLER_MOST = 400_000  # instructions a handler may take: 2.4 ms
+SRAM = 0x20000000
+
+
+@dataclass(frozen=True)
+class Core:
+    """A microcontroller: Unicorn's processor, its memories, the clock it starts with in MHz.
+
+    `slice`, `long_slice`: instructions at a stretch, within one of which only accesses and known delays let time go by:
+    short (9 us) while the firmware is busy with peripherals, longer while it computes. `fine`: the same in handlers, so
+    that their delays are measured.
+    """
+
+    cpu: int
+    flash: int
+    flash_bytes: int
+    sram_bytes: int
+    mhz: float
+    slice: int
+    long_slice: int
+    fine: int
+
+
+STM32F405 = Core(arm.UC_CPU_ARM_CORTEX_M4, 0x08000000, 0x100000, 0x20000, 16.0, 1500, 24_000, 100)
+NRF51822 = Core(arm.UC_CPU_ARM_CORTEX_M0, 0, 0x40000, 0x8000, 16.0, 150, 2400, 20)
+HANDLER_MOST = 400_000  # instructions a handler may take
 ACCESS_US = 0.03  # a peripheral access, about 5 cycles
 WFI = b"\x30\xbf"
 
@@ -68,11 +87,12 @@ class Event:
 class Machine:
     """Processor and time. `now_us`: since power came on."""
 
-    def __init__(self, elf: Path, seed: int = 0) -> None:
+    def __init__(self, elf: Path, seed: int = 0, core: Core = STM32F405) -> None:
+        self.core = core
         self.parts: list[Part] = []
         self.random = random.Random(seed)
         self.now_us = 0.0
-        self.hclk_mhz = 16.0
+        self.hclk_mhz = core.mhz
         self.violations: list[str] = []
         self.resets: list[tuple[float, str]] = []  # when and why
         self.stopped: str | None = None  # why the run ended before its time: power cut
@@ -85,15 +105,15 @@ class Machine:
         self._reset_wanted: str | None = None
         self._exception_return = False
         self._in_handler = False
-        self._slice = SLICE
+        self._slice = core.slice
         self._spent = 0.0  # us of peripheral accesses within the slice
         self.on_reset: Callable[[str], None] = lambda cause: None
         self.uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
-        self.uc.ctl_set_cpu_model(arm.UC_CPU_ARM_CORTEX_M4)
-        self.uc.mem_map(FLASH, FLASH_BYTES)
-        self.uc.mem_map(SRAM, SRAM_BYTES)
-        self.uc.mem_write(FLASH, b"\xff" * FLASH_BYTES)
-        self.uc.mem_write(SRAM, self.random.randbytes(SRAM_BYTES))  # what power-on leaves
+        self.uc.ctl_set_cpu_model(core.cpu)
+        self.uc.mem_map(core.flash, core.flash_bytes)
+        self.uc.mem_map(SRAM, core.sram_bytes)
+        self.uc.mem_write(core.flash, b"\xff" * core.flash_bytes)
+        self.uc.mem_write(SRAM, self.random.randbytes(core.sram_bytes))  # what power-on leaves
         self.symbols: dict[str, int] = {}
         self._load(elf)
         self.uc.hook_add(UC_HOOK_INTR, self._interrupt_hook)
@@ -205,7 +225,7 @@ class Machine:
             self._spent += uc.reg_read(arm.UC_ARM_REG_R0)
 
     def _vector(self, exception: int) -> int:
-        return int.from_bytes(self.uc.mem_read(FLASH + 4 * exception, 4), "little")
+        return int.from_bytes(self.uc.mem_read(self.core.flash + 4 * exception, 4), "little")
 
     def _take(self, exception: int) -> None:
         """Run a handler to its end. Registers are put back whole; the frame's room on the stack is taken (PM0214
@@ -217,13 +237,13 @@ class Machine:
         self._exception_return = False
         self._in_handler = True
         address = self._vector(exception)
-        for _ in range(HANDLER_MOST // FINE):
-            self._run(address, FINE)
+        for _ in range(HANDLER_MOST // self.core.fine):
+            self._run(address, self.core.fine)
             if self._exception_return:
                 break
             if self._reset_wanted or self.stopped:
                 return
-            self._spent += FINE / self.hclk_mhz
+            self._spent += self.core.fine / self.hclk_mhz
             address = uc.reg_read(arm.UC_ARM_REG_PC)
         else:
             self.violations.append(
@@ -241,7 +261,7 @@ class Machine:
         stack = (uc.reg_read(arm.UC_ARM_REG_SP) - 32) & ~7
         values = [uc.reg_read(r) for r in (arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R1, arm.UC_ARM_REG_R2, arm.UC_ARM_REG_R3)]
         values += [uc.reg_read(r) for r in (arm.UC_ARM_REG_R12, arm.UC_ARM_REG_LR)] + [pc, 0x01000000]
-        if stack - SRAM in range(SRAM_BYTES - 32):
+        if stack - SRAM in range(self.core.sram_bytes - 32):
             uc.mem_write(stack, b"".join(value.to_bytes(4, "little") for value in values))
         uc.reg_write(arm.UC_ARM_REG_SP, stack)
         uc.reg_write(arm.UC_ARM_REG_LR, 0xFFFFFFF9)
@@ -274,10 +294,13 @@ class Machine:
     # time
 
     def _events_due(self) -> None:
-        while self._events and self._events[0][0] <= self.now_us:
-            event = heapq.heappop(self._events)[2]
+        """Each at its own time, however late the processor lets it be seen: the world does not stand still with it."""
+        now = self.now_us
+        while self._events and self._events[0][0] <= now:
+            self.now_us, _, event = heapq.heappop(self._events)
             if event.call is not None:
                 event.call()
+        self.now_us = now
 
     def _next_us(self) -> float:
         while self._events and self._events[0][2].call is None:
@@ -321,7 +344,7 @@ class Machine:
                 self._asleep = True
                 self._spent += 1.0  # how far it got is not known
             else:
-                self._slice = SLICE if self._spent > 0.0 else min(2 * self._slice, LONG_SLICE)
+                self._slice = self.core.slice if self._spent > 0.0 else min(2 * self._slice, self.core.long_slice)
                 self._spent = max(self._spent, count / self.hclk_mhz)
         self.now_us += self._spent
         self._spent = 0.0
@@ -395,4 +418,4 @@ class SystemControl(Part):
             raise KeyError(offset)
 
 
-__all__ = ["EXC_IRQ0", "FLASH", "FLASH_BYTES", "SRAM", "SRAM_BYTES", "Event", "Machine", "Part", "SystemControl", "Uc"]
+__all__ = ["EXC_IRQ0", "NRF51822", "SRAM", "STM32F405", "Core", "Event", "Machine", "Part", "SystemControl", "Uc"]

@@ -282,6 +282,20 @@ static void listen(adis16405_t *self)
     self->listening = true;
 }
 
+void adis16405_pause(adis16405_t *self, bool on)
+{
+    if (self->state != ADIS16405_RUNNING) {
+        return;
+    }
+    if (on) {
+        hold(self);
+    } else {
+        self->progress_us = self->bus->time_us(self->bus->context);
+        self->ready_seen = self->ready_count;
+        listen(self);
+    }
+}
+
 bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES])
 {
     int16_t added[ADIS16405_AXES];

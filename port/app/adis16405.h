@@ -127,6 +127,10 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 /* From the main loop, every few ms at least: goes on with the start, watches, tries again. */
 void adis16405_poll(adis16405_t *self);
 
+/* From the main loop: takes no samples from here on, while interrupts come late or not at all; and goes on. Samples not taken are
+ * missing in time. Waits for a reading under way, 2 ms at most. */
+void adis16405_pause(adis16405_t *self, bool on);
+
 /* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset) to its readings by its offset registers, and says in `got` what
  * the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
  * goes into its flash. Samples that wait, and some that follow, are dropped: missing in time. False: beyond the registers (50 deg/s,

@@ -11,6 +11,16 @@ enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES 
 /* A report takes some seconds on any wire; one that has not ended after so long never will. */
 #define REPORT_MOST_MS 60000U
 
+unsigned port_axis(const char *name)
+{
+    static const char *const names[PORT_AXES] = {"gx", "gy", "gz", "ax", "ay", "az"};
+    unsigned at = 0;
+    while (at < PORT_AXES && strcmp(name, names[at]) != 0) {
+        at++;
+    }
+    return at;
+}
+
 selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
 {
     memset(app, 0, sizeof *app);
@@ -98,8 +108,9 @@ static void save(app_t *app, uint32_t now)
 {
     const port_module_t *module = app->module;
     app->saved_ms = now;
-    if (module->save_begin(module->context) &&
-        selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK && module->save_end(module->context)) {
+    const bool whole = module->save_begin(module->context) &&
+                       selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK;
+    if (module->save_end(module->context, whole)) {
         app->told.state_saves++;
     } else {
         app->told.state_save_failures++;
@@ -119,7 +130,8 @@ static bool faulty(const app_t *app, const float reading[])
     return false;
 }
 
-/* Takes what the gate has measured at rest for its noise, after 30 windows of it and whenever there are twice as many. */
+/* Takes what the gate has measured at rest for its noise, after SELFCAL_GATE_MEASURED_MIN windows of it and whenever there are twice as
+ * many. */
 static void learn_noise(app_t *app)
 {
     if (app->gate.measured < app->learn_at) {
@@ -250,7 +262,7 @@ static void tell(app_t *app)
 /* -------------------------------------------------------------------------------------------------------------- commands */
 
 static const uint64_t command_key[2] = {APP_COMMAND_KEY};
-enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = 0x3F };
+enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
 #define RESTART_MS 100U /* for the answer to leave */
 
 static void answer(app_t *app, uint8_t command, uint8_t result)
@@ -262,15 +274,10 @@ static void answer(app_t *app, uint8_t command, uint8_t result)
     app->answer = (uint32_t)command << SELFCAL_ANSWER_COMMAND_SHIFT | (uint32_t)result << SELFCAL_ANSWER_RESULT_SHIFT;
 }
 
-/* Bit of an axis of the model in a command: gx gy gz ax ay az. */
+/* Bit of an axis of the model in a command. */
 static uint32_t axis_bit(uint8_t axis)
 {
-    static const char *const name[] = {"gx", "gy", "gz", "ax", "ay", "az"};
-    uint32_t bit = 0;
-    while (bit < sizeof name / sizeof name[0] && strcmp(selfcal_model_axis_name[axis], name[bit]) != 0) {
-        bit++;
-    }
-    return 1UL << bit;
+    return 1UL << port_axis(selfcal_model_axis_name[axis]);
 }
 
 /* Has the sensor take off the biases of `axes`, or, with none, what it has been told to add. All that was learnt is kept. */
@@ -534,15 +541,33 @@ static bool begin_frames(app_t *app)
     return false;
 }
 
+/* Windows so far whose end was dear. */
+static uint32_t dear_windows(const app_t *app)
+{
+#if SELFCAL_MODEL_GATE
+    return app->gate.at_once;
+#else
+    (void)app;
+    return 0;
+#endif
+}
+
 bool app_step(app_t *app)
 {
     /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. On a slow core
      * several come during one slice. */
-    bool busy = app->computing && compute(app);
+    const uint32_t dear = dear_windows(app);
+    bool busy = false;
     for (unsigned taken = 0; taken < SAMPLES_A_TURN && (!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app);
          taken++) {
         busy = true;
     }
+    /* Such a sample and a slice do not add up in one turn; but a report is not put off twice in a row. */
+    app->put_off = dear_windows(app) != dear && !app->put_off;
+    if (app->put_off) {
+        return true;
+    }
+    busy = (app->computing && compute(app)) || busy;
     busy = send_frames(app) || busy;
     if (!app->waiting) {
         busy = begin_frames(app) || (!app->computing && advance(app)) || busy;

@@ -41,6 +41,7 @@ typedef struct {
     bool worked_out;  /* ... is, and waits for the wire */
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
+    bool put_off;     /* the last turn left a slice of a report to this one */
     bool waiting;     /* `frame` is made but not taken yet */
     bool finished;    /* ... and the last status is on its way */
     bool corrupt;     /* selfcal_check() failed: nothing is sent any more */

@@ -1,22 +1,16 @@
 #include "sensor.h"
 
-#include <string.h>
-
 static adis16405_t sensor;
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 
 bool sensor_init(const adis16405_bus_t *bus)
 {
-    static const char *const name[ADIS16405_AXES] = {"gx", "gy", "gz", "ax", "ay", "az"};
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        uint8_t at = 0;
-        while (at < ADIS16405_AXES && strcmp(selfcal_model_axis_name[axis], name[at]) != 0) {
-            at++;
-        }
-        if (at == ADIS16405_AXES) {
+        const unsigned at = port_axis(selfcal_model_axis_name[axis]);
+        if (at == PORT_AXES) {
             return false;
         }
-        channel[axis] = at;
+        channel[axis] = (uint8_t)at;
     }
     const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
     return adis16405_init(&sensor, bus, &config);
@@ -35,6 +29,11 @@ void sensor_burst(const uint16_t words[ADIS16405_BURST_WORDS], bool whole)
 void sensor_poll(void)
 {
     adis16405_poll(&sensor);
+}
+
+void sensor_pause(bool on)
+{
+    adis16405_pause(&sensor, on);
 }
 
 port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing)

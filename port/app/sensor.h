@@ -9,10 +9,11 @@
 /* False: the model has an axis or a rate that the sensor has not. */
 bool sensor_init(const adis16405_bus_t *bus);
 
-/* From the interrupt handlers, and from the main loop: as adis16405_ready(), _burst() and _poll(). */
+/* From the interrupt handlers, and from the main loop: as adis16405_ready(), _burst(), _poll() and _pause(). */
 void sensor_ready(void);
 void sensor_burst(const uint16_t words[ADIS16405_BURST_WORDS], bool whole);
 void sensor_poll(void);
+void sensor_pause(bool on);
 
 /* For port_t and port_module_t. */
 port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing);

@@ -6,7 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "selfcal.h"
+#include "module.h"
 
 enum {
     PIN_READY = 20, /* edge 12 */
@@ -33,7 +33,23 @@ uint32_t clock_us32(void);
 void clock_spin_us(uint32_t us);
 void clock_handler(void);
 void watchdog_feed(void);
+
+/* startup.c */
+
 __attribute__((noreturn)) void board_reset(void);
+__attribute__((noreturn)) void board_fault(void);
+
+/* Reads and clears it. */
+reset_cause_t board_reset_cause(void);
+
+/* flash.c: erasing a slot takes half a second */
+
+extern const slots_memory_t flash_memory;
+
+/* rng.c */
+
+/* False: it gives none. 20 ms at most. */
+bool rng_number(uint32_t *number);
 
 /* spi.c: what adis16405_bus_t wants */
 
@@ -49,6 +65,7 @@ void ready_handler(void);
 void uart_init(void);
 bool uart_send(const selfcal_frame_t *frame);
 void uart_poll(void); /* takes what the host said */
+void uart_tell(selfcal_module_t *told);
 void uart_handler(void);
 
 #endif

@@ -59,10 +59,12 @@ static bool exchange(uint8_t out, uint8_t *in)
     SPI0_READY = 0U;
     SPI0_TXD = out;
     const uint32_t start = clock_us32();
+    bool late = false; /* by the time before READY is looked at: an interrupt in between is no failure */
     while (SPI0_READY == 0U) {
-        if (clock_us32() - start > BYTE_US) {
+        if (late) {
             return false;
         }
+        late = clock_us32() - start > BYTE_US;
     }
     *in = (uint8_t)SPI0_RXD;
     return true;

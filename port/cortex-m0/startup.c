@@ -1,4 +1,4 @@
-/* Vectors and start-up. A fault resets the processor. */
+/* Vectors and start-up. A fault resets the processor; that it did is kept in the register that a reset leaves alone. */
 #include "board.h"
 #include "nrf51.h"
 
@@ -10,6 +10,37 @@ int *__errno(void)  /* NOLINT(bugprone-reserved-identifier,cert-dcl37-c,cert-dcl
 {
     static int number;
     return &number;
+}
+
+enum { FAULT_MARK = 0x5E };
+
+void board_reset(void)
+{
+    __asm__ volatile("dsb" : : : "memory");
+    SCB_AIRCR = SCB_AIRCR_SYSRESETREQ;
+    for (;;) { /* the watchdog ends it if the reset does not come */
+    }
+}
+
+void board_fault(void)
+{
+    POWER_GPREGRET = FAULT_MARK;
+    board_reset();
+}
+
+reset_cause_t board_reset_cause(void)
+{
+    const uint32_t reason = POWER_RESETREAS;
+    const bool fault = (POWER_GPREGRET & 0xFFU) == FAULT_MARK;
+    POWER_RESETREAS = reason; /* cleared by ones */
+    POWER_GPREGRET = 0U;
+    return reason == 0U                               ? RESET_POWER_ON
+           : (reason & POWER_RESETREAS_DOG) != 0U     ? RESET_WATCHDOG
+           : (reason & POWER_RESETREAS_LOCKUP) != 0U  ? RESET_FAULT
+           : (reason & POWER_RESETREAS_SREQ) != 0U    ? (fault ? RESET_FAULT : RESET_SOFTWARE)
+           : (reason & POWER_RESETREAS_PIN) != 0U     ? RESET_PIN
+           : (reason & POWER_RESETREAS_OFF) != 0U     ? RESET_LOW_POWER
+                                                      : RESET_UNKNOWN;
 }
 
 int main(void);
@@ -38,11 +69,11 @@ typedef union {
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16 + IRQ_COUNT] = {
     [0] = {.stack = link_stack},
     [1] = {.call = startup},
-    [2] = {.call = board_reset}, /* NMI */
-    [3] = {.call = board_reset}, /* HardFault */
-    [11] = {.call = board_reset}, /* SVCall */
-    [14] = {.call = board_reset}, /* PendSV */
-    [15] = {.call = board_reset}, /* SysTick */
+    [2] = {.call = board_fault}, /* NMI */
+    [3] = {.call = board_fault}, /* HardFault */
+    [11] = {.call = board_fault}, /* SVCall */
+    [14] = {.call = board_fault}, /* PendSV */
+    [15] = {.call = board_fault}, /* SysTick */
     [16 + IRQ_UART0] = {.call = uart_handler},
     [16 + IRQ_SPI0] = {.call = spi_handler},
     [16 + IRQ_GPIOTE] = {.call = ready_handler},

@@ -9,6 +9,8 @@ static slcan_t slcan;
 static volatile uint8_t out[OUT_BYTES], in[IN_BYTES];
 static volatile uint32_t out_head, out_tail, in_head, in_tail; /* count up for ever; the handler moves out_tail and in_head */
 static volatile bool sending;
+static volatile uint32_t lost_in;
+static uint32_t dropped;
 
 void uart_init(void)
 {
@@ -57,6 +59,7 @@ static bool put(const char *bytes, uint32_t count)
 bool uart_send(const selfcal_frame_t *frame)
 {
     if (!slcan.open) {
+        dropped++;
         return true;
     }
     char line[SLCAN_FRAME_BYTES];
@@ -71,7 +74,19 @@ void uart_poll(void)
         const size_t count = slcan_receive(&slcan, in[in_tail % IN_BYTES], answer);
         in_tail++;
         (void)put(answer, (uint32_t)count); /* an answer that finds no room is left out */
+#ifdef APP_COMMAND_KEY
+        if (slcan.came) {
+            slcan.came = false;
+            module_command(slcan.data);
+        }
+#endif
     }
+}
+
+void uart_tell(selfcal_module_t *told)
+{
+    told->frames_dropped = dropped;
+    told->bus_off_count = lost_in;
 }
 
 void uart_handler(void)
@@ -79,6 +94,7 @@ void uart_handler(void)
     if (UART0_ERROR != 0U) {
         UART0_ERROR = 0U;
         UART0_ERRORSRC = UART0_ERRORSRC; /* ones clear it */
+        lost_in++;
     }
     if (UART0_RXDRDY != 0U) {
         UART0_RXDRDY = 0U; /* before the byte is taken: the next one sets it again */
@@ -86,6 +102,8 @@ void uart_handler(void)
         if (in_head - in_tail < IN_BYTES) {
             in[in_head % IN_BYTES] = byte;
             in_head++;
+        } else {
+            lost_in++;
         }
     }
     if (UART0_TXDRDY != 0U) {

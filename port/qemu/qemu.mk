@@ -8,7 +8,8 @@ QEMU_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/qe
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
 QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
-QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x8000
+# 4 KB more than the part's 32: the recording's buffers and a stack twice as large, which the image itself does not have.
+QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
 
 .PHONY: qemu
 qemu: $(OUT)/selfcal-qemu.elf

@@ -6,7 +6,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "selfcal.h"
+#include "module.h"
 
 /* --------------------------------------------------------------------------------------------------------- start-up */
 
@@ -50,7 +50,6 @@ void systick_handler(void);
 
 /* ----------------------------------------------------------------------------------------------------------- sensor */
 
-struct adis16405_bus;
 void spi_init(void);
 bool spi_word(void *context, uint16_t out, uint16_t *in);
 bool spi_burst(void *context);
@@ -90,23 +89,10 @@ void usart_poll(void); /* takes what the host said */
 void usart_counters(wire_counters_t *counters);
 void usart_handler(void);
 
-/* In main.c, in an image with commands: one came. */
-void board_command(const uint8_t data[8]);
-
 /* A random number of the RNG's; false: it has none, for want of a clock or by its own checks. 1 ms at most. */
-bool rng_number(void *context, uint32_t *number);
+bool rng_number(uint32_t *number);
 
 /* --------------------------------------------------------------------------------------------- watchdog, reset cause */
-
-typedef enum {
-    RESET_UNKNOWN = 0,
-    RESET_POWER_ON = 1,  /* power, or brown-out */
-    RESET_PIN = 2,
-    RESET_SOFTWARE = 3,
-    RESET_WATCHDOG = 4,
-    RESET_FAULT = 5,     /* software reset after a recorded fault */
-    RESET_LOW_POWER = 6
-} reset_cause_t;
 
 /* Reads and clears the reset flags. */
 reset_cause_t watchdog_reset_cause(void);
@@ -117,18 +103,7 @@ void watchdog_feed(void);
 
 /* ------------------------------------------------------------------------------------------------------------ flash */
 
-/* Largest state a slot keeps, bytes. */
-#define FLASH_SLOT_BYTES (128U * 1024U - 32U)
-
-/* The newest state whose save reached its end, or NULL; `older`: the one before it. Whether it is still what was written its own
- * checksum tells. */
-const void *flash_newest(bool older, size_t *length);
-
-/* A save: begin erases the slot that is not the newest (1 s, 2 s at most, during which the processor stands still), put
- * appends, end writes the header. Until the header's last word is written the newest state stays what it was. False: the
- * flash refused or did not read back; the save is void. */
-bool flash_begin(void);
-bool flash_put(void *context, const void *bytes, size_t count);
-bool flash_end(void);
+/* Erasing a slot takes 1 s, 2 s at most, during which the processor stands still. */
+extern const slots_memory_t flash_memory;
 
 #endif

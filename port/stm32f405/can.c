@@ -131,7 +131,7 @@ void can_poll(void)
             data[i] = (uint8_t)(low >> (8U * i));
             data[4U + i] = (uint8_t)(high >> (8U * i));
         }
-        board_command(data);
+        module_command(data);
     }
 #endif
 }

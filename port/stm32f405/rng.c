@@ -14,9 +14,8 @@ static bool next(uint32_t *number)
     return true;
 }
 
-bool rng_number(void *context, uint32_t *number)
+bool rng_number(uint32_t *number)
 {
-    (void)context;
     uint32_t before = 0;
     RCC_AHB2ENR |= RCC_AHB2ENR_RNG;
     (void)RCC_AHB2ENR;

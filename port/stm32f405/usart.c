@@ -63,7 +63,7 @@ void usart_poll(void)
 #ifdef APP_COMMAND_KEY
         if (slcan.came) {
             slcan.came = false;
-            board_command(slcan.data);
+            module_command(slcan.data);
         }
 #endif
     }

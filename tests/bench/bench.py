@@ -338,6 +338,10 @@ def table(bench: Bench) -> str:
     sample("… and in a report: samples that wait, and its slice", worst)
     number("samples that wait at most in a report", "facts", "report.most_waiting")
     number("report of one axis, from its beginning, ms", "facts", "report.ms")
+    per("stationary gate, one sample", "gate", ".1f")
+    per("… with a step of its thresholds", "gate.step")
+    per("… at the end of a window", "gate.judge")
+    per("… of one with samples missing, whose threshold is worked out there", "gate.part")
     row("**bytes**", {})
     for path in sorted((ROOT / "lib").glob("*.c")):
         number(f"flash, {path.name}", "sizes", f"text.{path.stem}")

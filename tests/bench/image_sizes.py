@@ -244,7 +244,7 @@ class Image:
 
     def resets(self, handler: int) -> bool:
         """Whether a handler does nothing but end the run."""
-        return self.functions[handler].name in ("unexpected", "board_reset")
+        return self.functions[handler].name in ("unexpected", "board_reset", "board_fault")
 
 
 def measure(target: str) -> tuple[dict[str, int], str]:

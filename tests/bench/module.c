@@ -1,15 +1,18 @@
-/* Counts the instructions of the firmware application on a Cortex-M: what a sample costs at the sensor's full rate, between
- * reports and while one is worked out, and how long samples wait then. Time is the instructions' own, at MHZ of them a second.
+/* Counts the instructions of the firmware application on a Cortex-M, the stationary gate before the bank: what a sample costs at
+ * the sensor's full rate, between reports and while one is worked out, and how long samples wait then; the gate by itself. Time is the instructions' own, at MHZ of them a second.
  * Prints as bench.c does. Reading the sensor and writing the wire are not in it. */
 #include "app.h"
 #include "image.h"
 #include "record.h"
 
 #define AXES SELFCAL_MODEL_AXES
-/* Samples of the record, given over and over; a power of two. */
+/* Samples that lie ready; a power of two. */
 #define RING 32U
-/* Reports are due when 32 bank samples are in: 2 batches, so that pushes carry the nodes' work. */
-#define REPORT_MS 32000U
+/* Reports are due when 33 bank samples are in: 2 batches, so that pushes carry the nodes' work, and one for the gate to see rest.
+ * Meanwhile the gate takes the noise that it has measured twice, after 30 and 60 windows of a third of a second. */
+#define REPORT_MS 34000U
+/* One sample is missing before this one, so that the gate judges a window by thresholds of its own. */
+#define GAP_AT 20000U
 /* SysTick counts 16 (M0) or 168 (M4F) ticks a us, an instruction is 64 ns: see bench.py. Of 1 / 819.2 Hz. */
 #ifdef __ARM_FP
 #define MHZ 168U
@@ -24,7 +27,9 @@ typedef struct {
     uint32_t rounds, parts;
 } taken_t;
 
+static record_t record;
 static float ring[RING][AXES];
+static uint32_t made;     /* samples put into the ring */
 static uint32_t samples;  /* taken */
 static uint64_t now_ticks; /* idle time too */
 static uint32_t most_waiting;
@@ -43,7 +48,7 @@ static port_sample_t board_sample(void *context, float reading[], uint32_t *miss
     for (unsigned axis = 0; axis < AXES; axis++) {
         reading[axis] = ring[samples % RING][axis];
     }
-    *missing = 0;
+    *missing = samples == GAP_AT ? 1U : 0U;
     samples++;
     return PORT_SAMPLE;
 }
@@ -59,7 +64,15 @@ static void board_idle(void *context) {
     now_ticks = (uint64_t)samples * PERIOD_TICKS;
 }
 
+static void fill(void) {
+    while ((int32_t)(made - samples) < (int32_t)RING) {
+        record_next(&record, ring[made % RING]);
+        made++;
+    }
+}
+
 static taken_t turn(void) {
+    fill();
     const uint32_t waiting = (uint32_t)(now_ticks / PERIOD_TICKS) + 1U - samples;
     most_waiting = waiting > most_waiting ? waiting : most_waiting;
     const image_time_t start = image_now();
@@ -98,15 +111,56 @@ static void print_value(const char *name, uint64_t number) {
     image_print("\n");
 }
 
+/* One sample into the gate of the application, which is not in use any more. */
+static taken_t push_gate(void) {
+    samples++;
+    fill();
+    const image_time_t start = image_now();
+    (void)selfcal_gate_push(&app.gate, ring[samples % RING]);
+    const image_time_t now = image_now();
+    const taken_t taken = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
+    return taken;
+}
+
+static void keep_worst(taken_t *worst, taken_t taken) {
+    if (taken.ticks > worst->ticks) {
+        *worst = taken;
+    }
+}
+
+/* A sample's share while thresholds are worked out, while none is, at a whole window's end, and at that of one with a sample missing. */
+static void print_gate(void) {
+    taken_t step = {0, 0, 0}, sum = {0, 0, 0}, judged = {0, 0, 0}, part = {0, 0, 0};
+    uint32_t steps = 0;
+    (void)app_gate(&app);
+    const uint32_t window = app.gate.config.window;
+    for (uint32_t i = 0; i < 4U * window; i++) {
+        const bool working = app.gate.work != 0U;
+        const taken_t taken = push_gate();
+        if (working) {
+            steps++;
+            keep_worst(&step, taken);
+        } else if (i >= window) {
+            add(&sum, taken);
+            keep_worst(&judged, taken);
+        }
+    }
+    (void)selfcal_gate_skip(&app.gate, 1U);
+    for (uint32_t i = 1; i < window; i++) {
+        keep_worst(&part, push_gate());
+    }
+    print_count("gate", sum, 3U * window);
+    print_count("gate.judge", judged, 1U);
+    print_count("gate.step", step, 1U);
+    print_count("gate.part", part, 1U);
+    print_value("gate.steps", steps);
+}
+
 int main(void) {
     static const port_t port = {NULL, board_time_ms, board_sample, board_send, board_idle};
-    record_t record;
     image_start_clock();
     record_init(&record);
-    for (unsigned i = 0; i < RING; i++) {
-        record_next(&record, ring[i]);
-    }
-    if (app_init(&app, &port, REPORT_MS) != SELFCAL_OK) {
+    if (app_init(&app, &port, REPORT_MS) != SELFCAL_OK || !app_gate(&app)) {
         return 2;
     }
     const image_time_t start = image_now();
@@ -118,13 +172,14 @@ int main(void) {
     while (app.report_number == 0U) {
         const taken_t taken = turn();
         add(&between, taken);
-        if (taken.ticks > worst_between.ticks) {
-            worst_between = taken;
-        }
+        keep_worst(&worst_between, taken);
     }
     print_count("sample", between, samples);
     print_count("sample.worst", worst_between, 1U);
 
+    if (app.gate.counters.alarms != 0U || app.gate.measured < 60U) {
+        return 4; /* the record is one of rest */
+    }
     const uint32_t before = samples;
     const uint64_t begun = now_ticks;
     while (!app.computing) {
@@ -134,14 +189,13 @@ int main(void) {
     most_waiting = 0;
     while (app.computing) {
         const taken_t taken = turn();
-        if (taken.ticks > worst_report.ticks) {
-            worst_report = taken;
-        }
+        keep_worst(&worst_report, taken);
     }
     print_count("sample.report.worst", worst_report, 1U);
     print_value("mhz", MHZ);
     print_value("report.samples", samples - before);
     print_value("report.most_waiting", most_waiting);
+    print_gate();
     print_value("report.ms", (now_ticks - begun) * 1250U / 1024U / PERIOD_TICKS);
     return 0;
 }

@@ -1,4 +1,4 @@
-"""The STM32F405 image for the tests: built as `make firmware` builds it, run on the board of host_sim/parts."""
+"""The images for the tests: built as `make firmware` builds them, run on the boards of host_sim/parts."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ sys.path.insert(0, str(ROOT / "host_sim"))
 
 parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup")
 Board = parts.Board
+NrfBoard = parts.NrfBoard
+CORES = {"stm32f405": "cortex-m4f", "cortex-m0": "cortex-m0"}
 from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is there
 from unicorn import arm_const as arm  # noqa: E402
 
@@ -43,6 +45,7 @@ def image(
     quiet: bool = False,
     bank_hz: float = QUIET_BANK_HZ,
     laws: tuple[str, ...] = ("constant", "random_walk", "gauss_markov"),
+    target: str = "stm32f405",
 ) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at
     `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds)."""
@@ -56,15 +59,15 @@ def image(
             document["bank_rate_hz"] = bank_hz
             document["hypotheses"] = dict.fromkeys(laws, 1)
             (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-            codegen(folder / "model.yaml", folder / "new", target="cortex-m4f", rate=QUIET_RATE_HZ)
+            codegen(folder / "model.yaml", folder / "new", target=CORES[target], rate=QUIET_RATE_HZ)
         else:
-            codegen(None, folder / "new", target="cortex-m4f")
+            codegen(None, folder / "new", target=CORES[target])
         for file in (folder / "new").iterdir():
             old = folder / file.name
             if not old.exists() or old.read_bytes() != file.read_bytes():
                 old.write_bytes(file.read_bytes())
-        makefile = "port/stm32f405/stm32f405.mk"
-        command = ["make", "-s", "-f", makefile, "stm32f405", f"MODEL_DIR={folder}", f"OUT={folder}"]
+        makefile = f"port/{target}/{target}.mk"
+        command = ["make", "-s", "-f", makefile, target, f"MODEL_DIR={folder}", f"OUT={folder}"]
         stamp = folder / "flags"
         if not stamp.exists() or stamp.read_text() != flags:
             (folder / "selfcal.elf").unlink(missing_ok=True)

@@ -118,6 +118,21 @@ def test_arguments_that_are_refused(name: str, value: str | None, complaint: str
         verb.argument_of(name, value)
 
 
+def test_what_the_command_line_says(tmp_path: Path) -> None:
+    """One line that says what to do: no channel, no key file, no such order; --help names every order."""
+    verb.new_key(tmp_path / "k")
+    there = {"key_file": tmp_path / "k", "interface": "slcan"}
+    with pytest.raises(UserError, match=r"to which module\? --channel names its serial port"):
+        verb.command("save", None, channel="", **there)
+    with pytest.raises(UserError, match=r"no such key; --key names .*`selfcal command new-key --key .*none` makes"):
+        verb.command("save", None, key_file=tmp_path / "none", interface="slcan", channel="/dev/null")
+    with pytest.raises(UserError, match=r"no such command: sing \(there are .*save.*new-key, build-flag\)"):
+        verb.command("sing", None, channel="/dev/null", **there)
+    words = " ".join(CliRunner().invoke(app, ["command", "--help"]).output.split())
+    orders = [name for name in COMMAND if name != "challenge"]
+    assert all(name in words for name in (*orders, *verb.OWN_ORDERS))
+
+
 # ----------------------------------------------------------------------------------------------------------- commands
 
 

@@ -207,7 +207,8 @@ def command(
         str,
         typer.Argument(
             metavar="ORDER",
-            help="reset [forget], save, telemetry_period MS, write_offsets AXES|none; new-key, build-flag",
+            help="To a module: reset [forget], save, telemetry_period MS, write_offsets AXES|none. "
+            "Of a key: new-key makes one, build-flag prints what an image is built with",
         ),
     ],
     value: Annotated[
@@ -226,9 +227,7 @@ def command(
     elif order == "build-flag":
         print(verb.build_flag(verb.read_key(key)))
     else:
-        answer = verb.command(
-            order, value, key=verb.read_key(key), interface=interface, channel=channel, bitrate=bitrate
-        )
+        answer = verb.command(order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate)
         print(f"{order}: {answer}")
         sys.exit(0 if answer == "done" else USER_ERROR)
 

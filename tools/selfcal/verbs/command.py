@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 CHALLENGE = "challenge"
 #: s to wait for a challenge, and for an answer: a module obeys between reports, which take it seconds.
 CHALLENGE_S, ANSWER_S = 5.0, 120.0
+#: Orders that go to no module.
+OWN_ORDERS = ("new-key", "build-flag")
 _MASK = 2**64 - 1
 
 
@@ -74,6 +76,10 @@ def read_key(path: Path | str) -> bytes:
     """A key file: 32 hexadecimal digits. Raises UserError for anything else."""
     try:
         key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{path}: there is no such key; --key names the module's, `selfcal command new-key --key {path}` makes one"
+        ) from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
     except ValueError as error:
@@ -118,16 +124,20 @@ def argument_of(order: str, value: str | None) -> int:
 
 
 def command(
-    order: str, value: str | None, *, key: bytes, interface: str, channel: str, bitrate: int | None = None
+    order: str, value: str | None, *, key_file: Path | str, interface: str, channel: str, bitrate: int | None = None
 ) -> str:
     """Have a module do `order`; returns its answer, the name of a result in the DBC.
 
-    Raises UserError for an order or argument that does not exist, a channel that cannot be opened, or no answer.
+    Raises UserError for an order or argument that does not exist, a key that cannot be read, a channel that is not
+    named or cannot be opened, or no answer.
     """
     orders = [name for name in codes("command") if name != CHALLENGE]
     if order not in orders:
-        raise UserError(f"no such command: {order} (there are {', '.join(orders)})")
+        raise UserError(f"no such command: {order} (there are {', '.join((*orders, *OWN_ORDERS))})")
     argument = argument_of(order, value)
+    if not channel:
+        raise UserError("to which module? --channel names its serial port (/dev/ttyACM0), or the --interface's channel")
+    key = read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
         link.bus.send(frame(payload(CHALLENGE)))
         challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE])
