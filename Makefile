@@ -4,7 +4,7 @@
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
-#   make campaigns              every fault campaign on the STM32F405 image at length, an hour and more
+#   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]   random calls of the library under sanitizers, 10^7 executions
 #   make firmware [ACCEPT=1]    build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above a target's budget
@@ -95,7 +95,7 @@ emulate: setup
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt
-	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py
+	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
