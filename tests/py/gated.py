@@ -27,15 +27,15 @@ def make_gate(model: Model, tables: Tables) -> _library32.Gate:
 
 
 class Learning:
-    """A gate that takes the noise it has measured, as the application has it do: after 30 windows of rest and whenever
-    there are twice as many."""
+    """A gate that takes the noise it has measured, as the application has it do: after the least number of windows of
+    rest that it can be measured on, and whenever there are twice as many."""
 
     def __init__(self, model: Model, tables: Tables) -> None:
         table = gate_table(model, tables)
         assert table is not None
         self.window, self.axes = table.window, len(table.sigma)
         self.gate = make_gate(model, tables)
-        self.learn_at = 30
+        self.learn_at = _library32.GATE_MEASURED_MIN
 
     def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Samples [n, axes], not beyond the end of a window; whether each is at rest."""

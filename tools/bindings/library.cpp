@@ -387,6 +387,7 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("version") = SELFCAL_VERSION;
     m.attr("GRID_MAX") = SELFCAL_GRID_MAX;
     m.attr("BATCH") = SELFCAL_BATCH;
+    m.attr("GATE_MEASURED_MIN") = SELFCAL_GATE_MEASURED_MIN;
     m.attr("REGRESSORS_MAX") = SELFCAL_REGRESSORS_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
