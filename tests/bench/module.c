@@ -2,7 +2,7 @@
  * the sensor's full rate, between reports and while one is worked out, and how long samples wait then; the gate by itself. Time is the instructions' own, at MHZ of them a second.
  * Prints as bench.c does. Reading the sensor and writing the wire are not in it. */
 #include "app.h"
-#include "image.h"
+#include "count.h"
 #include "record.h"
 
 #define AXES SELFCAL_MODEL_AXES
@@ -21,11 +21,6 @@
 #define MHZ 48U
 #define PERIOD_TICKS 60000U
 #endif
-
-typedef struct {
-    uint64_t ticks;
-    uint32_t rounds, parts;
-} taken_t;
 
 static record_t record;
 static float ring[RING][AXES];
@@ -77,38 +72,9 @@ static taken_t turn(void) {
     most_waiting = waiting > most_waiting ? waiting : most_waiting;
     const image_time_t start = image_now();
     (void)app_step(&app);
-    const image_time_t now = image_now();
-    const taken_t taken = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
+    const taken_t taken = count_since(start);
     now_ticks += taken.ticks;
     return taken;
-}
-
-static void add(taken_t *sum, taken_t part) {
-    sum->ticks += part.ticks;
-    sum->rounds += part.rounds;
-    sum->parts += part.parts;
-}
-
-static void print_count(const char *name, taken_t taken, uint64_t per) {
-    image_print("count ");
-    image_print(name);
-    image_print(" ");
-    image_print_number(taken.ticks);
-    image_print(" ");
-    image_print_number(taken.parts);
-    image_print(" ");
-    image_print_number(taken.rounds);
-    image_print(" ");
-    image_print_number(per);
-    image_print("\n");
-}
-
-static void print_value(const char *name, uint64_t number) {
-    image_print("value ");
-    image_print(name);
-    image_print(" ");
-    image_print_number(number);
-    image_print("\n");
 }
 
 /* One sample into the gate of the application, which is not in use any more. */
@@ -117,9 +83,7 @@ static taken_t push_gate(void) {
     fill();
     const image_time_t start = image_now();
     (void)selfcal_gate_push(&app.gate, ring[samples % RING]);
-    const image_time_t now = image_now();
-    const taken_t taken = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
-    return taken;
+    return count_since(start);
 }
 
 static void keep_worst(taken_t *worst, taken_t taken) {
@@ -141,7 +105,7 @@ static void print_gate(void) {
             steps++;
             keep_worst(&step, taken);
         } else if (i >= window) {
-            add(&sum, taken);
+            count_add(&sum, taken);
             keep_worst(&judged, taken);
         }
     }
@@ -149,11 +113,11 @@ static void print_gate(void) {
     for (uint32_t i = 1; i < window; i++) {
         keep_worst(&part, push_gate());
     }
-    print_count("gate", sum, 3U * window);
-    print_count("gate.judge", judged, 1U);
-    print_count("gate.step", step, 1U);
-    print_count("gate.part", part, 1U);
-    print_value("gate.steps", steps);
+    count_print("gate", sum, 3U * window);
+    count_print("gate.judge", judged, 1U);
+    count_print("gate.step", step, 1U);
+    count_print("gate.part", part, 1U);
+    count_print_value("gate.steps", steps);
 }
 
 int main(void) {
@@ -163,19 +127,16 @@ int main(void) {
     if (app_init(&app, &port, REPORT_MS) != SELFCAL_OK || !app_gate(&app)) {
         return 2;
     }
-    const image_time_t start = image_now();
-    const image_time_t now = image_now();
-    const taken_t empty = {now.ticks - start.ticks, now.rounds - start.rounds, 1U};
-    print_count("clock.empty", empty, 1U);
+    count_print_empty();
 
     taken_t between = {0, 0, 0}, worst_between = {0, 0, 0}, worst_report = {0, 0, 0};
     while (app.report_number == 0U) {
         const taken_t taken = turn();
-        add(&between, taken);
+        count_add(&between, taken);
         keep_worst(&worst_between, taken);
     }
-    print_count("sample", between, samples);
-    print_count("sample.worst", worst_between, 1U);
+    count_print("sample", between, samples);
+    count_print("sample.worst", worst_between, 1U);
 
     if (app.gate.counters.alarms != 0U || app.gate.measured < 60U) {
         return 4; /* the record is one of rest */
@@ -185,17 +146,17 @@ int main(void) {
     while (!app.computing) {
         (void)turn(); /* the status */
     }
-    print_value("sample.most_waiting", most_waiting);
+    count_print_value("sample.most_waiting", most_waiting);
     most_waiting = 0;
     while (app.computing) {
         const taken_t taken = turn();
         keep_worst(&worst_report, taken);
     }
-    print_count("sample.report.worst", worst_report, 1U);
-    print_value("mhz", MHZ);
-    print_value("report.samples", samples - before);
-    print_value("report.most_waiting", most_waiting);
+    count_print("sample.report.worst", worst_report, 1U);
+    count_print_value("mhz", MHZ);
+    count_print_value("report.samples", samples - before);
+    count_print_value("report.most_waiting", most_waiting);
     print_gate();
-    print_value("report.ms", (now_ticks - begun) * 1250U / 1024U / PERIOD_TICKS);
+    count_print_value("report.ms", (now_ticks - begun) * 1250U / 1024U / PERIOD_TICKS);
     return 0;
 }
