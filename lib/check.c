@@ -72,6 +72,7 @@ static bool batches_are_sound(const selfcal_t *self) {
         self->ran >= self->model->nodes || (self->ran > 0U && waits->count == 0U && waits->gap_after == 0U) ||
         self->push_nodes == 0U || !(self->keep > 0.0) || !(self->keep <= 1.0) || !(self->weight >= 0.0) ||
         !(self->beginning >= 0.0) || !(self->beginning <= 1.0) ||
+        (self->model->forgetting == NULL && (self->keep < 1.0 || self->beginning < 1.0)) ||
         !(self->weight <= (selfcal_wide_t)self->n) || (self->n > 0U && !(self->weight > 0.0))) {
         return false;
     }

@@ -133,6 +133,8 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.ran = model.nodes);
     BROKEN(waits->count = 0); /* nothing to run over, yet half of the nodes have */
     BROKEN(bank.push_nodes = 0);
+    BROKEN(bank.keep = 0.5); /* this model forgets nothing */
+    BROKEN(bank.beginning = 0.5);
     BROKEN(gathered->gap_after = 1);
     BROKEN(bank.position = BLOCK);
     BROKEN(bank.used = bank.position + 1U);
