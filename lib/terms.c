@@ -395,6 +395,7 @@ void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, sel
             view->drift_var += (a == b ? 1.0 : 2.0) * spread[term_pair(a, b)];
         }
     }
+    view->drift_var = fmax(view->drift_var, 0.0); /* after the longest gap it is what is left of numbers 10^16 times as large */
 }
 
 bool selfcal_terms_sound(const selfcal_t *self) {
