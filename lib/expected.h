@@ -5,16 +5,13 @@ typedef struct {
     T ln_s; /* ln of what the filter itself takes it to be, over its own sigma_v^2 */
 } NAME(expected_t);
 
-/* The converged filter of (rho, alpha), random walk without a `pole`, over white noise and a first-order drift of deviation
+/* The converged filter of (rho, 1 - phi = beta), a random walk with a beta of 0, over white noise and a first-order drift of deviation
  * sqrt(truth->variance) and pole 1 - truth->rate. Its innovations are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the
  * delay; their variance is that of an ARMA(2,1) process, here written so that nothing cancels when the poles are close to 1. */
-static NAME(expected_t) NAME(expected)(T ln_rho, T ln_alpha, bool pole, T dt_s, const selfcal_truth_t *truth) {
-    T beta = T_(0.0), q = T_exp(T_(2.0) * ln_rho);
-    if (pole) {
-        beta = -T_expm1(-T_exp(ln_alpha) * dt_s);
-        q *= beta * (T_(2.0) - beta);
-    }
-    const T b = beta * (T_(2.0) - beta) - q;
+static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *truth) {
+    const T one_less_phi_sq = beta * (T_(2.0) - beta);
+    const T q = T_exp(T_(2.0) * ln_rho) * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));
+    const T b = one_less_phi_sq - q;
     const T root = T_sqrt(b * b + T_(4.0) * q);
     const T p_inf = b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
     const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf); /* phi K */

@@ -116,7 +116,6 @@ static void transform_line(const selfcal_grid_t *grid, bool transposed, const se
 #define T selfcal_real_t
 #define T_(x) R(x)
 #define T_exp r_exp
-#define T_expm1 r_expm1
 #define T_log1p r_log1p
 #define T_sqrt r_sqrt
 #include "expected.h"
@@ -124,14 +123,12 @@ static void transform_line(const selfcal_grid_t *grid, bool transposed, const se
 #undef T
 #undef T_
 #undef T_exp
-#undef T_expm1
 #undef T_log1p
 #undef T_sqrt
 #define NAME(name) name##_wide
 #define T selfcal_wide_t
 #define T_(x) x
 #define T_exp exp
-#define T_expm1 expm1
 #define T_log1p log1p
 #define T_sqrt sqrt
 #include "expected.h"
@@ -139,21 +136,30 @@ static void transform_line(const selfcal_grid_t *grid, bool transposed, const se
 /* n ln V beyond which selfcal_real_t would cost 0.02 nat. */
 #define WIDE_BEYOND R(2e5)
 
+/* 1 - phi of the drift at an alpha; 0 of a random walk. */
+static selfcal_real_t beta_at(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    return pole ? -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+}
+static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    return pole ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
+}
+
 /* Takes (rho, alpha) as what made the data. A drift slower than the record looks like a random walk within it, and its level
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
-    const selfcal_wide_t dt = (selfcal_wide_t)work->bank->model->dt_s;
     const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
     selfcal_real_t rate = R(0.0), variance = r_exp(R(2.0) * ln_rho);
     if (pole) {
-        rate = r_exp(ln_alpha) * (selfcal_real_t)dt;
+        rate = r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s;
     }
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
     selfcal_truth_t *truth = &work->truth;
     truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
     truth->rate = -r_expm1(-slow);
-    truth->ln_v = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, dt, truth).ln_v;
+    truth->ln_v = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth).ln_v;
     truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
 }
 
@@ -162,19 +168,18 @@ typedef struct {
     selfcal_real_t profile, ln_sigma;
 } expectation_t;
 
-static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
+static expectation_t expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, selfcal_real_t ln_rho, selfcal_real_t ln_alpha,
+                                 selfcal_real_t beta) {
     expectation_t result = {R(0.0), R(0.0)};
-    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
-    const float dt = work->bank->model->dt_s;
     if (hypothesis_of(work)->rho == NULL || is_sum(hypothesis_of(work)->law)) {
         return result;
     }
     if (truth->wide) {
-        const expected_t_wide e = expected_wide((selfcal_wide_t)ln_rho, (selfcal_wide_t)ln_alpha, pole, (selfcal_wide_t)dt, truth);
+        const expected_t_wide e = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
         result.profile = (selfcal_real_t)(-0.5 * work->bank->weight * (e.ln_v - truth->ln_v));
         result.ln_sigma = (selfcal_real_t)(0.5 * (e.ln_v - e.ln_s));
     } else {
-        const expected_t e = expected(ln_rho, ln_alpha, pole, (selfcal_real_t)dt, truth);
+        const expected_t e = expected(ln_rho, beta, truth);
         result.profile = R(-0.5) * (selfcal_real_t)work->bank->weight * (e.ln_v - (selfcal_real_t)truth->ln_v);
         result.ln_sigma = R(0.5) * (e.ln_v - e.ln_s);
     }
@@ -314,7 +319,7 @@ static void step_sigma(selfcal_work_t *work) {
 
 static expectation_t node_expectation(const selfcal_work_t *work, const selfcal_truth_t *truth, uint16_t k) {
     const selfcal_place_t place = place_of(work, k);
-    return expectation(work, truth, place.ln_rho, place.ln_alpha);
+    return expectation(work, truth, place.ln_rho, place.ln_alpha, beta_at(work, place.ln_alpha));
 }
 
 /* What the splines have to carry at the nodes. */
@@ -339,8 +344,11 @@ static void step_shift(selfcal_work_t *work) {
 
 /* ------------------------------------------------------------------------------------------------------------- cells */
 
-static uint16_t cells(const selfcal_grid_t *grid) {
-    return grid != NULL ? SELFCAL_REPORT_CELLS : 1U;
+/* The search makes do with half as many a dimension. */
+#define SEARCH_CELLS (SELFCAL_REPORT_CELLS / 2U)
+
+static uint8_t cells(const selfcal_work_t *work, const selfcal_grid_t *grid) {
+    return grid != NULL ? work->cells : 1U;
 }
 
 static selfcal_real_t cell_middle(const selfcal_work_t *work, int dimension, uint16_t cell) {
@@ -352,9 +360,9 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     for (int d = 0; d < 2; d++) {
         work->lo[d] = lo[d];
-        work->width[d] = (hi[d] - lo[d]) / (selfcal_real_t)cells(d == 0 ? hypothesis->rho : hypothesis->alpha);
+        work->width[d] = (hi[d] - lo[d]) / (selfcal_real_t)cells(work, d == 0 ? hypothesis->rho : hypothesis->alpha);
     }
-    for (uint16_t i = 0; hypothesis->rho != NULL && i < SELFCAL_REPORT_CELLS; i++) {
+    for (uint16_t i = 0; hypothesis->rho != NULL && i < work->cells; i++) {
         const selfcal_real_t z = (cell_middle(work, 0, i) - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
         work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->basis[i]);
     }
@@ -386,13 +394,15 @@ typedef struct {
     selfcal_real_t profile[SELFCAL_GRID_MAX], ln_sigma[SELFCAL_GRID_MAX];
     selfcal_real_t basis[6]; /* of alpha */
     uint8_t basis_first;
-    selfcal_real_t ln_alpha, shift;
+    selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
 } row_t;
 
 static void make_row(const selfcal_work_t *work, row_t *row) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
     row->ln_alpha = cell_middle(work, 1, work->row);
+    row->beta = beta_at(work, row->ln_alpha);
+    row->half_ln_dt = half_ln_dt(work);
     row->shift = drift_shift(work);
     uint16_t taps = 1;
     row->basis_first = 0;
@@ -444,7 +454,7 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
         const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
         cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
     }
-    const expectation_t e = expectation(work, &work->truth, cell->ln_rho, row->ln_alpha);
+    const expectation_t e = expectation(work, &work->truth, cell->ln_rho, row->ln_alpha, row->beta);
     cell->profile += e.profile;
     cell->ln_sigma += e.ln_sigma;
 }
@@ -453,12 +463,12 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
 static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t middle, selfcal_real_t width) {
     const selfcal_real_t lo = r_fmax(middle - R(0.5) * width, (selfcal_real_t)prior->ln_min);
     const selfcal_real_t hi = r_fmin(middle + R(0.5) * width, (selfcal_real_t)prior->ln_max);
-    return hi > lo ? (width > R(0.0) ? (hi - lo) / width : R(1.0)) : R(0.0);
+    return hi > lo ? (hi - lo) / width : R(0.0);
 }
 
 /* ln of the parameters at the conditional mode of a cell. */
-static void cell_parameters(const selfcal_work_t *work, const row_t *row, const cell_t *cell, selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
-    ln_value[SELFCAL_N] = cell->ln_sigma + half_ln_dt(work);
+static void cell_parameters(const row_t *row, const cell_t *cell, selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
+    ln_value[SELFCAL_N] = cell->ln_sigma + row->half_ln_dt;
     ln_value[SELFCAL_ALPHA] = row->ln_alpha;
     ln_value[SELFCAL_K] = cell->ln_rho + cell->ln_sigma + row->shift;
     ln_value[SELFCAL_SIGMA_M] = ln_value[SELFCAL_K];
@@ -484,26 +494,31 @@ static void begin_pass(selfcal_work_t *work) {
     }
 }
 
-/* The conditional mode's reach: the sigma_v cells around it. */
-static bool reachable(const selfcal_work_t *work, const selfcal_prior_t *prior, selfcal_real_t ln_value, selfcal_real_t extra) {
-    return ln_value + work->delta[0] - extra < (selfcal_real_t)prior->ln_max &&
-           ln_value + work->delta[SELFCAL_SIGMA_CELLS - 1] + extra > (selfcal_real_t)prior->ln_min;
-}
-
 static void step_scan(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
+    const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
     row_t row;
     make_row(work, &row);
-    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(hypothesis->rho)); i < work->at; i++) {
+    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(work, hypothesis->rho)); i < work->at; i++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         make_cell(work, &row, i, &cell);
-        cell_parameters(work, &row, &cell, ln_value);
-        if (!reachable(work, &prior[SELFCAL_N], ln_value[SELFCAL_N], R(0.0)) ||
-            (hypothesis->rho != NULL && !reachable(work, &prior[drift], ln_value[drift], R(0.5) * work->width[0]))) {
+        cell_parameters(&row, &cell, ln_value);
+        /* The height at the sigma_v next to its mode that the limits leave, half a cell along rho beyond them included. */
+        selfcal_real_t from = work->delta[0], to = work->delta[SELFCAL_SIGMA_CELLS - 1];
+        for (unsigned j = 0; j < sides; j++) {
+            const unsigned p = j == 0U ? SELFCAL_N : drift;
+            const selfcal_real_t half = j == 0U ? R(0.0) : R(0.5) * work->width[0];
+            from = r_fmax(from, (selfcal_real_t)prior[p].ln_min - ln_value[p] - half);
+            to = r_fmin(to, (selfcal_real_t)prior[p].ln_max - ln_value[p] + half);
+        }
+        if (!(from < to)) {
             continue;
+        }
+        if (from > R(0.0) || to < R(0.0)) {
+            cell.profile -= (selfcal_real_t)work->n_eff * sigma_shape(from > R(0.0) ? from : to);
         }
         if (cell.profile > work->best) {
             work->best = cell.profile;
@@ -549,7 +564,7 @@ static bool end_scan(selfcal_work_t *work) {
         work->found_lo[d] = present ? r_fmax(work->found_lo[d], work->limit_lo[d]) : work->limit_lo[d];
         work->found_hi[d] = present ? r_fmin(work->found_hi[d], work->limit_hi[d]) : work->limit_hi[d];
         shrunk = shrunk || (present && work->found_hi[d] - work->found_lo[d] <
-                                           SHRINK * work->width[d] * (selfcal_real_t)SELFCAL_REPORT_CELLS);
+                                           SHRINK * work->width[d] * (selfcal_real_t)work->cells);
     }
     return !shrunk || work->pass >= PASSES_MAX;
 }
@@ -628,55 +643,65 @@ static void deposit(const spread_t *spread, selfcal_real_t middle, selfcal_real_
     spread->bins[bin < SELFCAL_HISTOGRAM ? bin : SELFCAL_HISTOGRAM - 1] += density * (to - from);
 }
 
-/* What a cell adds to the sums, sigma_v integrated. */
+/* What a cell adds to the sums, sigma_v integrated: its mass, and first and second moments of N and of the drift parameter about the
+ * best cell, relative. */
 typedef struct {
-    selfcal_real_t mass, n1, n2, d1, d2; /* and first and second moments of N and the drift parameter about the best cell, relative */
+    selfcal_real_t mass, first[2], second[2];
 } moments_t;
+
+/* N or the drift parameter in a cell. */
+typedef struct {
+    const selfcal_prior_t *prior;
+    selfcal_real_t ln_value, width; /* at sigma_v's conditional mode; what it runs through at each sigma_v of the cell */
+    selfcal_real_t off;             /* from the best cell, relative */
+    spread_t spread;
+} side_t;
 
 /* `fall`: change of ln sigma_v's mode from one side of the cell to the other. */
 static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t fall) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
-    const selfcal_prior_t *n_prior = &prior_of(work)[SELFCAL_N], *drift_prior = &prior_of(work)[drift];
-    const bool has_drift = hypothesis->rho != NULL;
-    /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
-     * noise, sigma_v falls as rho rises and their product stands still. */
-    const selfcal_real_t n_width = r_fmax(work->delta_width, has_drift ? r_fabs(fall) : R(0.0));
-    const selfcal_real_t drift_width = r_fmax(work->delta_width, r_fabs(work->width[0] + fall));
-    const spread_t n_spread = spread_over(work, SELFCAL_N, n_width), drift_spread = spread_over(work, drift, drift_width);
-    const selfcal_real_t n_off = r_expm1(ln_value[SELFCAL_N] - work->best_ln[SELFCAL_N]);
-    const selfcal_real_t drift_off = has_drift ? r_expm1(ln_value[drift] - work->best_ln[drift]) : R(0.0);
-    moments_t sum = {R(0.0), R(0.0), R(0.0), R(0.0), R(0.0)};
+    const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
+    bool whole = true; /* the priors leave all of the cell */
+    side_t side[2];
+    for (unsigned j = 0; j < sides; j++) {
+        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        side_t *s = &side[j];
+        s->prior = &prior_of(work)[p];
+        s->ln_value = ln_value[p];
+        /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
+         * noise, sigma_v falls as rho rises and their product stands still. */
+        s->width = r_fmax(work->delta_width, sides == 1U ? R(0.0) : r_fabs(j == 0U ? fall : work->width[0] + fall));
+        s->off = r_expm1(ln_value[p] - work->best_ln[p]);
+        s->spread = spread_over(work, p, s->width);
+        whole = whole && ln_value[p] + work->delta[0] - R(0.5) * s->width >= (selfcal_real_t)s->prior->ln_min &&
+                ln_value[p] + work->delta[SELFCAL_SIGMA_CELLS - 1] + R(0.5) * s->width <= (selfcal_real_t)s->prior->ln_max;
+    }
+    moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        const selfcal_real_t delta = work->delta[k];
-        const selfcal_real_t ln_n = ln_value[SELFCAL_N] + delta, ln_drift = ln_value[drift] + delta;
-        /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
-        selfcal_real_t w = height * work->delta_weight[k] * permitted(n_prior, ln_n, n_width);
-        if (n_prior->uniform) {
-            w *= r_exp(ln_n);
-        }
-        if (has_drift) {
-            w *= permitted(drift_prior, ln_drift, drift_width);
-            if (drift_prior->uniform) {
-                w *= r_exp(ln_drift);
+        selfcal_real_t w = height * work->delta_weight[k];
+        for (unsigned j = 0; j < sides; j++) {
+            const side_t *s = &side[j];
+            const selfcal_real_t ln = s->ln_value + work->delta[k];
+            if (!whole) {
+                w *= permitted(s->prior, ln, s->width);
+            }
+            /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
+            if (s->prior->uniform) {
+                w *= r_exp(ln);
             }
         }
         if (!(w > R(0.0))) {
             continue;
         }
         const selfcal_real_t e = work->delta_expm1[k];
-        const selfcal_real_t n_dev = r_fma(n_off, e, n_off + e);
-        const selfcal_real_t wn = w * n_dev;
         sum.mass += w;
-        sum.n1 += wn;
-        sum.n2 = r_fma(wn, n_dev, sum.n2);
-        deposit(&n_spread, ln_n, w);
-        if (has_drift) {
-            const selfcal_real_t d_dev = r_fma(drift_off, e, drift_off + e);
-            const selfcal_real_t wd = w * d_dev;
-            sum.d1 += wd;
-            sum.d2 = r_fma(wd, d_dev, sum.d2);
-            deposit(&drift_spread, ln_drift, w);
+        for (unsigned j = 0; j < sides; j++) {
+            const side_t *s = &side[j];
+            const selfcal_real_t dev = r_fma(s->off, e, s->off + e);
+            const selfcal_real_t weighed = w * dev;
+            sum.first[j] += weighed;
+            sum.second[j] = r_fma(weighed, dev, sum.second[j]);
+            deposit(&s->spread, s->ln_value + work->delta[k], w);
         }
     }
     return sum;
@@ -689,7 +714,7 @@ static void step_sum(selfcal_work_t *work) {
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    const uint16_t last = (uint16_t)(cells(hypothesis->rho) - 1U);
+    const uint16_t last = (uint16_t)(cells(work, hypothesis->rho) - 1U);
     selfcal_real_t weight[SELFCAL_GRID_MAX], weight_sq[SELFCAL_GRID_MAX]; /* of the rho basis functions */
     memset(weight, 0, sizeof weight);
     memset(weight_sq, 0, sizeof weight_sq);
@@ -714,18 +739,18 @@ static void step_sum(selfcal_work_t *work) {
             continue;
         }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
-        cell_parameters(work, &row, &cell, ln_value);
+        cell_parameters(&row, &cell, ln_value);
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
         /* Above the best of the search are cells out of the priors' reach, however far: their mass is 0 times a finite height. */
         const selfcal_real_t height = r_exp(r_fmin(cell.profile - work->best, DEPTH));
         const moments_t sum = sum_cell(work, ln_value, height * alpha_density, fall);
         part_mass += (selfcal_wide_t)sum.mass;
         work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
-        work->first[SELFCAL_N] += (selfcal_wide_t)sum.n1;
-        work->second[SELFCAL_N] += (selfcal_wide_t)sum.n2;
-        work->first[drift] += (selfcal_wide_t)sum.d1; /* zero without a drift */
-        work->second[drift] += (selfcal_wide_t)sum.d2;
-        const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.n1 + sum.n2; /* times (N / best N)^2 */
+        for (unsigned j = 0; j < 2U; j++) { /* zero without a drift */
+            work->first[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.first[j];
+            work->second[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.second[j];
+        }
+        const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.first[0] + sum.second[0]; /* times (N / best N)^2 */
         for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
             const selfcal_real_t basis = has_drift ? work->basis[i][k] : R(1.0);
             const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
@@ -1072,19 +1097,20 @@ static void step_box(selfcal_work_t *work) {
     } else if (work->moved) {
         set_box(work, work->found_lo, work->found_hi);
     }
-    if (work->found) {
+    if (work->cells == SELFCAL_REPORT_CELLS) {
         begin_sum(work);
+        work->stage = SUM;
     } else {
         begin_pass(work);
+        work->stage = SCAN;
     }
-    work->stage = work->found ? SUM : SCAN;
 }
 
 /* After a row of a pass: the next one, the next pass, or what follows the search. */
 static void next_scan(selfcal_work_t *work) {
     work->at = 0;
     work->row++;
-    if (work->row < cells(hypothesis_of(work)->alpha)) {
+    if (work->row < cells(work, hypothesis_of(work)->alpha)) {
         return;
     }
     const bool over = end_scan(work), found = work->best > (selfcal_real_t)-INFINITY;
@@ -1098,7 +1124,7 @@ static void next_scan(selfcal_work_t *work) {
         set_truth(work, work->best_at[0], work->best_at[1]);
         go_to(work, SHIFT);
     } else {
-        work->found = over;
+        work->cells = over ? SELFCAL_REPORT_CELLS : SEARCH_CELLS;
         work->stage = BOX;
     }
 }
@@ -1117,7 +1143,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         return SELFCAL_OK;
     }
     selfcal_posterior_t *posterior = &report->hypothesis[work->hypothesis];
-    const uint16_t nodes = nodes_of(work), row = cells(hypothesis_of(work)->rho);
+    const uint16_t nodes = nodes_of(work), row = cells(work, hypothesis_of(work)->rho);
     switch (work->stage) {
     case GATHER:
         if (step_gather(work)) {
@@ -1160,7 +1186,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     case SPLINE_SIGMA:
         if (step_transform(work, false, work->field[1], work->spline[1])) {
             work->pass = 0;
-            work->found = false;
+            work->cells = SEARCH_CELLS;
             work->stage = BOX;
         }
         break;
@@ -1178,7 +1204,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         if (work->at == row) {
             work->at = 0;
             work->row++;
-            if (work->row == cells(hypothesis_of(work)->alpha)) {
+            if (work->row == cells(work, hypothesis_of(work)->alpha)) {
                 go_to(work, work->mass > 0.0 ? WEIGHTS : EVIDENCE);
             }
         }

@@ -732,7 +732,8 @@ typedef struct {
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
     uint16_t best_node;
     bool refined;            /* the expectation is about the peak, no longer about the best node */
-    bool moved, found;       /* the box is to change after a pass; it is the one to sum over */
+    bool moved;              /* the box is to change after a pass */
+    uint8_t cells;           /* a dimension: fewer in the search than in the sums */
     selfcal_truth_t truth, truth_before;
     /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
     selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
