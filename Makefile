@@ -125,7 +125,7 @@ $(eval $(call C_TESTS,fixed32))
 
 # --------------------------------------------------------------------------------------------------------------- fuzz
 
-# Small grids and batches: an execution is some 0.15 ms. trace-cmp finds magic numbers, which the harness has none of.
+# Small grids and batches: an execution is some 0.2 ms. trace-cmp finds magic numbers, which the harness has none of.
 .PHONY: fuzz
 KERNEL ?= float
 FUZZ := $(BUILD)/fuzz/$(KERNEL)

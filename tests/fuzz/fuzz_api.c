@@ -3,16 +3,19 @@
  * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, counters not running backwards, reports that are
  * probability laws. After every LOOK_EVERY-th, and wherever the state is about to be replaced: selfcal_check() content (what is
  * broken stays broken). A twin, once restored from a snapshot, gets the same calls and must stay equal bit for bit.
- * An execution is fast: small grids and batches (see the Makefile), and by a hash of the input only some executions make whole
- * reports, save snapshots, or push long records. */
+ * An execution is fast: small grids and batches (see the Makefile), seldom two sums in a model, records that are short where the
+ * nodes are many, and by a hash of the input only some executions make whole reports, save snapshots, or push long records. */
 #include <math.h>
+#include <sanitizer/asan_interface.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "selfcal.h"
 
-enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID, STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 4 };
+enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID };
+enum { STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 32 };
+enum { EFFORT = 1500, SAMPLES_MIN = 10 }; /* for bank samples, some 0.1 ms; but a batch and a part of the next are had by all */
 #define MORE (SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
               SELFCAL_TERMS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX))
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
@@ -58,7 +61,11 @@ static bank_t bank, twin;
 static bool twinned;      /* the twin is at the bank's state */
 static bool tampered;     /* the bank comes from a snapshot that no bank wrote: numbers may overflow, memory may not */
 static bool reporting;    /* a report is under way */
-static unsigned pushes, steps, snapshots; /* left: long inputs, whole reports and snapshots are slow */
+static size_t in_use;     /* bytes of their memory */
+static unsigned pushes, effort, steps, snapshots; /* left: long inputs, whole reports and snapshots are slow */
+static unsigned sample_effort;    /* of effort, for a bank sample */
+static unsigned flushes, reports; /* left: looks that take all nodes through a part of a batch, reports that come to an end */
+static bool moved;                /* there may be such a part */
 static selfcal_counters_t before;
 static uint32_t count_before;
 static selfcal_work_t work, twin_work;
@@ -125,10 +132,12 @@ static void make_fit(void) {
     }
 }
 
-static void make_model(input_t *in) {
+static void make_model(input_t *in, bool any_sums) {
     static const float intervals[] = {1.0F, 0.1F, 1.0F / 819.2F, 100.0F};
     static const uint32_t blocks[] = {1, 2, 3, 8};
     static const float priors[][2] = {{-7.0F, -0.7F}, {-14.0F, 4.0F}, {-1.0F, 1.0F}};
+    /* bits: SELFCAL_FLICKER, SELFCAL_MOVING_AVERAGE, SELFCAL_WALK_AND_MARKOV. 36 nodes each: models of several are rare */
+    static const uint8_t sums[] = {0, 1, 2, 1, 4, 0, 2, 4};
     const uint8_t shape = byte(in), kind = byte(in), limits = byte(in);
     memset(&model, 0, sizeof model);
     model.id = 7;
@@ -156,8 +165,10 @@ static void make_model(input_t *in) {
         a->stuck_limit = (limits >> 3 & 1U) != 0U ? 3U : 0U;
     }
     unsigned laws = (kind & 7U) == 0U ? 7U : kind & 7U;
+    const unsigned more = limits >> 4 & 7U;
+    const bool all = any_sums && shape >> 5 == 6U;
     if (SELFCAL_TERMS_MAX > 1) {
-        laws |= (limits >> 4 & 3U) << SELFCAL_FLICKER | (limits >> 6 & 1U) << SELFCAL_WALK_AND_MARKOV;
+        laws |= (all ? more : sums[more]) << SELFCAL_FLICKER;
     }
     for (unsigned law = 0; law < SELFCAL_LAWS; law++) {
         if ((laws >> law & 1U) != 0U) {
@@ -187,7 +198,7 @@ static void make_model(input_t *in) {
         }
         model.regressors = &regressors;
     }
-    if ((limits >> 4 & 3U) == 3U) {
+    if (all ? (more & 3U) == 3U : more == 3U || more == 5U || more == 7U) {
         forgetting.code = &selfcal_forgetting_code;
         forgetting.half_life_s = ldexpf(model.dt_s, 3 + 3 * (limits >> 6)); /* 8 to 4096 bank intervals */
         model.forgetting = &forgetting;
@@ -251,7 +262,7 @@ static selfcal_status_t save(const bank_t *from, store_t *store) {
 }
 
 static selfcal_status_t restore(bank_t *to, const store_t *store) {
-    return selfcal_restore(&to->self, &model, to->memory, sizeof to->memory, store->bytes, store->length);
+    return selfcal_restore(&to->self, &model, to->memory, in_use, store->bytes, store->length);
 }
 
 /* Nodes of the laws that are no sums. */
@@ -262,6 +273,26 @@ static size_t plain_nodes(void) {
         nodes += of->law >= SELFCAL_FLICKER ? 0U : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
     }
     return nodes;
+}
+
+/* What a bank sample costs, in some 0.1 us: each node's gains and the series it filters, those of sums to twice the digits. */
+static unsigned effort_of_sample(void) {
+    const unsigned columns = 1U + model.axes + (model.regressors != NULL ? regressors.count : 0U), plain = (unsigned)plain_nodes();
+    return (model.nodes - plain) * (3U + columns) + plain * (2U + columns) / (model.regressors != NULL ? 2U : 4U) + 1U;
+}
+
+/* Bytes of the bank's memory that this model needs. */
+static size_t needed(void) {
+    const size_t columns = model.regressors != NULL ? regressors.count : 0U;
+    return SELFCAL_SIZE(model.nodes, model.axes) + SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, columns) +
+           SELFCAL_TERMS_SIZE(model.nodes - plain_nodes(), model.axes, columns);
+}
+
+/* What lies beyond is out of bounds. */
+static void fence(bank_t *of) {
+    uint8_t *memory = (uint8_t *)of->memory;
+    ASAN_UNPOISON_MEMORY_REGION(memory, in_use);
+    ASAN_POISON_MEMORY_REGION(memory + in_use, sizeof of->memory - in_use);
 }
 
 /* All but the pointers; padding is clear in both. */
@@ -346,10 +377,12 @@ static void check_motion(selfcal_motion_t motion) {
 /* -------------------------------------------------------------------------------------------------------------- calls */
 
 static void push(const float sample[]) {
-    if (pushes == 0U) {
+    if (pushes == 0U || effort == 0U) {
         return;
     }
     pushes--;
+    moved = true;
+    const uint32_t samples = selfcal_count(&bank.self);
     HOLDS(selfcal_push(&bank.self, sample) == SELFCAL_OK || model.regressors != NULL);
     if (model.regressors != NULL) {
         HOLDS(selfcal_push_with(&bank.self, sample, values) == SELFCAL_OK);
@@ -360,6 +393,9 @@ static void push(const float sample[]) {
     values[0] += 0.1F;
     if (has_gate) {
         check_motion(selfcal_gate_push(&gate, sample));
+    }
+    if (selfcal_count(&bank.self) != samples) {
+        effort -= effort < sample_effort ? effort : sample_effort;
     }
 }
 
@@ -401,6 +437,7 @@ static void set_values(input_t *in) {
 }
 
 static void skip(uint64_t count) {
+    moved = true;
     HOLDS(selfcal_skip(&bank.self, count) == SELFCAL_OK);
     if (twinned) {
         HOLDS(selfcal_skip(&twin.self, count) == SELFCAL_OK);
@@ -411,6 +448,7 @@ static void skip(uint64_t count) {
 }
 
 static void moving(void) {
+    moved = true;
     HOLDS(selfcal_moving(&bank.self) == SELFCAL_OK);
     if (twinned) {
         HOLDS(selfcal_moving(&twin.self) == SELFCAL_OK);
@@ -438,7 +476,7 @@ static void rate(input_t *in) {
 
 static void look_at_node(input_t *in) {
     const uint8_t axis = byte(in) % (SELFCAL_AXES_MAX + 1U);
-    const uint16_t index = byte(in);
+    const uint16_t index = (uint16_t)(byte(in) % (model.nodes + 2U)); /* seldom out of range */
     selfcal_node_view_t view;
     selfcal_wide_t ln_p = 0.0, sigma;
     const uint8_t odd = byte(in);
@@ -448,6 +486,11 @@ static void look_at_node(input_t *in) {
     } else {
         sigma = ldexp(1.0 + odd % 16, odd / 16 - 12);
     }
+    if (moved && flushes == 0U) {
+        return;
+    }
+    flushes -= moved ? 1U : 0U;
+    moved = false;
     const selfcal_status_t status = selfcal_node(&bank.self, axis, index, &view);
     HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED || status == SELFCAL_BAD_ARGUMENT);
     HOLDS((status == SELFCAL_BAD_ARGUMENT) == (axis >= model.axes || index >= model.nodes));
@@ -462,6 +505,9 @@ static void look_at_node(input_t *in) {
 }
 
 static void report_begin(input_t *in) {
+    if (reports == 0U) {
+        return;
+    }
     const uint8_t axis = byte(in) % (SELFCAL_AXES_MAX + 1U);
     const uint8_t mask = model.regressors != NULL ? byte(in) & 3U : 0U;
     const selfcal_status_t status = selfcal_report_begin_subset(&work, &bank.self, axis, mask, NULL, &report);
@@ -486,6 +532,7 @@ static void report_steps(unsigned wanted) {
         HOLDS(selfcal_report_step(&work, &report) == SELFCAL_BAD_ARGUMENT || status != SELFCAL_OK);
     }
     if (status == SELFCAL_OK) {
+        reports--;
         HOLDS(!twinned || memcmp(&report, &twin_report, sizeof report) == 0);
         if (!tampered) {
             check_report();
@@ -536,14 +583,16 @@ static void look_at_gate(input_t *in) {
 }
 
 static void send_status(input_t *in) {
-    static const char *const names[][SELFCAL_AXES_MAX] = {{"gx", "gy", "gz"}, {"ax", "ay", "az"}, {"gx", "gx", "gx"}, {"", "az", "xyz"}};
+    static const char *const names[][SELFCAL_AXES_MAX] = {
+        {"gx", "gy", "gz"}, {"ax", "ay", "az"}, {"gx", "gx", "gx"}, {"", "az", "xyz"}};
     const uint8_t which = byte(in);
     const selfcal_status_t status = selfcal_telemetry_init(&telemetry, &model, names[which & 3U]);
     HOLDS(status == SELFCAL_OK || status == SELFCAL_BAD_MODEL);
     has_telemetry = status == SELFCAL_OK;
     if (has_telemetry) {
-        HOLDS(selfcal_telemetry_status(&telemetry, selfcal_counters(&bank.self), (which & 4U) != 0U ? SELFCAL_RUNNING : SELFCAL_FINISHED,
-                                       which, (uint32_t)bits(in, 4)) == SELFCAL_OK);
+        HOLDS(selfcal_telemetry_status(&telemetry, selfcal_counters(&bank.self),
+                                       (which & 4U) != 0U ? SELFCAL_RUNNING : SELFCAL_FINISHED, which,
+                                       (uint32_t)bits(in, 4)) == SELFCAL_OK);
         check_frames();
     }
 }
@@ -555,7 +604,8 @@ static void twin_from_snapshot(void) {
     }
     snapshots--;
     HOLDS(save(&bank, &store) == SELFCAL_OK);
-    memset(&twin, 0xA5, sizeof twin);
+    memset(&twin.self, 0xA5, sizeof twin.self);
+    memset(twin.memory, 0xA5, in_use);
     HOLDS(restore(&twin, &store) == SELFCAL_OK);
     twinned = true;
     reporting = false; /* the twin has none */
@@ -585,7 +635,6 @@ static void restore_mutated(input_t *in) {
         HOLDS(tampered);
         return;
     }
-    memset(mutated.bytes, 0, sizeof mutated.bytes);
     memcpy(mutated.bytes, store.bytes, store.length);
     mutated.length = store.length;
     const uint8_t how = byte(in);
@@ -595,15 +644,20 @@ static void restore_mutated(input_t *in) {
     if ((how & 0x30U) == 0x30U) {
         mutated.length = bits(in, 2) % sizeof mutated.bytes;
     }
+    if (mutated.length > store.length) {
+        memset(mutated.bytes + store.length, 0, mutated.length - store.length);
+    }
     if ((how & 0x40U) != 0U && mutated.length > 4U) {
         mend_crc(&mutated);
     }
     const bool same = mutated.length == store.length && memcmp(mutated.bytes, store.bytes, store.length) == 0;
-    kept = bank;
+    moved = true;
+    kept.self = bank.self;
+    memcpy(kept.memory, bank.memory, in_use);
     const selfcal_status_t status = restore(&bank, &mutated);
     reporting = false;
     if (same) {
-        HOLDS(status == SELFCAL_OK && memcmp(kept.memory, bank.memory, sizeof kept.memory) == 0);
+        HOLDS(status == SELFCAL_OK && memcmp(kept.memory, bank.memory, in_use) == 0);
     } else if (status == SELFCAL_OK) {
         HOLDS((how & 0x40U) != 0U); /* no flip gets past the checksum */
         HOLDS(selfcal_check(&bank.self) == SELFCAL_OK);
@@ -618,7 +672,7 @@ static void restore_mutated(input_t *in) {
         count_before = 0;
     } else {
         HOLDS(status <= SELFCAL_SNAPSHOT_TRUNCATED && status >= SELFCAL_SNAPSHOT_VERSION);
-        HOLDS(memcmp(&kept, &bank, sizeof bank) == 0);
+        HOLDS(memcmp(&kept.self, &bank.self, sizeof bank.self) == 0 && memcmp(kept.memory, bank.memory, in_use) == 0);
     }
 }
 
@@ -641,7 +695,8 @@ static void bad_arguments(input_t *in) {
     HOLDS(selfcal_skip(NULL, byte(in)) == SELFCAL_BAD_ARGUMENT && selfcal_check(NULL) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_save(NULL, append, NULL) == SELFCAL_BAD_ARGUMENT && selfcal_save(&bank.self, NULL, NULL) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_report_begin(NULL, &bank.self, 0, &report) == SELFCAL_BAD_ARGUMENT);
-    HOLDS(selfcal_restore(&twin.self, &model, twin.memory, sizeof twin.memory, NULL, 100) == SELFCAL_BAD_ARGUMENT);
+    HOLDS(selfcal_restore(&twin.self, &model, twin.memory, in_use, NULL, 100) == SELFCAL_BAD_ARGUMENT);
+    HOLDS(selfcal_init(&twin.self, &model, twin.memory, in_use - 1U) == SELFCAL_BAD_MEMORY);
 }
 
 int LLVMFuzzerInitialize(int *argc, char ***argv);
@@ -670,16 +725,27 @@ static uint32_t hash(const uint8_t *data, size_t size) {
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     input_t in = {data, data + size};
-    make_model(&in);
+    const uint32_t chance = hash(data, size);
+    const bool longer = chance % 8U == 0U;
+    make_model(&in, longer);
+    in_use = sizeof bank.memory;
+    fence(&bank);
     const selfcal_status_t status = selfcal_init(&bank.self, &model, bank.memory, sizeof bank.memory);
     if (status != SELFCAL_OK) {
         HOLDS(status == SELFCAL_BAD_MODEL || status == SELFCAL_BAD_MEMORY);
         return 0;
     }
+    in_use = needed();
+    fence(&bank);
+    fence(&twin);
     twinned = tampered = reporting = has_telemetry = has_gate = false;
-    const uint32_t chance = hash(data, size);
-    pushes = chance % 8U == 0U ? 200U : 64U;
-    snapshots = chance / 8U % 4U == 0U ? 2U : 0U;
+    pushes = longer ? 200U : 64U;
+    sample_effort = effort_of_sample();
+    effort = (longer ? 4U : 1U) * (SAMPLES_MIN * sample_effort < EFFORT ? EFFORT : SAMPLES_MIN * sample_effort);
+    snapshots = chance / 8U % (1U + model.nodes / 6U) == 0U ? 2U : 0U;
+    flushes = (longer ? 4U : 1U) * (2U + EFFORT / 4U / sample_effort);
+    reports = 3;
+    moved = false;
     const bool whole = chance / 32U % 32U == 0U;
     steps = whole ? STEPS_MAX : 8U;
     memset(&before, 0, sizeof before);
