@@ -27,6 +27,9 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
 #define Q_MAX R(1e12)
 
+/* No prior of drift and white noise, and no interval, puts a node lower. */
+#define LN_RHO_MIN R(-120.0)
+
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
 #define SLACK R(1e-5)
 
@@ -203,9 +206,15 @@ static bool terms_are_sound(const selfcal_t *self) {
 #endif
 }
 
-static bool node_is_sound(const selfcal_t *self, size_t j) {
+/* The node that the kernel takes as the i-th. */
+static bool node_is_sound(const selfcal_t *self, size_t i) {
+    const size_t j = kernel_node(self, i);
     const selfcal_node_t *node = &self->node[j];
-    /* the kernels choose which nodes run first */
+    const bool sum = is_sum(self->model->hypothesis[node_of(self->model, j).hypothesis].law);
+    if ((self->n > 0U || i < self->ran) && (node->c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
+        return false;
+    }
+    /* Some may have run over the batch that waits. */
     const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
     /* P' = phi^2 r P/(r + P) + q: q <= P at any time, and with r = 1 P' < 1 + q */
     if (!within(node->beta, R(0.0), R(1.0)) || !within(node->q, R(0.0), Q_MAX) ||
@@ -220,13 +229,25 @@ static bool node_is_sound(const selfcal_t *self, size_t j) {
     return kernel_is_sound(self, j);
 }
 
-/* The nodes have a place once the first batch has run. */
+/* Whether nodes a step apart lie between two limits, but for rounding. */
+static bool nodes_within(const selfcal_grid_t *grid, selfcal_real_t first, selfcal_real_t step, selfcal_real_t lo, selfcal_real_t hi) {
+    const selfcal_real_t last = first + step * (selfcal_real_t)(grid_nodes(grid) - 1U), slack = R(1e-3);
+    return grid == NULL || (step > R(0.0) && within(first, lo - slack, hi) && within(last, lo, hi + slack));
+}
+
+/* The nodes have a place once the first batch waits for them. */
 static bool grid_is_sound(const selfcal_t *self) {
     for (uint8_t h = 0; h < self->model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[h];
-        if (!isfinite(self->rho_lo[h]) || !isfinite(self->alpha_lo[h]) || !isfinite(self->rho_step[h]) ||
-            !isfinite(self->alpha_step[h]) || (hypothesis->rho != NULL && !(self->rho_step[h] > R(0.0))) ||
-            (hypothesis->alpha != NULL && !(self->alpha_step[h] > R(0.0)))) {
+        selfcal_real_t lo = INFINITY, hi = -INFINITY; /* of alpha, over the axes */
+        for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+            const selfcal_prior_t *prior = &priors_of(self->model, hypothesis, axis)[SELFCAL_ALPHA];
+            lo = r_fmin(lo, (selfcal_real_t)prior->ln_min);
+            hi = r_fmax(hi, (selfcal_real_t)prior->ln_max);
+        }
+        if (!isfinite(self->rho_lo[h]) || !isfinite(self->alpha_lo[h]) ||
+            !nodes_within(hypothesis->rho, self->rho_lo[h], self->rho_step[h], LN_RHO_MIN, LN_RHO_MAX) ||
+            !nodes_within(hypothesis->alpha, self->alpha_lo[h], self->alpha_step[h], lo, hi)) {
             return false;
         }
     }
@@ -241,11 +262,12 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
         !regressors_are_sound(self) || !terms_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
-    if (self->n > 0U && !grid_is_sound(self)) {
+    const selfcal_batch_t *waits = &self->batch[1U - self->gathering];
+    if ((self->n > 0U || waits->count > 0U || waits->gap_after > 0U) && !grid_is_sound(self)) {
         return SELFCAL_CORRUPT;
     }
-    for (size_t j = 0; j < self->model->nodes; j++) {
-        if (!node_is_sound(self, j)) {
+    for (size_t i = 0; i < self->model->nodes; i++) {
+        if (!node_is_sound(self, i)) {
             return SELFCAL_CORRUPT;
         }
     }
