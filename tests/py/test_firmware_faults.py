@@ -1,5 +1,5 @@
-"""Fault campaigns on the unmodified STM32F405 image, those of the saved state on the nRF51822's too: trials, and how
-many were survived. Each prints a line with both.
+"""Fault campaigns on the unmodified STM32F405 image, some on the nRF51822's too (SPI, sensor away, saved state):
+trials, and how many were survived. Each prints a line with both.
 
 A trial is survived when the image does not reset, hang or fault, breaks no rule of a part, gives the library no sample
 that the sensor did not make (wrong = 0) and puts every sample where it belongs in time (misplaced = 0).
@@ -18,6 +18,7 @@ from parts.flash import half_erased, half_programmed
 #: Reports every 500 ms, no bank sample (firmware.py), no gate: for the driver, the wire and the flash.
 QUIET = ("quiet", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0", True)
 SERIAL = ("serial", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0 -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD=1000000", True)
+TARGETS = ("stm32f405", "cortex-m0")
 #: codes of `sensor_fault` in selfcal.dbc
 ABSENT, SELF_TEST, SILENT, NO_DATA, STUCK, STATUS = 1, 3, 4, 5, 6, 7
 STARTING, RUNNING, FAILED = 1, 2, 3
@@ -37,12 +38,23 @@ def sound(board: parts.Board, tap: Tap | None, slack: int) -> bool:
     return well
 
 
-def test_sensor_unplugged_and_back() -> None:
+def quiet(target: str, seed: int) -> parts.Board | parts.NrfBoard:
+    """A board of either target, its channel open."""
+    if target == "stm32f405":
+        return Board(image(*QUIET), seed=seed)
+    board = NrfBoard(image("m0-quiet", *QUIET[1:], target=target), seed=seed)
+    board.run(0.1)
+    board.usart.say(b"O\r")
+    return board
+
+
+@pytest.mark.parametrize("target", TARGETS if MANY > 1 else ["stm32f405"])
+def test_sensor_unplugged_and_back(target: str) -> None:
     """The time away is counted by the module's clock: within a sample a gap."""
-    trials, survived = 4 * MANY, 0
+    trials, survived = (4 if target == "stm32f405" else 1) * MANY, 0
     for trial in range(trials):
         rng = random.Random(trial)
-        board = Board(image(*QUIET), seed=trial)
+        board = quiet(target, seed=trial)
         tap = Tap(board)
         board.sensor.floating_high = bool(trial & 1)
         board.sensor.clock_error = rng.uniform(-0.002, 0.002)
@@ -60,8 +72,9 @@ def test_sensor_unplugged_and_back() -> None:
         assert len(tap.pushed) > while_away + 100, "it did not come back"
         assert status(board)["sensor_state"] == RUNNING
         survived += sound(board, None, 0) and tap.wrong() == 0 and tap.mistimed() == 0
-        board.close()
-    tell("sensor unplugged and back", trials, survived)
+        if isinstance(board, Board):
+            board.close()
+    tell(f"sensor unplugged and back, {target}", trials, survived)
     assert survived == trials
 
 
@@ -129,12 +142,14 @@ def test_sensor_bad_from_the_start(name: str, code: int) -> None:
     assert sound(board, None, 0)
 
 
-@pytest.mark.parametrize("chance", [1e-5, 1e-4, 1e-3])
-def test_spi_bit_flips(chance: float) -> None:
+@pytest.mark.parametrize(
+    ("target", "chance"), [("stm32f405", 1e-5), ("stm32f405", 1e-4), ("stm32f405", 1e-3), ("cortex-m0", 1e-3)]
+)
+def test_spi_bit_flips(target: str, chance: float) -> None:
     """Bits turned over on either wire: no wrong sample is taken. Two bursts carry 192 bits of the six channels, so that
     at 1e-3 every sixth sample is lost."""
-    seconds = 8.0 * MANY
-    board = Board(image(*QUIET), seed=int(1 / chance))
+    seconds = (8.0 if target == "stm32f405" else 3.0) * MANY
+    board = quiet(target, seed=int(1 / chance))
     tap = Tap(board)
     board.run(1.0)
     board.spi.flip = chance
@@ -145,7 +160,7 @@ def test_spi_bit_flips(chance: float) -> None:
     lost = told["sensor_damaged_count"] + told["sensor_stale_count"] + told["sensor_alarm_count"]
     wrong = tap.wrong()
     tell(
-        f"SPI bit flips at {chance:g}",
+        f"SPI bit flips at {chance:g}, {target}",
         board.spi.flipped,
         board.spi.flipped - wrong,
         f"{len(tap.pushed)} samples taken, {lost:.0f} refused, {wrong} wrong",
@@ -425,7 +440,6 @@ def test_clock_falls_back(broken: str) -> None:
 
 SAVING = ("saving", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0 -DBOARD_SAVE_PERIOD_S=2U", True)
 NEWEST, OLDER, REFUSED = 1, 2, 3
-TARGETS = ("stm32f405", "cortex-m0")
 
 
 def saver(
