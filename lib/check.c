@@ -65,6 +65,14 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
     return true;
 }
 
+/* What the samples count for: one each, or less where they are forgotten. */
+static bool weight_is_sound(const selfcal_t *self) {
+    if (self->model->forgetting != NULL) {
+        return self->weight <= (selfcal_wide_t)self->n;
+    }
+    return self->keep == 1.0 && self->beginning == 1.0 && self->weight < 9e15 && (uint32_t)(uint64_t)self->weight == self->n;
+}
+
 /* One batch is gathered and never full: then it is handed over. The other waits for the nodes or is empty. */
 static bool batches_are_sound(const selfcal_t *self) {
     if (self->gathering > 1U) {
@@ -75,8 +83,7 @@ static bool batches_are_sound(const selfcal_t *self) {
         self->ran >= self->model->nodes || (self->ran > 0U && waits->count == 0U && waits->gap_after == 0U) ||
         self->push_nodes == 0U || !(self->keep > 0.0) || !(self->keep <= 1.0) || !(self->weight >= 0.0) ||
         !(self->beginning >= 0.0) || !(self->beginning <= 1.0) ||
-        (self->model->forgetting == NULL && (self->keep < 1.0 || self->beginning < 1.0)) ||
-        !(self->weight <= (selfcal_wide_t)self->n) || (self->n > 0U && !(self->weight > 0.0))) {
+        (self->n > 0U && !(self->weight > 0.0)) || !weight_is_sound(self)) {
         return false;
     }
     /* time before the first sample is no gap */
