@@ -68,7 +68,7 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
 /* What the samples count for: one each, or less where they are forgotten. */
 static bool weight_is_sound(const selfcal_t *self) {
     if (self->model->forgetting != NULL) {
-        return self->weight <= (selfcal_wide_t)self->n;
+        return self->weight <= (selfcal_wide_t)self->n && (self->n > 0U || self->keep == 1.0); /* nothing to forget yet */
     }
     return self->keep == 1.0 && self->beginning == 1.0 && self->weight < 9e15 && (uint32_t)(uint64_t)self->weight == self->n;
 }
@@ -213,11 +213,10 @@ static bool terms_are_sound(const selfcal_t *self) {
 #endif
 }
 
-/* The node that the kernel takes as the i-th. */
-static bool node_is_sound(const selfcal_t *self, size_t i) {
+/* The node that the kernel takes as the i-th; `sum`: of such a law. */
+static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     const size_t j = kernel_node(self, i);
     const selfcal_node_t *node = &self->node[j];
-    const bool sum = is_sum(self->model->hypothesis[node_of(self->model, j).hypothesis].law);
     if ((self->n > 0U || i < self->ran) && (node->c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
         return false;
     }
@@ -273,9 +272,13 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if ((self->n > 0U || waits->count > 0U || waits->gap_after > 0U) && !grid_is_sound(self)) {
         return SELFCAL_CORRUPT;
     }
-    for (size_t i = 0; i < self->model->nodes; i++) {
-        if (!node_is_sound(self, i)) {
-            return SELFCAL_CORRUPT;
+    size_t i = 0;
+    for (uint8_t h = 0; h < self->model->hypotheses; h++) {
+        const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[h];
+        for (const size_t end = i + hypothesis_nodes(hypothesis); i < end; i++) {
+            if (!node_is_sound(self, i, is_sum(hypothesis->law))) {
+                return SELFCAL_CORRUPT;
+            }
         }
     }
     return SELFCAL_OK;
