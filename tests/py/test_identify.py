@@ -264,3 +264,39 @@ def test_stretch_of_run1_against_an_independent_computation(axis: str) -> None:
     assert result.probability["gauss_markov"] == pytest.approx(p, abs=0.02)
     if k is not None and k_sd is not None:
         assert abs(drift.mean - k) <= 2.0 * k_sd
+
+
+def test_a_ramp_is_no_adequate_random_walk(tmp_path: Path) -> None:
+    """1e-4 deg/s a second in white noise: a random walk follows it, but half a second late, which is told. Innovations
+    of records drawn from the prior have a mean of 0 +- 1/sqrt(n), and none fails."""
+    rng = np.random.default_rng(4)
+    log = tmp_path / "ramp.csv"
+    save(log, {"gx": ("deg/s", 0.2 + 1e-4 * np.arange(3600.0) + 0.016 * rng.normal(size=3600))}, 1.0, {})
+    axis = identify(log)["axes"]["gx"]
+    assert max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law]) == "random_walk"
+    assert not axis["checks"]["innovation_mean"]["passed"]
+    assert not axis["adequate"]
+    means = []
+    for seed in range(12):
+        law = PLAIN[seed % 3]
+        y, _ = simulate_bank_samples(law, draw(GROUP, law, np.random.default_rng(seed)), 1.0, 2000, seed)
+        save(log, {"gx": ("deg/s", y)}, 1.0, {})
+        check = identify(log)["axes"]["gx"]["checks"]["innovation_mean"]
+        assert check["passed"]
+        means.append(check["value"] * math.sqrt(2000))
+    assert 0.4 < np.std(means) < 1.8  # 4 sd of a standard deviation of twelve
+
+
+@pytest.mark.parametrize(("option", "samples"), [({}, 5), ({"decimate": 1e-3}, 600)])
+def test_a_record_shorter_than_a_bank_interval(tmp_path: Path, option: dict[str, float], samples: int) -> None:
+    log = tmp_path / "short.csv"
+    save(log, {"gx": ("deg/s", np.random.default_rng(1).normal(size=samples))}, 10.0, {})
+    with pytest.raises(UserError, match="too short: 0 averages"):
+        identify(log, **option)
+
+
+@pytest.mark.parametrize("limits", [{"min": 1e-30, "max": 1e30}, {"min": 1e-3, "max": 1.00000001e-3}])
+def test_priors_that_the_library_cannot_hold(limits: dict[str, float]) -> None:
+    group = replace(GROUP, priors={**GROUP.priors, "N": Prior("log_uniform", **limits)})
+    with pytest.raises(UserError, match=r"gyro.priors.N: min and max must differ, within 1e-20 to"):
+        make_tables(replace(MODEL, groups=(group,)), 1.0, ("gx",))

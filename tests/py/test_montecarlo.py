@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
+from selfcal.errors import UserError
+from selfcal.model import Model
 from selfcal.verbs.montecarlo import montecarlo, show
 
 #: 400 records a law, one hour at 1 Hz, as the issue asks.
@@ -21,3 +27,13 @@ def test_intervals_and_false_identification_are_honest() -> None:
     # error alone; 3 sd.
     f = document["false_identification"]
     assert abs(f["actual"] - f["calculated"]) <= 3.0 * f["sd_of_difference"], f
+
+
+def test_what_it_does_not_simulate(tmp_path: Path) -> None:
+    model = tmp_path / "model.yaml"
+    line = "  - {name: time, kind: time, sd: {gyro: 1.0e-3}}"
+    model.write_text(f"{Model.load().path.read_text()}\nregressors:\n{line}\n")
+    with pytest.raises(UserError, match="the ensemble has no regressors"):
+        montecarlo(model, records=2, duration_s=60.0)
+    with pytest.raises(UserError, match=r"--duration must be at most 1e\+07 s"):
+        montecarlo(records=2, duration_s=1e12)

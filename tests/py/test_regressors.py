@@ -303,3 +303,13 @@ def test_codegen_writes_tables_that_compile(tmp_path: Path) -> None:
     sources = [tmp_path / "main.c", folder / "selfcal_model.c", *lib.glob("*.c")]
     subprocess.run(["gcc", *flags, f"-I{lib}", f"-I{folder}", *sources, "-lm", "-o", tmp_path / "main"], check=True)
     assert subprocess.run([tmp_path / "main"], check=False).returncode == 0
+
+
+def test_a_value_that_no_sum_holds_is_named(tmp_path: Path) -> None:
+    """The library would keep those samples out."""
+    log = tmp_path / "log.csv"
+    rng = np.random.default_rng(8)
+    temp = np.where(np.arange(600) < 300, 1e30, 20.0)
+    save(log, {name: ("deg/s", rng.normal(size=600)) for name in ("gx", "gy")} | {"temp": ("K", temp)}, 1.0, {})
+    with pytest.raises(UserError, match=r"the regressor temperature is 1e\+30 at 300 samples"):
+        identify(log, axes=["gx"], model=model_file(tmp_path, ENTRIES))

@@ -390,6 +390,7 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("GATE_MEASURED_MIN") = SELFCAL_GATE_MEASURED_MIN;
     m.attr("REGRESSORS_MAX") = SELFCAL_REGRESSORS_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
+    m.attr("SAMPLE_MAX") = SELFCAL_SAMPLE_MAX;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
     m.attr("AT_MIN") = static_cast<int>(SELFCAL_AT_MIN);
     m.attr("AT_MAX") = static_cast<int>(SELFCAL_AT_MAX);

@@ -197,7 +197,8 @@ def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
         try:
             scales["" if name == "*" else name] = (float(number), unit)
         except ValueError:
-            raise UserError(f"--scale takes [NAME=]SIZE[unit], not '{text}'") from None
+            wanted = "[NAME=]SIZE, a unit in brackets after it (gx=0.05[deg/s])"
+            raise UserError(f"--scale takes {wanted}, not '{text}'") from None
     return scales
 
 

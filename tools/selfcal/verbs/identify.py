@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from selfcal import _library32
 from selfcal import units as unit_module
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
@@ -137,6 +138,10 @@ def identify_axis(
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
         samples = recording.in_unit(name, group.unit).astype(np.float32)
         columns = columns_of(regressors, recording).astype(np.float32)
+    for name_of, column in zip([column.name for column in tables.regressors], columns.T, strict=True):
+        beyond = np.abs(column) >= _library32.SAMPLE_MAX
+        if beyond.any():
+            raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
     blocks = block_means(
         samples.astype(np.float64), recording.missing_before, tables.block, group, columns.astype(np.float64)
     )
@@ -247,7 +252,8 @@ def block_means(
     total = np.bincount(index, values, minlength=count)
     with np.errstate(invalid="ignore", divide="ignore"):
         raw = total / used
-        z = np.array([np.bincount(index, column, minlength=count) / used for column in rows.T]).reshape(-1, count).T
+        sums = [np.bincount(index, column, minlength=count) for column in rows.T]
+        z = np.column_stack([np.empty((count, 0)), *sums]) / used[:, None]
         mean = np.where(used * 2 >= block, raw, np.nan)
         r = np.where(used * 2 >= block, block / used, 1.0)
     good = np.isfinite(mean)[index]
@@ -261,8 +267,8 @@ def block_means(
 def _checks(
     blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
 ) -> dict[str, dict[str, Any]]:
-    """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, white, normal
-    and of one variance?"""
+    """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a
+    ramp that a random walk follows leaves one), white, normal and of one variance?"""
     from selfcal import _reference
     from selfcal.engines.reference import textbook_node
 
@@ -299,6 +305,7 @@ def _checks(
     ratio = math.log(float(whole[half:].var() / whole[:half].var()))
     # Standard deviations under white normal innovations.
     checks = {
+        "innovation_mean": (float(whole.mean() / whole.std()), 1.0 / math.sqrt(n)),
         "innovation_lag1": (lag1, 1.0 / math.sqrt(n)),
         "innovation_excess_kurtosis": (kurtosis, math.sqrt(24.0 / n)),
         "innovation_ln_variance_ratio_of_halves": (ratio, math.sqrt(8.0 / n)),

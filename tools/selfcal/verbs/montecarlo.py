@@ -30,6 +30,8 @@ from selfcal.verbs.identify import TABLE_WIDTH, write_json
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.
 MIN_SAMPLES = 10
+#: Of a record: 80 MB.
+MOST_SAMPLES = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,10 @@ def montecarlo(
         raise UserError("--records must be at least 2")
     if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
         raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
+    if not duration_s * loaded.bank_rate_hz <= MOST_SAMPLES:
+        raise UserError(f"--duration must be at most {MOST_SAMPLES / loaded.bank_rate_hz:g} s")
+    if loaded.regressors:
+        raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)
     jobs = [(law, seed + 1_000_003 * index) for law in loaded.hypotheses for index in range(records)]
     work = partial(_record, loaded, axis, duration_s)

@@ -161,7 +161,8 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
     rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("reading", "<f4", (len(axes),))])
     rows["missing"] = recording.missing_before
     for index, name in enumerate(axes):
-        rows["reading"][:, index] = recording.in_unit(name, model.group_of(name).unit)
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
+            rows["reading"][:, index] = recording.in_unit(name, model.group_of(name).unit)
     header = np.array(
         [(MAGIC, len(axes), 0, recording.rate_hz, recording.samples)],
         dtype=[("magic", "S8"), ("axes", "<u4"), ("zero", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
