@@ -70,7 +70,7 @@ def test_verbs_are_functions() -> None:
         (["identify", "log.csv", "--engine", "steam"], "Invalid value for '--engine'"),
         (["identify", "log.csv", "--unit", "rad/s"], "--unit takes NAME=VALUE, not 'rad/s'"),
         (["identify", "log.csv", "--column", "gx=a", "--column", "gx=b"], "--column: 'gx' is given twice"),
-        (["identify", "log.csv", "--scale", "big"], "--scale takes [NAME=]SIZE[unit], not 'big'"),
+        (["identify", "log.csv", "--scale", "big"], "--scale takes [NAME=]SIZE, a unit in brackets after it (gx="),
         (["identify", "absent.csv"], "absent.csv: cannot be read: No such file or directory"),
         (["replay", "absent.csv"], "absent.csv: cannot be read: No such file or directory"),
         (["identify", "log.csv", "--model", "absent.yaml"], "absent.yaml: "),
