@@ -84,6 +84,12 @@ class Recording:
         return units.convert(column.values, column.unit, unit)
 
 
+def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """As the firmware gets them: what float32 cannot hold becomes infinite and is kept out."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
 @dataclass(frozen=True)
 class _Field:
     """A column to be read: key in the file, name and unit here, size of its LSB (1 if it is in the unit itself)."""

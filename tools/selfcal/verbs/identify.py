@@ -22,7 +22,7 @@ from selfcal import units as unit_module
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import LAWS, RATIOS, SUMS, Group, Model
-from selfcal.recording import Recording, Scale, load
+from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import Scored, choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult
 from selfcal.tables import Tables, make_tables
@@ -135,9 +135,8 @@ def identify_axis(
     group = model.group_of(name)
     regressors = offered(model, name)
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
-        samples = recording.in_unit(name, group.unit).astype(np.float32)
-        columns = columns_of(regressors, recording).astype(np.float32)
+    samples = as_float(recording.in_unit(name, group.unit))
+    columns = as_float(columns_of(regressors, recording))
     for name_of, column in zip([column.name for column in tables.regressors], columns.T, strict=True):
         beyond = np.abs(column) >= _library32.SAMPLE_MAX
         if beyond.any():

@@ -22,7 +22,7 @@ from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
-from selfcal.recording import Recording, Scale, load
+from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, write_json
@@ -161,8 +161,7 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
     rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("reading", "<f4", (len(axes),))])
     rows["missing"] = recording.missing_before
     for index, name in enumerate(axes):
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is kept out
-            rows["reading"][:, index] = recording.in_unit(name, model.group_of(name).unit)
+        rows["reading"][:, index] = as_float(recording.in_unit(name, model.group_of(name).unit))
     header = np.array(
         [(MAGIC, len(axes), 0, recording.rate_hz, recording.samples)],
         dtype=[("magic", "S8"), ("axes", "<u4"), ("zero", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
