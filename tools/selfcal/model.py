@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from selfcal import units
@@ -36,6 +37,8 @@ PARAMETERS = ("N", "K", "sigma_m", "alpha")
 #: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
 RATIOS = ("spectral_ratio", "markov_ratio")
 RATIO_LIMITS = (1e-3, 1e3)
+#: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
+LN_LIMIT = 46.0
 #: Place of each parameter there; two share one where no law has both.
 PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
@@ -241,6 +244,9 @@ class _Reader:
         least, most = RATIO_LIMITS
         if where.rpartition(".")[2] in RATIOS and not (least <= low and high <= most):
             raise self.fail(where, f"must lie within {least:g} to {most:g}")
+        if not -LN_LIMIT <= np.float32(math.log(low)) < np.float32(math.log(high)) <= LN_LIMIT:
+            reach = f"{math.exp(-LN_LIMIT):.0e} to {math.exp(LN_LIMIT):.0e}"
+            raise self.fail(where, f"min and max must differ, within {reach}, not {low!r} to {high!r}")
         return Prior(law, min=low, max=high)
 
     def group(self, name: str, tree: Any, laws: Collection[str], correlation_time_s: float) -> Group:

@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline
 
 from selfcal import _library32
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, PLACES, SUMS, Group, Model, Prior, Regressor
+from selfcal.model import LAWS, PARAMETERS, PLACES, SUMS, Group, Model, Regressor
 from selfcal.units import same_kind
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
@@ -22,8 +22,6 @@ RATE_LIMITS = (1e-6, 1e6)
 MOST_BLOCK = 1_000_000
 #: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/internal.h, TIME_MAX in lib/bank.c.
 ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
-#: ln of what a prior may reach: LN_LIMIT in lib/bank.c.
-LN_LIMIT = 46.0
 
 
 @dataclass(frozen=True)
@@ -188,9 +186,6 @@ def make_tables(
     axis_tables = []
     for name in names:
         group = model.group_of(name)
-        for key, prior in group.priors.items():
-            if prior.law != "normal":
-                _check_limits(f"{model.path}: {group.name}.priors.{key}", prior)
         priors = [group.priors[key] for key in PARAMETERS]
         axis_tables.append(
             AxisTable(
@@ -242,14 +237,6 @@ def make_tables(
         ),
         half_life_s=model.half_life_s,
     )
-
-
-def _check_limits(place: str, prior: Prior) -> None:
-    """Whether the library takes them, as floats."""
-    low, high = np.log(prior.min).astype(np.float32), np.log(prior.max).astype(np.float32)
-    if not -LN_LIMIT <= low < high <= LN_LIMIT:
-        reach = f"{math.exp(-LN_LIMIT):.0e} to {math.exp(LN_LIMIT):.0e}"
-        raise UserError(f"{place}: min and max must differ, within {reach}, not {prior.min!r} to {prior.max!r}")
 
 
 def _priors(group: Group, law: str) -> tuple[tuple[float, float, bool], ...]:
