@@ -212,6 +212,29 @@ def test_coarse_stamps_with_missing_samples(tmp_path: Path, rate: float, lattice
     assert sum(missing.values()) == pytest.approx(20_000 - index.size, abs=6)
 
 
+@pytest.mark.parametrize("samples", [300, 3000, 30_000])
+@pytest.mark.parametrize("lost", [0.05, 0.1, 0.2])
+def test_a_thinned_record_on_every_lattice_point(tmp_path: Path, samples: int, lost: float) -> None:
+    """10 Hz stamped in tenths of a second, up to one sample in five lost at random: each gap is what the stamps say."""
+    rng = np.random.default_rng([samples, round(100 * lost)])
+    index = np.flatnonzero(rng.random(samples) >= lost)
+    found, missing = stamped(tmp_path, np.round((index - index[0]) * 0.1, 6))
+    assert found == pytest.approx(10.0, rel=1e-9)
+    assert sum(missing.values()) == index[-1] - index[0] + 1 - index.size
+
+
+def test_a_thinned_record_of_another_rate_asks_for_it(tmp_path: Path) -> None:
+    """9.5 Hz stamped in tenths of a second, one sample in ten lost: not 10 Hz."""
+    index = np.flatnonzero(np.random.default_rng(1).random(3000) >= 0.1)
+    time = np.floor((index - index[0]) / 9.5 * 10.0) / 10.0
+    try:
+        found, _ = stamped(tmp_path, time)
+    except UserError as error:
+        assert "give --rate HZ" in str(error)
+        found, _ = stamped(tmp_path, time, rate=9.5)
+    assert found == pytest.approx(9.5, rel=3e-4)
+
+
 def test_an_unbroken_coarse_record_has_no_gap(tmp_path: Path) -> None:
     """Whatever the phase of the first stamp, and however short the record."""
     for samples in (5, 20, 100, 2000):

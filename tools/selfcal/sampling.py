@@ -125,6 +125,30 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
     grid, scores = _scan(head, lattice, low, high)
+    try:
+        return _scanned(time, lattice, grid, scores)
+    except Ambiguous:
+        thinned = _thinned(time, lattice, float(scores.min()), head.size)
+        if thinned is None or not low < lattice < high:
+            raise
+        return thinned
+
+
+def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) -> Found | None:
+    """An even grid of one lattice step, samples lost here and there, if no dt makes do with clearly fewer gaps in the
+    first `rows` than it needs; `gaps`: the fewest of any. Of random losses some dt or other saves a few."""
+    steps = np.rint(np.diff(time) / lattice).astype(np.int64)
+    own = int((steps[: rows - 1] > 1).sum())
+    if steps.min() < 1 or own > gaps + 0.5 * math.sqrt(gaps) + _AS_GOOD:
+        return None
+    return float(time[-1] - time[0]) / int(steps.sum()), np.concatenate(([0], steps - 1))
+
+
+def _scanned(
+    time: NDArray[np.float64], lattice: float, grid: NDArray[np.float64], scores: NDArray[np.float64]
+) -> Found:
+    """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
+    head = time[:_HEAD]
     each = scores.min(axis=1)
     best = _on_lattice(grid, each, lattice, head.size)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
