@@ -305,3 +305,14 @@ def test_priors_that_the_library_cannot_hold(tmp_path: Path, limits: dict[str, f
     path.write_text(text.replace(stated, wanted))
     with pytest.raises(UserError, match=r"gyro.priors.N: min and max must differ, within 1e-20 to"):
         Model.load(path)
+
+
+def test_a_bias_prior_that_the_library_cannot_hold(tmp_path: Path) -> None:
+    """Wider by 10^9 than the white noise it would take that for none: residuals end at 1e-9 of it (lib/posterior.c)."""
+    path = tmp_path / "model.yaml"
+    text = MODEL.path.read_text()
+    path.write_text(text.replace("bias: {law: normal, sd: 10.0}", "bias: {law: normal, sd: 1.0e+6}"))
+    with pytest.raises(UserError, match=r"gyro.priors.bias.sd: must be at most 1e\+08 times the least N, not 1e\+06"):
+        Model.load(path)
+    path.write_text(text.replace("bias: {law: normal, sd: 10.0}", "bias: {law: normal, sd: 0.99e+5}"))
+    assert Model.load(path).groups[0].priors["bias"].sd == 0.99e5

@@ -37,6 +37,8 @@ PARAMETERS = ("N", "K", "sigma_m", "alpha")
 #: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
 RATIOS = ("spectral_ratio", "markov_ratio")
 RATIO_LIMITS = (1e-3, 1e3)
+#: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/posterior.c).
+WIDEST_BIAS = 1e8
 #: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
 #: Place of each parameter there; two share one where no law has both.
@@ -257,7 +259,14 @@ class _Reader:
             raise self.fail(f"{where}.axes", "must be a list of axis names")
         names = ("bias", *PARAMETERS, *(name for law in laws for name in LAWS[law] if name not in PARAMETERS))
         known = ("bias", *PLACES)
-        priors = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")
+        trees = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")
+        priors = {
+            key: self.prior(self.entry(trees, key, f"{where}.priors"), f"{where}.priors.{key}", bias=key == "bias")
+            for key in names
+        }
+        if not priors["bias"].sd <= WIDEST_BIAS * priors["N"].min:
+            most = f"{WIDEST_BIAS:.0e} times the least N"
+            raise self.fail(f"{where}.priors.bias.sd", f"must be at most {most}, not {priors['bias'].sd:g}")
         return Group(
             name=name,
             axes=tuple(axes),
@@ -265,12 +274,7 @@ class _Reader:
             range=self.number(fields.get("range", 0.0), f"{where}.range", strict=False),
             lsb=self.number(fields.get("lsb", 0.0), f"{where}.lsb", strict=False),
             stuck_limit=self.count(fields.get("stuck_limit", 0), f"{where}.stuck_limit", 0),
-            priors={
-                key: self.prior(
-                    self.entry(priors, key, f"{where}.priors"), f"{where}.priors.{key}", bias=key == "bias"
-                )
-                for key in names
-            },
+            priors=priors,
             correlation_time_s=correlation_time_s,
         )
 
