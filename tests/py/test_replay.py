@@ -214,7 +214,9 @@ def assert_one_line(done: subprocess.CompletedProcess[str], complaint: str) -> N
     ("options", "complaint"),
     [
         (["--transport", "can"], "--transport can: this build has the transport slcan only"),
-        (["--report-every", "0"], "--report-every"),
+        (["--report-every", "0"], "--report-every must be 0.001 to 4e+06 s, not 0"),
+        (["--report-every", "1e9"], "--report-every must be 0.001 to 4e+06 s, not 1e+09"),
+        (["--report-every", "nan"], "--report-every must be 0.001 to 4e+06 s, not nan"),
         (["--axis", "temp"], "no axis 'temp'"),
         (["--model", "no-such-model.yaml"], "cannot read the model file"),
     ],
@@ -226,6 +228,19 @@ def test_bad_options(options: list[str], complaint: str) -> None:
 def test_recording_too_short_for_a_report(tmp_path: Path) -> None:
     (tmp_path / "short.csv").write_text("t[s],gx[deg/s]\n0,1.0\n1,1.1\n")
     assert_one_line(command(tmp_path / "short.csv"), "too short")
+
+
+def test_recording_without_a_report_says_why(tmp_path: Path) -> None:
+    """As `identify` does: saturated, without any scatter, louder than the priors."""
+    noise = np.random.default_rng(1).normal(size=600)
+    for gx, complaint in (
+        (np.full(600, 400.0), "column gx: no usable sample: all are saturated (range 300 deg/s) or stuck"),
+        (np.full(600, 1.0), "column gx: all 60 averages are equal (1 deg/s): a stuck or too coarse reading"),
+        (50.0 * noise, "column gx: the record lies outside the model's priors of gx, whose white noise N"),
+    ):
+        rows = "".join(f"{k / 10:.1f},{value:.6f}\n" for k, value in enumerate(gx))
+        (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + rows)
+        assert_one_line(command(tmp_path / "log.csv"), complaint)
 
 
 def test_model_in_other_units_than_the_wire(tmp_path: Path) -> None:

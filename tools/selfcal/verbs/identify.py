@@ -141,18 +141,7 @@ def identify_axis(
         beyond = np.abs(column) >= _library32.SAMPLE_MAX
         if beyond.any():
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
-    blocks = block_means(
-        samples.astype(np.float64), recording.missing_before, tables.block, group, columns.astype(np.float64)
-    )
-    present = blocks.mean[np.isfinite(blocks.mean)]
-    needed = REPORT_MIN + len(tables.regressors)
-    kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
-    if present.size < needed:
-        found = f"{present.size} averages of {tables.dt_s:g} s"
-        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
-    if not present.std() > 0.0:
-        equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
-        raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
+    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     choices = choices_of(regressors)
@@ -191,6 +180,28 @@ def identify_axis(
     checks = _checks(blocks, tables, group, results[inside.best], _used(mask_of(regressors, choices[inside.best])))
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
     return Identified(unit, scored.result, checks, blocks.kept_out, scored)
+
+
+def usable_blocks(
+    samples: NDArray[np.float32],
+    missing_before: NDArray[np.int64],
+    tables: Tables,
+    group: Group,
+    columns: NDArray[np.float32] | None = None,
+) -> Blocks:
+    """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them."""
+    z = None if columns is None else columns.astype(np.float64)
+    blocks = block_means(samples.astype(np.float64), missing_before, tables.block, group, z)
+    present = blocks.mean[np.isfinite(blocks.mean)]
+    needed = REPORT_MIN + len(tables.regressors)
+    kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
+    if present.size < needed:
+        found = f"{present.size} averages of {tables.dt_s:g} s"
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
+    if not present.std() > 0.0:
+        equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
+        raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
+    return blocks
 
 
 def _used(mask: int) -> list[int]:

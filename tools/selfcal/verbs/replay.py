@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from selfcal.engines.library import outside_priors
 from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
@@ -25,7 +26,7 @@ from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, write_json
+from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, usable_blocks, write_json
 from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
@@ -76,17 +77,18 @@ def replay(
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
     The firmware is built for the model and the recording's rate if it is not there yet. `target`: this machine, or a
-    processor emulated by QEMU. `report_every`: seconds of the recording between reports (default: a hundredth of it on
-    the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `gate`: only rest counts, as the model's
-    stationary gate sees it; while the sensor moves time passes as a gap. `plot`: file for the picture of the run.
+    processor emulated by QEMU. `report_every`: seconds of the recording between reports, one bank interval at least
+    (default: a hundredth of it on the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `gate`: only rest
+    counts, as the model's stationary gate sees it; while the sensor moves time passes as a gap. `plot`: file for the
+    picture of the run.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
     if transport != "slcan":
         raise UserError(f"--transport {transport}: this build has the transport slcan only")
-    if report_every is not None and not (math.isfinite(report_every) and report_every >= 0.001):
-        raise UserError(f"--report-every must be at least 0.001 s, not {report_every:g}")
+    if report_every is not None and not 0.001 <= report_every <= LONGEST_PERIOD_S:
+        raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
     if plot is not None and Path(plot).suffix not in PLOT_FORMATS:
         raise UserError(f"{plot}: a plot is one of {', '.join(PLOT_FORMATS)}")
     for file in (json, plot):
@@ -182,9 +184,9 @@ def run(
 ) -> dict[str, list[AxisReport]]:
     """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts, and the
     gate's."""
-    block = bank_block(recording.rate_hz, model.bank_rate_hz)
-    longest_s = recording.duration_s / TARGETS[target].reports
-    period_s = report_every or min(max(block / recording.rate_hz, longest_s), LONGEST_PERIOD_S)
+    bank_s = bank_block(recording.rate_hz, model.bank_rate_hz) / recording.rate_hz
+    wanted_s = report_every or min(recording.duration_s / TARGETS[target].reports, LONGEST_PERIOD_S)
+    period_s = max(wanted_s, bank_s)  # between two bank samples nothing changes
     history: dict[str, list[AxisReport]] = {name: [] for name in axes}
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
@@ -281,16 +283,24 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
     return decoder.finished
 
 
+def _why_no_report(recording: Recording, model: Model, name: str) -> str:
+    tables = make_tables(model, recording.rate_hz, (name,))
+    group = model.group_of(name)
+    try:
+        usable_blocks(as_float(recording.in_unit(name, group.unit)), recording.missing_before, tables, group)
+    except UserError as error:
+        return str(error)
+    return outside_priors(tables.axes[0])
+
+
 def _document(
     recording: Recording, model: Model, axes: Sequence[str], history: Mapping[str, Sequence[AxisReport]]
 ) -> dict[str, Any]:
     found: dict[str, Identified] = {}
     for name in axes:
-        if not history[name]:
-            raise UserError(f"{recording.path}: too short for a report at {model.bank_rate_hz:g} bank samples a second")
-        result = history[name][-1].result()
-        if not any(math.isfinite(p) for p in result.probability.values()):
-            raise UserError(f"{recording.path}: axis {name}: outside the model's priors; widen them in the model file")
+        result = history[name][-1].result() if history[name] else None
+        if result is None or not any(math.isfinite(p) for p in result.probability.values()):
+            raise UserError(f"{recording.path}: column {name}: {_why_no_report(recording, model, name)}")
         unit = recording.columns[name].unit
         found[name] = Identified(unit, in_unit(result, model.group_of(name).unit, unit), {}, {})
     document = to_document(recording, found)
