@@ -28,6 +28,7 @@ from selfcal.recording import Recording, load
 from selfcal.tables import make_tables
 from selfcal.units import factor
 from selfcal.verbs import replay as replay_module
+from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import build, replay, run, write_rows
 
 from conftest import shared_recording
@@ -106,6 +107,7 @@ def test_replay_with_the_gate_keeps_motion_out(tmp_path: Path, capfd: pytest.Cap
     assert not any(host.used[1505:1600])
     assert sum(host.used) > 5930 - 100 - 60  # but the shaking, and 12 windows of 5: at the start, after it and the gap
     assert_same(document, {name: host.bank.report(index) for index, name in enumerate(axes)})
+    assert document["axes"]["gx"]["adequate"] is None
     sigma = document["axes"]["gx"]["parameters"]["constant"]["N"]["mean"]
     with_motion = replay(tmp_path / "moved.npz", report_every=600.0, axes=("gx",))
     assert sigma < 0.5 * with_motion["axes"]["gx"]["parameters"]["constant"]["N"]["mean"]
@@ -165,6 +167,15 @@ def test_replay_is_the_library_over_the_wire(
     recording = load(log)
     assert int(recording.missing_before.sum()) == 70
     assert_same(document, direct(recording, Model.load().axes))
+    # identify runs a bank an axis; from its estimates to these the checks move by far less than their limits of 0.16
+    alone = identify(log)
+    for name, axis in document["axes"].items():
+        assert axis["samples_kept_out"] == alone["axes"][name]["samples_kept_out"]
+        assert axis["samples_kept_out"]["missing"] == 70
+        assert axis["adequate"] is alone["axes"][name]["adequate"]
+        checks = {check: outcome["value"] for check, outcome in alone["axes"][name]["checks"].items()}
+        assert len(checks) == 4
+        assert {check: outcome["value"] for check, outcome in axis["checks"].items()} == pytest.approx(checks, abs=0.02)
     said = capfd.readouterr().err
     # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 44 frames, and the last status
     assert f"frames: {6 * (46 + 6 * 44) + 46} received, 0 lost" in said

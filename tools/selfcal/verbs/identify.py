@@ -170,14 +170,15 @@ def identify_axis(
             advance()
     unit = recording.columns[name].unit
     if not regressors:
-        checks = _checks(blocks, tables, group, results[0], [])
+        checks = innovation_checks(blocks, tables, group, results[0], [])
         return Identified(unit, in_unit(results[0], group.unit, unit), checks, blocks.kept_out)
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
     inside = combine(choices, results, model.hypotheses, group.unit)
-    checks = _checks(blocks, tables, group, results[inside.best], _used(mask_of(regressors, choices[inside.best])))
+    used = _used(mask_of(regressors, choices[inside.best]))
+    checks = innovation_checks(blocks, tables, group, results[inside.best], used)
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
     return Identified(unit, scored.result, checks, blocks.kept_out, scored)
 
@@ -274,7 +275,7 @@ def block_means(
     return Blocks(mean[first:], r[first:], within, kept_out, z[first:])
 
 
-def _checks(
+def innovation_checks(
     blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
 ) -> dict[str, dict[str, Any]]:
     """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a

@@ -26,7 +26,15 @@ from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.identify import Identified, chosen_axes, in_unit, to_document, usable_blocks, write_json
+from selfcal.verbs.identify import (
+    Identified,
+    chosen_axes,
+    in_unit,
+    innovation_checks,
+    to_document,
+    usable_blocks,
+    write_json,
+)
 from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
@@ -115,7 +123,7 @@ def replay(
         )
     firmware = build(loaded_model, recording.rate_hz, names, target)
     history = run(firmware, recording, loaded_model, names, report_every, target, gate)
-    document = _document(recording, loaded_model, names, history)
+    document = _document(recording, loaded_model, names, history, gate)
     if json is not None:
         write_json(document, json)
     if plot is not None:
@@ -283,27 +291,33 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
     return decoder.finished
 
 
-def _why_no_report(recording: Recording, model: Model, name: str) -> str:
-    tables = make_tables(model, recording.rate_hz, (name,))
-    group = model.group_of(name)
-    try:
-        usable_blocks(as_float(recording.in_unit(name, group.unit)), recording.missing_before, tables, group)
-    except UserError as error:
-        return str(error)
-    return outside_priors(tables.axes[0])
-
-
 def _document(
-    recording: Recording, model: Model, axes: Sequence[str], history: Mapping[str, Sequence[AxisReport]]
+    recording: Recording, model: Model, axes: Sequence[str], history: Mapping[str, Sequence[AxisReport]], gate: bool
 ) -> dict[str, Any]:
-    found: dict[str, Identified] = {}
+    found = {}
     for name in axes:
-        result = history[name][-1].result() if history[name] else None
-        if result is None or not any(math.isfinite(p) for p in result.probability.values()):
-            raise UserError(f"{recording.path}: column {name}: {_why_no_report(recording, model, name)}")
-        unit = recording.columns[name].unit
-        found[name] = Identified(unit, in_unit(result, model.group_of(name).unit, unit), {}, {})
+        try:
+            found[name] = _identified(recording, model, name, history[name], gate)
+        except UserError as error:
+            raise UserError(f"{recording.path}: column {name}: {error}") from error
     document = to_document(recording, found)
-    for axis in document["axes"].values():
-        axis["adequate"] = None  # telemetry carries no innovations to check
+    if gate:
+        for axis in document["axes"].values():
+            axis["adequate"] = None  # which samples were at rest is not in the telemetry
     return document
+
+
+def _identified(
+    recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool
+) -> Identified:
+    """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
+    tables = make_tables(model, recording.rate_hz, (name,))
+    group, unit = model.group_of(name), recording.columns[name].unit
+    blocks = usable_blocks(as_float(recording.in_unit(name, group.unit)), recording.missing_before, tables, group)
+    if not history:
+        raise UserError("too little rest for a report" if gate else "too short for a report")
+    result = history[-1].result()
+    if not any(math.isfinite(p) for p in result.probability.values()):
+        raise UserError(outside_priors(tables.axes[0]))
+    checks = {} if gate else innovation_checks(blocks, tables, group, result, [])
+    return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
