@@ -7,7 +7,7 @@
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]   random calls of the library under sanitizers, 10^7 executions
-#   make firmware [ACCEPT=1]    build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above a target's budget
+#   make firmware [TARGET=...] [CFLAGS=...] [ACCEPT=1]   build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above its budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
@@ -151,22 +151,23 @@ $(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
 
 .PHONY: firmware firmware-images flash
 FIRMWARE := stm32f405 cortex-m0
+WANTED := $(filter $(or $(TARGET),$(FIRMWARE)),$(FIRMWARE))
 CORE_stm32f405 := cortex-m4f
 CORE_cortex-m0 := cortex-m0
 
 firmware: setup firmware-images $(if $(ACCEPT),bench-images)
-	@$(BIN)/python tests/bench/image_sizes.py $(FIRMWARE)
+	@$(BIN)/python tests/bench/image_sizes.py $(WANTED)
 	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
 
 define FIRMWARE_IMAGE
 .PHONY: image-$(1)
-firmware-images: image-$(1)
 image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
 	@$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
 $(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
 endef
 $(foreach target,$(FIRMWARE),$(eval $(call FIRMWARE_IMAGE,$(target))))
+firmware-images: $(WANTED:%=image-%)
 
 flash: setup
 	@tools/setup/flash.sh "$(TARGET)" $(FIRMWARE)

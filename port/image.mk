@@ -12,12 +12,18 @@ IMAGE_MODEL := $(abspath $(MODEL_DIR))
 $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
 
 $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(IMAGE_MODEL)/selfcal_model.c $(IMAGE_MODEL)/selfcal_model.h \
-                    port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/arm.mk
+                    port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/arm.mk $(OUT)/flags
 	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
 	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(IMAGE_CFLAGS) $(CFLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
 	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL),$(abspath $(IMAGE_SOURCES)) $(IMAGE_MODEL)/selfcal_model.c)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
 	    $(OUT)/objects/*.o -lm -o $@
+
+# Other flags, another image: touched when they change.
+IMAGE_FLAGS := $(IMAGE_CFLAGS) $(CFLAGS)
+.PHONY: flags
+$(OUT)/flags: flags
+	@mkdir -p $(OUT) && printf '%s\n' '$(subst ','\'',$(IMAGE_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(IMAGE_FLAGS))' > $@
 
 $(OUT)/selfcal.bin: $(OUT)/selfcal.elf
 	arm-none-eabi-objcopy -O binary $< $@

@@ -46,6 +46,8 @@ class Adis16405:
         self.dead = False  # nothing at all
         self.fail_self_test = 0  # bits of DIAG_STAT that a self-test sets
         self.trouble = 0  # bits of DIAG_STAT that set themselves at each sample
+        self.deaf = 0  # reset commands that it will miss
+        self.reset_open = False  # its reset line is not wired
         self.lose_sign: Callable[[int], bool] = lambda k: False  # the known anomaly, for sample k
         self.stale: Callable[[int], bool] = lambda k: False  # data-ready without new data
         self.product = PRODUCT
@@ -74,6 +76,8 @@ class Adis16405:
 
     def reset_line(self, level: bool) -> None:
         """Low holds it in reset."""
+        if self.reset_open:
+            return
         if not level:
             self._stop()
             self.booted_at = float("inf")
@@ -87,7 +91,8 @@ class Adis16405:
 
     def _boot(self, delay_us: float) -> None:
         self._stop()
-        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x56: self.product, **self.factory}
+        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x40: 0, 0x56: self.product}
+        self.registers |= self.factory
         self.out = dict.fromkeys(OUTPUTS, 0)
         self.new = dict.fromkeys(OUTPUTS, False)
         self.answer = 0
@@ -215,10 +220,13 @@ class Adis16405:
         base, shift = address & ~1, 8 * (address & 1)
         if base == 0x3E:
             if shift == 0 and byte >> 7:
-                self._boot(RESET_US)
+                if self.deaf > 0:
+                    self.deaf -= 1
+                else:
+                    self._boot(RESET_US)
         elif base in OFFSETS and self.writes_fail:
             pass
-        elif base in (0x34, 0x36, 0x38) or base in OFFSETS:
+        elif base in (0x34, 0x36, 0x38, 0x40) or base in OFFSETS:
             self.registers[base] = self.registers[base] & ~(0xFF << shift) | byte << shift
             if base == 0x34 and shift and byte >> 2 & 1:
                 self.machine.at(SELF_TEST_US, self._self_tested)

@@ -10,6 +10,7 @@ enum {
     SENS_AVG = 0x38,
     DIAG_STAT = 0x3C,
     GLOB_CMD = 0x3E,
+    ALM_MAG1 = 0x40, /* an alarm that ALM_CTRL leaves off: nothing but a place for MARK */
     PRODUCT_ID = 0x56
 };
 #define WRITE 0x8000U
@@ -20,6 +21,9 @@ enum {
 #define DIAG_SELF_TEST 0xFC20U        /* channels 15 to 10, overall 5 */
 #define DIAG_FATAL (DIAG_SELF_TEST | 0x0043U) /* and flash checksum 6, supply above 5.25 V 1, below 4.75 V 0 */
 
+/* Stands where offsets have been written: a reset that was lost, and with it the registers as the sensor's flash has them, shows by it. */
+#define MARK 0x15A5U
+
 /* A burst word. */
 #define ND 0x8000U
 #define EA 0x4000U
@@ -29,6 +33,9 @@ enum { FIRST_CHANNEL = 1 }; /* after the supply */
 /* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no motion,
  * and with nothing to compare with what could be a negative reading is refused. */
 enum { SIGN_STEP = 4096, SIGN_UNSURE = 8192 - 6000 };
+/* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones once XGYRO_OFF is not
+ * negative. */
+enum { SIGN_ALIKE = 4 };
 
 /* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel). From the third in a
  * row on they are withheld, the sixteenth is a fault. */
@@ -101,16 +108,32 @@ static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
            read_surely(self, address, &found) && offset_value(channel, found) == value;
 }
 
-/* After a reset: what the registers hold, and then what has been added to that. */
+/* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs (the anomaly): it is
+ * taken for 0, and the bank finds so much more bias. */
 static bool restore_offsets(adis16405_t *self)
 {
+    bool any = false;
+    uint16_t word;
+    if (!read_surely(self, ALM_MAG1, &word) || word == MARK) { /* not reset: the registers hold what was added before */
+        return false;
+    }
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        uint16_t word;
         if (!read_surely(self, (uint8_t)(XGYRO_OFF + 2U * channel), &word)) {
             return false;
         }
         self->base[channel] = offset_value(channel, word);
-        if (self->added[channel] != 0 && !write_offset(self, channel, self->base[channel] + self->added[channel])) {
+        self->anomalous = channel == 0U ? self->base[0] < 0 : self->anomalous;
+        any = any || self->added[channel] != 0;
+    }
+    if (self->anomalous) {
+        self->base[0] = 0;
+    }
+    if (any && !write_register(self, ALM_MAG1, MARK)) {
+        return false;
+    }
+    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
+        const bool wrong = self->added[channel] != 0 || (channel == 0U && self->anomalous);
+        if (wrong && !write_offset(self, channel, self->base[channel] + self->added[channel])) {
             return false;
         }
     }
@@ -299,6 +322,9 @@ void adis16405_pause(adis16405_t *self, bool on)
 bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES])
 {
     int16_t added[ADIS16405_AXES];
+    if (self->state == ADIS16405_STARTING && self->step == STEP_SELF_TEST) {
+        return false; /* the registers have been written for this start */
+    }
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
         const float steps = wanted[channel] / offset_step(self, channel);
         if (!(steps > -4096.0F && steps < 4096.0F)) {
@@ -312,9 +338,9 @@ bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], fl
         got[channel] = (float)added[channel] * offset_step(self, channel);
     }
     if (self->state == ADIS16405_RUNNING) {
-        bool done = true;
         hold(self);
         self->tail = self->head;
+        bool done = write_register(self, ALM_MAG1, MARK);
         for (size_t channel = 0; channel < ADIS16405_AXES && done; channel++) {
             done = added[channel] == self->added[channel] || write_offset(self, channel, self->base[channel] + added[channel]);
         }
@@ -390,6 +416,7 @@ static void start_on(adis16405_t *self, uint64_t now)
     self->equal = 0;
     self->unproven = CHANGES_ASKED;
     self->anchored = false;
+    self->unsure = 0;
     listen(self);
 }
 
@@ -403,6 +430,10 @@ static void watch(adis16405_t *self, uint64_t now)
         if (read && (bits & DIAG_FATAL) != 0U) {
             fail(self, ADIS16405_STATUS, now);
             return;
+        }
+        if (read && bits != 0U) { /* over its range, say: the samples are refused, the sensor is well */
+            self->progress_us = now;
+            self->ready_seen = self->ready_count;
         }
     }
     const uint64_t silence = SILENCE_US > 10U * (self->nominal_q8 >> 8) ? SILENCE_US : 10U * (self->nominal_q8 >> 8);
@@ -429,9 +460,15 @@ void adis16405_poll(adis16405_t *self)
 }
 
 /* XGYRO_OUT less its sign bit, judged by what went before. */
-static bool sign_lost(const adis16405_t *self, int16_t x)
+static bool sign_lost(adis16405_t *self, int16_t x)
 {
-    return self->anchored ? x - self->last[0] >= SIGN_STEP : x >= SIGN_UNSURE;
+    if (self->anchored) {
+        return x - self->last[0] >= SIGN_STEP;
+    }
+    const bool alike = self->unsure > 0U && x - self->last[0] < SIGN_STEP && self->last[0] - x < SIGN_STEP;
+    self->unsure = x >= SIGN_UNSURE ? (uint8_t)(alike ? self->unsure + 1U : 1U) : 0U;
+    self->last[0] = x;
+    return self->unsure > 0U && self->unsure < SIGN_ALIKE;
 }
 
 /* Periods since the last sample, and the period itself tracked over samples that follow each other. */
@@ -469,6 +506,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         }
         if (self->anchored && stamp - self->last_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {
             self->anchored = false;
+            self->unsure = 0;
         }
         if (sign_lost(self, raw[0])) {
             self->counters.anomalies++;

@@ -98,6 +98,8 @@ typedef struct {
     /* main loop, of the samples */
     uint64_t last_us;      /* stamp of the last sample delivered */
     bool anchored;
+    uint8_t unsure;        /* readings in a row that could be negative ones less their sign */
+    bool anomalous;        /* XGYRO_OFF was below 0 after the reset */
     int16_t last[ADIS16405_AXES];
     uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */

@@ -8,8 +8,8 @@
 enum { SAMPLES_A_TURN = 64 };
 enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
 
-/* A report takes some seconds on any wire; one that has not ended after so long never will. */
-#define REPORT_MOST_MS 60000U
+/* A Cortex-M0 at 16 MHz takes half a minute over an axis's report; one that has not ended after so long never will. */
+#define AXIS_MOST_MS 300000U
 
 unsigned port_axis(const char *name)
 {
@@ -100,7 +100,7 @@ void app_module(app_t *app, const port_module_t *module)
 bool app_healthy(const app_t *app)
 {
     const uint32_t now = app->port->time_ms(app->port->context);
-    return !app->corrupt && (app->stage == STAGE_NONE || now - app->report_ms < REPORT_MOST_MS);
+    return !app->corrupt && (!app->computing || now - app->begun_ms < AXIS_MOST_MS);
 }
 
 /* Between reports, because the bank must stand still. */
@@ -339,9 +339,19 @@ static uint8_t forget(app_t *app)
 #endif
     }
     app->fresh = false;
-    /* The gate's windows go on: the bank must start with one of them. */
-    (void)app_gate(app);
+#if SELFCAL_MODEL_GATE
+    if (app->gated) { /* its windows go on: the bank must start with one of them */
+        (void)app_gate(app);
+    }
+#endif
     return status == SELFCAL_OK ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
+}
+
+static uint8_t saved(app_t *app, uint32_t now)
+{
+    const uint32_t before = app->told.state_saves;
+    save(app, now);
+    return app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
 /* Between reports: the bank stands still. */
@@ -354,13 +364,14 @@ static void obey(app_t *app, uint32_t now)
     }
     app->ordered = 0;
     if (command == SELFCAL_ANSWER_COMMAND_SAVE) {
-        const uint32_t before = app->told.state_saves;
-        save(app, now);
-        result = app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
+        result = saved(app, now);
     } else if (command == SELFCAL_ANSWER_COMMAND_WRITE_OFFSETS) {
         result = write_offsets(app, app->argument);
     } else if (app->argument == 1U) {
         result = forget(app);
+        if (result == SELFCAL_ANSWER_RESULT_DONE) {
+            result = saved(app, now); /* or the next restart would bring back what was saved before */
+        }
     } else {
         app->restarting = true;
         app->restart_ms = now;
@@ -438,7 +449,6 @@ static bool advance(app_t *app)
         if ((app->fresh || (due && app->module != NULL)) && (due || app->ended)) {
             app->due_ms += due ? (now - app->due_ms) / app->period_ms * app->period_ms + app->period_ms : 0U;
             app->report_number += app->fresh ? 1U : 0U;
-            app->report_ms = now;
             app->stage = STAGE_STATUS;
         } else if (app->ended && !app->finished) {
             app->finished = true;
@@ -510,7 +520,7 @@ static void correct(app_t *app)
 }
 #endif
 
-/* Begins what does not wait for a report's end: the report worked out, an answer, a corrected sample. Only with all frames out. */
+/* Begins what does not wait for a report's end: the report worked out, an answer. Only with all frames out. */
 static bool begin_frames(app_t *app)
 {
     const uint32_t now = app->port->time_ms(app->port->context);
@@ -529,7 +539,15 @@ static bool begin_frames(app_t *app)
         app->module->restart(app->module->context);
     }
 #endif
+    (void)now;
+    return false;
+}
+
+/* A corrected sample, if one is due. After all else: on a wire too slow for them one would always be. */
+static bool begin_corrected(app_t *app)
+{
 #if APP_CORRECTED_MS
+    const uint32_t now = app->port->time_ms(app->port->context);
     if (app->passed > 0U && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt) {
         app->corrected_ms = now;
         correct(app);
@@ -537,7 +555,7 @@ static bool begin_frames(app_t *app)
         return true;
     }
 #endif
-    (void)now;
+    (void)app;
     return false;
 }
 
@@ -570,7 +588,7 @@ bool app_step(app_t *app)
     busy = (app->computing && compute(app)) || busy;
     busy = send_frames(app) || busy;
     if (!app->waiting) {
-        busy = begin_frames(app) || (!app->computing && advance(app)) || busy;
+        busy = begin_frames(app) || (!app->computing && advance(app)) || begin_corrected(app) || busy;
     }
     if (!busy) {
         if (app->finished && !app->waiting) {

@@ -45,7 +45,6 @@ typedef struct {
     bool waiting;     /* `frame` is made but not taken yet */
     bool finished;    /* ... and the last status is on its way */
     bool corrupt;     /* selfcal_check() failed: nothing is sent any more */
-    uint32_t report_ms; /* when the report under way was begun */
     uint32_t saved_ms;  /* when the state was saved last, or the start */
     selfcal_module_t told; /* filled in by `module` */
     uint32_t begun_ms; /* start of the axis report under way */
@@ -102,8 +101,8 @@ void app_module(app_t *app, const port_module_t *module);
 void app_command(app_t *app, const uint8_t data[8]);
 #endif
 
-/* False once the bank's memory has been found corrupt, or a report has not ended for a minute: then only a restart helps, and the
- * watchdog must not be fed. */
+/* False once the bank's memory has been found corrupt, or an axis's report has been worked on for five minutes: then only a restart
+ * helps, and the watchdog must not be fed. A wire that takes no frames is no reason. */
 bool app_healthy(const app_t *app);
 
 /* One turn of the main loop: the samples that wait, one slice of a report, and the frames the wire has room for. False once

@@ -1,5 +1,8 @@
 #include "sensor.h"
 
+/* Two bursts, 634 us, must fit a sample period. */
+typedef char the_rate_can_be_read[(int)SELFCAL_MODEL_RATE_HZ < 1000 ? 1 : -1];
+
 static adis16405_t sensor;
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 

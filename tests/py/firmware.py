@@ -68,10 +68,6 @@ def image(
                 old.write_bytes(file.read_bytes())
         makefile = f"port/{target}/{target}.mk"
         command = ["make", "-s", "-f", makefile, target, f"MODEL_DIR={folder}", f"OUT={folder}"]
-        stamp = folder / "flags"
-        if not stamp.exists() or stamp.read_text() != flags:
-            (folder / "selfcal.elf").unlink(missing_ok=True)
-            stamp.write_text(flags)
         subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
     return folder / "selfcal.elf"
 

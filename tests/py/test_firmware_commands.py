@@ -377,6 +377,15 @@ def test_offsets_are_written_and_taken_out_of_the_estimate() -> None:
     board.sensor.power_on()
     board.run(3.0)
     assert board.sensor.registers[0x1C] & 0x1FFF == register["gy"] & 0x1FFF
+    # a reset that it misses is noticed, by a mark that should have gone, and asked for again: nothing is added twice
+    board.sensor.reset_open, board.sensor.deaf, board.sensor.silent = True, 1, True
+    board.run(0.3)
+    board.sensor.silent = False
+    board.run(3.0)
+    assert board.sensor.deaf == 0
+    assert status(board)["sensor_fault"] == 2
+    assert board.sensor.registers[0x1C] & 0x1FFF == register["gy"] & 0x1FFF
+    board.sensor.reset_open = False
     # so does a saved state after a power cut
     assert obey(board, "save", seconds=3.5) == [RESULT["done"]]
     board.power_cycle()

@@ -12,6 +12,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from firmware import MANY, Board, NrfBoard, Tap, image, messages, parts, readings, reports, status, tell
 from parts.flash import half_erased, half_programmed
@@ -257,6 +258,60 @@ def test_saturation() -> None:
     assert sound(board, tap, 0)
 
 
+def test_over_range_is_no_fault() -> None:
+    """The sensor says over-range for a second (DIAG_STAT 4, EA in every word): a gap, not a fault nor a restart."""
+    board = Board(image(*QUIET), seed=10)
+    tap = Tap(board)
+    board.run(3.0)
+    resets = board.sensor.resets
+    board.sensor.trouble = 0x10
+    board.run(1.0)
+    board.sensor.trouble = 0
+    board.run(2.0)
+    told = status(board)
+    assert board.sensor.resets == resets
+    assert told["sensor_fault_count"] == 0
+    assert int(told["sensor_diagnosis"]) & 0x10
+    assert max(tap.skips) == pytest.approx(102, abs=15)  # up to the reading of DIAG_STAT that clears it, 100 ms
+    assert sound(board, tap, 0)
+
+
+def test_fast_rotation_about_x_after_a_pause() -> None:
+    """120 deg/s, which one reading cannot be told from a negative one less its sign: three are refused, no more."""
+    board = Board(image(*QUIET), seed=11)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0] + 2400.0, *rest(k)[1:]) if k >= 200 else rest(k)
+    tap = Tap(board)
+    board.run(3.0)
+    board.sensor.silent = True
+    board.run(0.105)  # more than ten samples, and with three more less than a fault's 150 ms
+    board.sensor.silent = False
+    board.run(2.0)
+    told = status(board)
+    assert (told["sensor_anomaly_count"], told["sensor_fault_count"]) == (3, 0)
+    assert len(tap.pushed) > 400
+    assert sound(board, tap, 0)
+
+
+def test_offset_registers_as_autonull_leaves_them() -> None:
+    """A negative XGYRO_OFF in the sensor's own flash would lose the sign of every negative x: it is taken out, and what
+    comes is what the sensor measures."""
+    board = Board(image(*QUIET), seed=12)
+    board.sensor.factory[0x1A] = -20 & 0x1FFF
+    board.sensor.factory[0x1C] = -30 & 0x1FFF
+    board.sensor.power_on()
+    tap = Tap(board)
+    board.run(8.0)
+    x = np.array([sample[0] for _, sample in tap.pushed])
+    assert board.sensor.registers[0x1A] == 0
+    assert board.sensor.registers[0x1C] == -30 & 0x1FFF
+    assert status(board)["sensor_anomaly_count"] == 0
+    # the source's -9 LSB, 18 rms; the mean of 780 samples within 4 sd
+    assert x.size > 750
+    assert abs(x.mean() + 9 * 0.05) < 4.0 * 18 * 0.05 / math.sqrt(x.size)
+    assert sound(board, tap, 0)
+
+
 #: The gate: bank intervals of 80 samples, windows of 40; no report within a test.
 GATED = ("gated", "-DBOARD_REPORT_MS=3000000", True, 1.28)
 BLOCK = 80
@@ -397,6 +452,29 @@ def test_nobody_on_the_bus() -> None:
     assert decoder.statistics.damaged == 0
 
 
+#: A set of corrected samples takes longer on a bus without listeners than its period.
+STARVED = (
+    "starved",
+    "-DBOARD_REPORT_MS=2000 -DBOARD_GATE=0 -DAPP_CORRECTED_MS=100 -DBOARD_SAVE_PERIOD_S=5U",
+    True,
+    5.12,
+    ("constant",),
+)
+
+
+def test_corrected_samples_starve_nothing() -> None:
+    """Nobody on the bus, a corrected sample always due: reports and saves go on, and the module stays up."""
+    board = Board(image(*STARVED), seed=13)
+    board.run(6.0)
+    board.can.bus_bit_s = 0.0
+    board.run(1.0)
+    saves, number = board.value("app.told.state_saves"), board.value("app.report_number")
+    board.run(45.0)
+    assert board.value("app.told.state_saves") > saves
+    assert board.value("app.report_number") > number + 1
+    assert sound(board, None, 0)
+
+
 def test_random_serial_lines() -> None:
     """Random, truncated and overlong SLCAN lines: each is answered or ignored, the channel still opens, frames are
     whole."""
@@ -431,6 +509,38 @@ def test_random_serial_lines() -> None:
     survived = sound(board, tap, 0)
     tell("random serial lines", sent, sent if survived else 0)
     assert survived
+
+
+def test_a_slow_report_is_healthy() -> None:
+    """An axis's report may take five minutes, which is ten times what the Cortex-M0 takes; the wire takes as long as it
+    likes. The answer is that of the image's own app_healthy(), called."""
+    board = Board(image(*QUIET), seed=16)
+    board.run(1.0)
+
+    def healthy(computing: bool, age_s: float) -> bool:
+        uc = board.machine.uc
+        context = uc.context_save()
+        poke = {"app.computing": int(computing), "app.begun_ms": int(board.machine.now_us / 1e3 - 1e3 * age_s) % 2**32}
+        poke |= {"app.stage": 3}
+        before = {name: bytes(uc.mem_read(*parts.place(board.elf, name))) for name in poke}
+        for name, value in poke.items():
+            address, size = parts.place(board.elf, name)
+            uc.mem_write(address, value.to_bytes(size, "little"))
+        back = board.machine.symbols["module_run"] & ~1
+        uc.reg_write(parts.arm.UC_ARM_REG_R0, parts.place(board.elf, "app.port")[0])
+        uc.reg_write(parts.arm.UC_ARM_REG_LR, back | 1)
+        uc.emu_start(board.machine.symbols["app_healthy"] | 1, back)
+        answer = bool(uc.reg_read(parts.arm.UC_ARM_REG_R0))
+        for name, value in before.items():
+            uc.mem_write(parts.place(board.elf, name)[0], value)
+        uc.context_restore(context)
+        return answer
+
+    assert healthy(True, 295.0)
+    assert not healthy(True, 305.0)
+    assert healthy(False, 3000.0)
+    board.run(1.0)
+    assert sound(board, None, 0)
 
 
 def test_watchdog_and_faults_are_told() -> None:

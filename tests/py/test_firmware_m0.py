@@ -164,6 +164,24 @@ def test_offsets_are_written_and_kept() -> None:
     assert not made.machine.violations
 
 
+@pytest.mark.skipif(MANY == 1, reason="ten minutes: make campaigns")
+def test_a_whole_report_of_six_axes() -> None:
+    """All laws on six axes at 16 MHz, minutes of work: the module stays up, and every axis arrives."""
+    flags = "-DBOARD_REPORT_MS=20000 -DBOARD_GATE=0"
+    made = NrfBoard(image("m0-report", flags, True, 1.024, target="cortex-m0"), seed=5)
+    made.run(0.1)
+    made.usart.say(b"O\r")
+    for _ in range(60):
+        made.run(5.0)
+        decoder, found = reports(messages(made))
+        if sum(report.complete for report in found) == 6:
+            break
+    tell("six axes' report, cortex-m0", 1, int(well(made)), f"after {made.machine.now_us / 1e6:.0f} s")
+    assert well(made)
+    assert {report.axis for report in found if report.complete} == {"gx", "gy", "gz", "ax", "ay", "az"}
+    assert decoder.statistics.damaged == decoder.statistics.refused == 0
+
+
 def test_a_fault_and_a_stopped_main_loop_are_told() -> None:
     """A jump into nothing resets and is told; a main loop that is not healthy is reset by the watchdog within 9 s."""
     made = board(seed=8)
