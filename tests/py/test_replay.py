@@ -254,6 +254,21 @@ def test_recording_without_a_report_says_why(tmp_path: Path) -> None:
         assert_one_line(command(tmp_path / "log.csv"), complaint)
 
 
+def test_a_retired_axis_is_named(tmp_path: Path) -> None:
+    """gx saturates for good after 300 of 600 s: its numbers are from before, and the terminal and the JSON say so."""
+    gx, gy = 0.1 * np.random.default_rng(2).normal(size=(2, 6000))
+    gx[3000:] = 400.0
+    rows = "".join(f"{k / 10:.1f},{x:.6f},{y:.6f}\n" for k, (x, y) in enumerate(zip(gx, gy, strict=True)))
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s],gy[deg/s]\n" + rows)
+    done = command(tmp_path / "log.csv", "--json", tmp_path / "report.json")
+    assert done.returncode == 0
+    assert "gx: retired as dead on the way" in done.stderr
+    assert "gy: retired" not in done.stderr
+    axes = json.loads((tmp_path / "report.json").read_text())["axes"]
+    assert axes["gx"]["samples_kept_out"]["saturated"] == 3000
+    assert axes["gy"]["samples_kept_out"]["saturated"] == 0
+
+
 def test_model_in_other_units_than_the_wire(tmp_path: Path) -> None:
     text = Model.load().path.read_text()
     assert text.count("unit: deg/s") == 1

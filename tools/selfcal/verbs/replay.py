@@ -35,7 +35,7 @@ from selfcal.verbs.identify import (
     usable_blocks,
     write_json,
 )
-from selfcal.wire import ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
+from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
@@ -287,6 +287,10 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
     if decoder.status.get("motion", 0.0) > 0.0:
         alarms, blocks = (decoder.status.get(name, 0.0) for name in ("gate_alarm_count", "blocks_moving_count"))
         said += f"\ngate: rest ended {alarms:.0f} times; {blocks:.0f} bank intervals begun and given up for motion"
+    retired = int(decoder.status.get("axes_retired", 0.0))
+    for name in history:
+        if retired >> AXES.index(name) & 1:
+            said += f"\n{name}: retired as dead on the way; its last report is from before"
     Console(stderr=True).print(said, highlight=False, soft_wrap=True)
     return decoder.finished
 
