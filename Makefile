@@ -156,13 +156,14 @@ CORE_stm32f405 := cortex-m4f
 CORE_cortex-m0 := cortex-m0
 
 firmware: setup firmware-images $(if $(ACCEPT),bench-images)
-	@$(BIN)/python tests/bench/image_sizes.py $(WANTED)
+	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(FIRMWARE)))$(BIN)/python tests/bench/image_sizes.py $(WANTED)
+	@$(if $(ACCEPT),$(if $(TARGET)$(CFLAGS),$(error ACCEPT=1 takes the figures of all images as they are: no TARGET, no CFLAGS)))
 	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
 
 define FIRMWARE_IMAGE
 .PHONY: image-$(1)
 image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
-	@$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
+	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) TARGET=$(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
 $(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
 endef

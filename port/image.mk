@@ -4,6 +4,7 @@
 # the objects what gcc says of their stacks (.su).
 include port/arm.mk
 
+$(if $(OUT),,$(error OUT=DIR is wanted))
 IMAGE_SOURCES := $(wildcard lib/*.c port/app/*.c port/$(TARGET)/*.c)
 IMAGE_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/$(TARGET)/*.h)
 IMAGE_MODEL := $(abspath $(MODEL_DIR))

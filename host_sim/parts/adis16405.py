@@ -91,7 +91,7 @@ class Adis16405:
 
     def _boot(self, delay_us: float) -> None:
         self._stop()
-        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x40: 0, 0x56: self.product}
+        self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x40: 0, 0x48: 0, 0x56: self.product}
         self.registers |= self.factory
         self.out = dict.fromkeys(OUTPUTS, 0)
         self.new = dict.fromkeys(OUTPUTS, False)
@@ -226,7 +226,7 @@ class Adis16405:
                     self._boot(RESET_US)
         elif base in OFFSETS and self.writes_fail:
             pass
-        elif base in (0x34, 0x36, 0x38, 0x40) or base in OFFSETS:
+        elif base in (0x34, 0x36, 0x38, 0x40, 0x48) or base in OFFSETS:
             self.registers[base] = self.registers[base] & ~(0xFF << shift) | byte << shift
             if base == 0x34 and shift and byte >> 2 & 1:
                 self.machine.at(SELF_TEST_US, self._self_tested)

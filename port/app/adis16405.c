@@ -10,7 +10,8 @@ enum {
     SENS_AVG = 0x38,
     DIAG_STAT = 0x3C,
     GLOB_CMD = 0x3E,
-    ALM_MAG1 = 0x40, /* an alarm that ALM_CTRL leaves off: nothing but a place for MARK */
+    ALM_MAG1 = 0x40, /* of an alarm that is off: nothing but a place for MARK */
+    ALM_CTRL = 0x48,
     PRODUCT_ID = 0x56
 };
 #define WRITE 0x8000U
@@ -19,6 +20,7 @@ enum {
 #define MSC_CTRL_READY 0x06U          /* data-ready on DIO1, rising */
 #define MSC_CTRL_SELF_TEST_HIGH 0x04U /* bit 10; clears itself at the end */
 #define DIAG_SELF_TEST 0xFC20U        /* channels 15 to 10, overall 5 */
+#define DIAG_OVER_RANGE 0x0010U
 #define DIAG_FATAL (DIAG_SELF_TEST | 0x0043U) /* and flash checksum 6, supply above 5.25 V 1, below 4.75 V 0 */
 
 /* Stands where offsets have been written: a reset that was lost, and with it the registers as the sensor's flash has them, shows by it. */
@@ -34,8 +36,9 @@ enum { FIRST_CHANNEL = 1 }; /* after the supply */
  * and with nothing to compare with what could be a negative reading is refused. */
 enum { SIGN_STEP = 4096, SIGN_UNSURE = 8192 - 6000 };
 /* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones once XGYRO_OFF is not
- * negative. */
-enum { SIGN_ALIKE = 4 };
+ * negative. Not of those beyond all the sensor can read, 350 deg/s. */
+enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000 };
+enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
 /* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel). From the third in a
  * row on they are withheld, the sixteenth is a fault. */
@@ -108,33 +111,53 @@ static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
            read_surely(self, address, &found) && offset_value(channel, found) == value;
 }
 
-/* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs (the anomaly): it is
- * taken for 0, and the bank finds so much more bias. */
-static bool restore_offsets(adis16405_t *self)
+static bool adds(const adis16405_t *self)
 {
     bool any = false;
+    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
+        any = any || self->added[channel] != 0;
+    }
+    return any;
+}
+
+/* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs (the anomaly): it is
+ * taken for 0, and the bank finds so much more bias. With MARK the reset did not come about, and the registers hold what was added before;
+ * a part with MARK in its own flash, improbable as it is, must not be refused for ever. */
+static bool restore_offsets(adis16405_t *self)
+{
     uint16_t word;
-    if (!read_surely(self, ALM_MAG1, &word) || word == MARK) { /* not reset: the registers hold what was added before */
+    if (!read_surely(self, ALM_MAG1, &word)) {
+        return false;
+    }
+    bool write[ADIS16405_AXES];
+    const bool marked = word == MARK;
+    if (marked && !self->based && self->marks < MARKS_REFUSED) {
+        self->marks++;
         return false;
     }
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
+        write[channel] = marked || self->added[channel] != 0;
+        if (marked && self->based) {
+            continue;
+        }
         if (!read_surely(self, (uint8_t)(XGYRO_OFF + 2U * channel), &word)) {
+            self->based = false;
             return false;
         }
         self->base[channel] = offset_value(channel, word);
-        self->anomalous = channel == 0U ? self->base[0] < 0 : self->anomalous;
-        any = any || self->added[channel] != 0;
+        if (channel == 0U && self->base[0] < 0) {
+            self->base[0] = 0;
+            write[0] = true;
+        }
     }
-    if (self->anomalous) {
-        self->base[0] = 0;
-    }
-    if (any && !write_register(self, ALM_MAG1, MARK)) {
+    self->based = true;
+    if (adds(self) && !write_register(self, ALM_MAG1, MARK)) {
         return false;
     }
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        const bool wrong = self->added[channel] != 0 || (channel == 0U && self->anomalous);
-        if (wrong && !write_offset(self, channel, self->base[channel] + self->added[channel])) {
-            return false;
+        const int32_t value = self->base[channel] + self->added[channel];
+        if (write[channel] && ((channel == 0U && value < 0) || !write_offset(self, channel, value))) {
+            return false; /* of another part's saved state, say: until it is taken back */
         }
     }
     return true;
@@ -332,7 +355,7 @@ bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], fl
         }
         added[channel] = (int16_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
         const int32_t value = self->base[channel] + added[channel], limit = offset_limit(channel);
-        if (value < -limit || value >= limit || (channel == 0U && value < 0 && added[channel] != 0)) {
+        if (self->based && (value < -limit || value >= limit || (channel == 0U && value < 0))) {
             return false;
         }
         got[channel] = (float)added[channel] * offset_step(self, channel);
@@ -386,7 +409,7 @@ static void start_on(adis16405_t *self, uint64_t now)
         if (!read_surely(self, PRODUCT_ID, &value) || value != PRODUCT) {
             fail(self, ADIS16405_ABSENT, now);
         } else if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, self->filter) ||
-                   !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
+                   !write_register(self, ALM_CTRL, 0U) || !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
             fail(self, ADIS16405_SET_UP, now);
         } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
             fail(self, ADIS16405_SELF_TEST, now);
@@ -410,6 +433,10 @@ static void start_on(adis16405_t *self, uint64_t now)
         fail(self, ADIS16405_STATUS, now);
         return;
     }
+    if (adds(self) && (!read_surely(self, ALM_MAG1, &value) || value != MARK)) { /* reset by something else in between */
+        fail(self, ADIS16405_SET_UP, now);
+        return;
+    }
     self->state = ADIS16405_RUNNING;
     self->progress_us = now;
     self->ready_seen = self->ready_count;
@@ -417,6 +444,8 @@ static void start_on(adis16405_t *self, uint64_t now)
     self->unproven = CHANGES_ASKED;
     self->anchored = false;
     self->unsure = 0;
+    self->settling = 0;
+    self->excuses = 0;
     listen(self);
 }
 
@@ -431,7 +460,8 @@ static void watch(adis16405_t *self, uint64_t now)
             fail(self, ADIS16405_STATUS, now);
             return;
         }
-        if (read && bits != 0U) { /* over its range, say: the samples are refused, the sensor is well */
+        if (read && (bits & DIAG_OVER_RANGE) != 0U && self->excuses < EXCUSES) { /* the samples are refused, the sensor is well */
+            self->excuses++;
             self->progress_us = now;
             self->ready_seen = self->ready_count;
         }
@@ -464,6 +494,10 @@ static bool sign_lost(adis16405_t *self, int16_t x)
 {
     if (self->anchored) {
         return x - self->last[0] >= SIGN_STEP;
+    }
+    if (x > SIGN_BEYOND) {
+        self->unsure = 0;
+        return true;
     }
     const bool alike = self->unsure > 0U && x - self->last[0] < SIGN_STEP && self->last[0] - x < SIGN_STEP;
     self->unsure = x >= SIGN_UNSURE ? (uint8_t)(alike ? self->unsure + 1U : 1U) : 0U;
@@ -504,7 +538,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
             self->settling--;
             continue;
         }
-        if (self->anchored && stamp - self->last_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {
+        if (self->anchored && stamp - self->anchored_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {
             self->anchored = false;
             self->unsure = 0;
         }
@@ -515,6 +549,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         self->equal = memcmp(raw, self->last, sizeof raw) == 0 ? self->equal + 1U : 0U;
         memcpy(self->last, raw, sizeof raw);
         self->anchored = true;
+        self->anchored_us = stamp;
         if (self->equal == 0U && self->unproven > 0U) {
             self->unproven--;
         }
@@ -527,6 +562,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         self->last_us = stamp;
         self->progress_us = now;
         self->ready_seen = self->ready_count;
+        self->excuses = 0;
         self->good++;
         self->counters.samples++;
         for (size_t i = 0; i < ADIS16405_AXES; i++) {

@@ -11,7 +11,7 @@
  *
  * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the
  * driver resets the sensor and tries again, at first after 0.1 s, then with doubled delays up to 10 s. Nothing blocks for
- * longer than a register access, about 50 us each, 12 of them in a row at most.
+ * longer than a register access, about 50 us each, some ten of them in a row; a hundred when the sensor is started.
  *
  * Registers and bits: ADIS16400/ADIS16405 data sheet, table 8 and the register tables after it. */
 #ifndef ADIS16405_H
@@ -52,7 +52,7 @@ typedef enum {
 typedef enum {
     ADIS16405_NO_FAULT = 0,
     ADIS16405_ABSENT = 1,    /* PRODUCT_ID is not 16405 */
-    ADIS16405_SET_UP = 2,    /* a register did not read back as written */
+    ADIS16405_SET_UP = 2,    /* a register did not read back as written, or a reset did not come about */
     ADIS16405_SELF_TEST = 3, /* an axis failed it, or it did not end */
     ADIS16405_SILENT = 4,    /* no data-ready */
     ADIS16405_NO_DATA = 5,   /* data-ready, but no sample that passes the checks */
@@ -98,8 +98,11 @@ typedef struct {
     /* main loop, of the samples */
     uint64_t last_us;      /* stamp of the last sample delivered */
     bool anchored;
+    uint64_t anchored_us;  /* stamp of `last` */
     uint8_t unsure;        /* readings in a row that could be negative ones less their sign */
-    bool anomalous;        /* XGYRO_OFF was below 0 after the reset */
+    uint8_t excuses;       /* readings of DIAG_STAT in a row that say over-range */
+    uint8_t marks;         /* resets that left MARK */
+    bool based;            /* `base` is known */
     int16_t last[ADIS16405_AXES];
     uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
@@ -133,7 +136,7 @@ void adis16405_poll(adis16405_t *self);
  * missing in time. Waits for a reading under way, 2 ms at most. */
 void adis16405_pause(adis16405_t *self, bool on);
 
-/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset) to its readings by its offset registers, and says in `got` what
+/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset, but no negative XGYRO_OFF) to its readings by its offset registers, and says in `got` what
  * the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
  * goes into its flash. Samples that wait, and some that follow, are dropped: missing in time. False: beyond the registers (50 deg/s,
  * 6.8 g), or not written; the sensor adds what it did, after a restart if need be. A negative XGYRO_OFF is refused: with one the part loses the

@@ -8,8 +8,9 @@
 enum { SAMPLES_A_TURN = 64 };
 enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
 
-/* A Cortex-M0 at 16 MHz takes half a minute over an axis's report; one that has not ended after so long never will. */
-#define AXIS_MOST_MS 300000U
+/* A Cortex-M0 at 16 MHz takes half a minute over an axis's report, and a port takes a frame or drops it within a second; what has not come
+ * about after so long never will. */
+#define PATIENCE_MS 300000U
 
 unsigned port_axis(const char *name)
 {
@@ -100,7 +101,8 @@ void app_module(app_t *app, const port_module_t *module)
 bool app_healthy(const app_t *app)
 {
     const uint32_t now = app->port->time_ms(app->port->context);
-    return !app->corrupt && (!app->computing || now - app->begun_ms < AXIS_MOST_MS);
+    return !app->corrupt && (!app->computing || now - app->begun_ms < PATIENCE_MS) &&
+           (!app->refused || now - app->refused_ms < PATIENCE_MS);
 }
 
 /* Between reports, because the bank must stand still. */
@@ -222,9 +224,17 @@ static bool send_frames(app_t *app)
         if (!app->waiting) {
             app->waiting = selfcal_telemetry_next(&app->telemetry, &app->frame);
         }
-        if (!app->waiting || !app->port->send(app->port->context, &app->frame)) {
+        if (!app->waiting) {
             return sent;
         }
+        if (!app->port->send(app->port->context, &app->frame)) {
+            if (!app->refused) {
+                app->refused_ms = app->port->time_ms(app->port->context);
+            }
+            app->refused = true;
+            return sent;
+        }
+        app->refused = false;
         app->waiting = false;
         sent = true;
     }
@@ -370,7 +380,8 @@ static void obey(app_t *app, uint32_t now)
     } else if (app->argument == 1U) {
         result = forget(app);
         if (result == SELFCAL_ANSWER_RESULT_DONE) {
-            result = saved(app, now); /* or the next restart would bring back what was saved before */
+            /* Or the next restart would bring back what was saved before; in both slots, since one may come to harm. */
+            result = saved(app, now) == SELFCAL_ANSWER_RESULT_DONE ? saved(app, now) : SELFCAL_ANSWER_RESULT_FAILED;
         }
     } else {
         app->restarting = true;

@@ -43,6 +43,8 @@ typedef struct {
     bool ended;       /* no sample will follow */
     bool put_off;     /* the last turn left a slice of a report to this one */
     bool waiting;     /* `frame` is made but not taken yet */
+    bool refused;     /* the port has refused it, since refused_ms */
+    uint32_t refused_ms;
     bool finished;    /* ... and the last status is on its way */
     bool corrupt;     /* selfcal_check() failed: nothing is sent any more */
     uint32_t saved_ms;  /* when the state was saved last, or the start */
@@ -101,8 +103,8 @@ void app_module(app_t *app, const port_module_t *module);
 void app_command(app_t *app, const uint8_t data[8]);
 #endif
 
-/* False once the bank's memory has been found corrupt, or an axis's report has been worked on for five minutes: then only a restart
- * helps, and the watchdog must not be fed. A wire that takes no frames is no reason. */
+/* False once the bank's memory has been found corrupt, or an axis's report has been worked on, or a frame refused by the
+ * port, for five minutes: then only a restart helps, and the watchdog must not be fed. */
 bool app_healthy(const app_t *app);
 
 /* One turn of the main loop: the samples that wait, one slice of a report, and the frames the wire has room for. False once

@@ -274,6 +274,17 @@ def test_over_range_is_no_fault() -> None:
     assert int(told["sensor_diagnosis"]) & 0x10
     assert max(tap.skips) == pytest.approx(102, abs=15)  # up to the reading of DIAG_STAT that clears it, 100 ms
     assert sound(board, tap, 0)
+    board.sensor.trouble = 0x10  # after ten seconds it is a fault, and so is an alarm of its own at once
+    board.run(9.0)
+    assert status(board)["sensor_fault_count"] == 0
+    board.run(3.0)
+    assert status(board)["sensor_fault"] == NO_DATA
+    board.sensor.trouble = 0
+    board.run(3.0)
+    faults = status(board)["sensor_fault_count"]
+    board.sensor.trouble = 0x100
+    board.run(1.0)
+    assert status(board)["sensor_fault_count"] > faults
 
 
 def test_fast_rotation_about_x_after_a_pause() -> None:
@@ -512,16 +523,15 @@ def test_random_serial_lines() -> None:
 
 
 def test_a_slow_report_is_healthy() -> None:
-    """An axis's report may take five minutes, which is ten times what the Cortex-M0 takes; the wire takes as long as it
-    likes. The answer is that of the image's own app_healthy(), called."""
+    """An axis's report may take five minutes, which is ten times what the Cortex-M0 takes, and so may a frame. The
+    answer is that of the image's own app_healthy(), called."""
     board = Board(image(*QUIET), seed=16)
     board.run(1.0)
 
-    def healthy(computing: bool, age_s: float) -> bool:
+    def healthy(what: str, since: str, age_s: float) -> bool:
         uc = board.machine.uc
         context = uc.context_save()
-        poke = {"app.computing": int(computing), "app.begun_ms": int(board.machine.now_us / 1e3 - 1e3 * age_s) % 2**32}
-        poke |= {"app.stage": 3}
+        poke = {what: 1, since: int(board.machine.now_us / 1e3 - 1e3 * age_s) % 2**32, "app.stage": 3}
         before = {name: bytes(uc.mem_read(*parts.place(board.elf, name))) for name in poke}
         for name, value in poke.items():
             address, size = parts.place(board.elf, name)
@@ -536,9 +546,10 @@ def test_a_slow_report_is_healthy() -> None:
         uc.context_restore(context)
         return answer
 
-    assert healthy(True, 295.0)
-    assert not healthy(True, 305.0)
-    assert healthy(False, 3000.0)
+    for stalled in (("app.computing", "app.begun_ms"), ("app.refused", "app.refused_ms")):
+        assert healthy(*stalled, 295.0)
+        assert not healthy(*stalled, 305.0)
+    assert healthy("app.stage", "app.begun_ms", 3000.0)
     board.run(1.0)
     assert sound(board, None, 0)
 

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     import can
 
 CHALLENGE = "challenge"
-#: s to wait for a challenge, and for an answer: a module obeys between reports, which take it seconds.
-#: A module obeys between reports: a Cortex-M0 at 16 MHz takes 200 s over one of six axes.
+#: s to wait for a challenge, and for an answer: a module obeys between reports, and a Cortex-M0's takes 200 s.
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
 #: Orders that go to no module.
 OWN_ORDERS = ("new-key", "build-flag")
@@ -161,5 +160,5 @@ def _await(link: Link, signal: str, timeout_s: float, about: int) -> int:
             raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
         decoder.answer.clear()
     if signal == "result":
-        raise UserError(f"the module took the command, but has not said within {timeout_s:g} s what came of it")
+        raise UserError(f"the module gave a challenge, but no word within {timeout_s:g} s of what came of the command")
     raise UserError("the module does not answer: is its image built with a command key?")

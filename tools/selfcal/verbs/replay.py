@@ -289,7 +289,7 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
         said += f"\ngate: rest ended {alarms:.0f} times; {blocks:.0f} bank intervals begun and given up for motion"
     retired = int(decoder.status.get("axes_retired", 0.0))
     for name in history:
-        if retired >> AXES.index(name) & 1:
+        if history[name] and retired >> AXES.index(name) & 1:
             said += f"\n{name}: retired as dead on the way; its last report is from before"
     Console(stderr=True).print(said, highlight=False, soft_wrap=True)
     return decoder.finished
