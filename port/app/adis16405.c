@@ -38,6 +38,7 @@ enum { SIGN_STEP = 4096, SIGN_UNSURE = 8192 - 6000 };
 /* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones once XGYRO_OFF is not
  * negative. Not of those beyond all the sensor can read, 350 deg/s. */
 enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000 };
+/* Readings of DIAG_STAT in a row, 0.1 s apart, that excuse missing samples; starts that MARK ends before its registers are believed. */
 enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
 /* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel). From the third in a

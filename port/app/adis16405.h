@@ -136,8 +136,8 @@ void adis16405_poll(adis16405_t *self);
  * missing in time. Waits for a reading under way, 2 ms at most. */
 void adis16405_pause(adis16405_t *self, bool on);
 
-/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset, but no negative XGYRO_OFF) to its readings by its offset registers, and says in `got` what
- * the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
+/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset, but no negative XGYRO_OFF) to its readings by its offset
+ * registers, and says in `got` what the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
  * goes into its flash. Samples that wait, and some that follow, are dropped: missing in time. False: beyond the registers (50 deg/s,
  * 6.8 g), or not written; the sensor adds what it did, after a restart if need be. A negative XGYRO_OFF is refused: with one the part loses the
  * sign bit of negative x rates (the anomaly above), so that a positive x bias stays. */

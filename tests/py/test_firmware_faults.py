@@ -368,7 +368,7 @@ def test_shocks_are_kept_out() -> None:
     assert survived == trials
 
 
-#: Samples of a window of the gate; noise of the board's sensor, deg/s and g (parts/sensor.py).
+#: Samples of a window of the gate; noise of the board's sensor, deg/s and g (parts/board.py).
 WINDOW = BLOCK // 2
 SIGMA = (0.9, 9e-3)
 #: Energy of a motion in a window, over sigma^2, that the gate misses once in a thousand: T1 of six axes at rest is

@@ -128,8 +128,8 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     try:
         return _scanned(time, lattice, grid, scores)
     except Ambiguous:
-        thinned = _thinned(time, lattice, float(scores.min()), head.size)
-        if thinned is None or not low < lattice < high:
+        thinned = _thinned(time, lattice, float(scores.min()), head.size) if low < lattice < high else None
+        if thinned is None:
             raise
         return thinned
 

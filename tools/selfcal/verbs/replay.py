@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.engines.library import outside_priors
 from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
@@ -322,6 +321,8 @@ def _identified(
         raise UserError("too little rest for a report" if gate else "too short for a report")
     result = history[-1].result()
     if not any(math.isfinite(p) for p in result.probability.values()):
+        from selfcal.engines.library import outside_priors
+
         raise UserError(outside_priors(tables.axes[0]))
     checks = {} if gate else innovation_checks(blocks, tables, group, result, [])
     return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
