@@ -50,6 +50,7 @@ class Bxcan(Part):
         self.on_frame: Callable[[float, Frame], None] = lambda us, frame: None
         self.bus_offs = 0
         self.attempts = 0
+        self.aborted = 0
         self.heard = self.overruns = 0  # frames of others that the filter took, and that found no room
 
     def reset(self) -> None:
@@ -221,6 +222,7 @@ class Bxcan(Part):
     def _complete(self, i: int, flags: int) -> None:
         self.requests.remove(i)
         self.abort.discard(i)
+        self.aborted += not flags & 2
         self.box[i][0] &= ~1
         self.tsr = self.tsr & ~(0xF << 8 * i) | (1 | flags) << 8 * i
         if self.ier & 1:

@@ -14,7 +14,7 @@ enum { PATIENCE_MS = 100 };
 static bool working;
 static uint32_t dropped, refused_since_ms;
 static bool refused;
-static volatile uint32_t bus_offs;
+static volatile uint32_t aborted, bus_offs;
 
 uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s)
 {
@@ -103,7 +103,6 @@ bool can_send(const selfcal_frame_t *frame)
         } else if (now - refused_since_ms > PATIENCE_MS) {
             refused = false;
             CAN_TSR = CAN_TSR_ABRQ(0) | CAN_TSR_ABRQ(1) | CAN_TSR_ABRQ(2);
-            dropped += MAILBOXES;
         }
         return false;
     }
@@ -136,10 +135,19 @@ void can_poll(void)
 #endif
 }
 
-/* Wakes the main loop, which fills the mailbox. */
+/* Wakes the main loop, which fills the mailbox. A request that ends without TXOK was aborted; one that was on the bus then may
+ * still have been heard (section 32.7.1). */
 void can_tx_handler(void)
 {
-    CAN_TSR = CAN_TSR_RQCP(0) | CAN_TSR_RQCP(1) | CAN_TSR_RQCP(2);
+    const uint32_t ended = CAN_TSR;
+    uint32_t clear = 0;
+    for (uint32_t mailbox = 0; mailbox < MAILBOXES; mailbox++) {
+        if ((ended & CAN_TSR_RQCP(mailbox)) != 0U) {
+            clear |= CAN_TSR_RQCP(mailbox);
+            aborted += (ended & CAN_TSR_TXOK(mailbox)) == 0U ? 1U : 0U;
+        }
+    }
+    CAN_TSR = clear;
 }
 
 void can_error_handler(void)
@@ -152,6 +160,6 @@ void can_error_handler(void)
 
 void can_counters(wire_counters_t *counters)
 {
-    counters->dropped = dropped;
+    counters->dropped = dropped + aborted;
     counters->bus_offs = bus_offs;
 }
