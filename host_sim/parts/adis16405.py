@@ -54,6 +54,7 @@ class Adis16405:
         self._read_once = -1
         # statistics
         self.frames = self.bursts = self.resets = 0
+        self.reads: dict[int, int] = {}  # of registers, by address
         self.index = 0
         self._event: Event | None = None
         self.power_on()
@@ -64,6 +65,10 @@ class Adis16405:
     def power_on(self) -> None:
         """Registers as delivered; ready after 220 ms."""
         self._boot(BOOT_US)
+
+    def reset(self) -> None:
+        """By its line, by command, or by a spike: ready after 170 ms."""
+        self._boot(RESET_US)
 
     def plug(self, connected: bool) -> None:
         """Unplugging takes the supply too."""
@@ -82,7 +87,7 @@ class Adis16405:
             self._stop()
             self.booted_at = float("inf")
         elif self.booted_at == float("inf"):
-            self._boot(RESET_US)
+            self.reset()
 
     def _stop(self) -> None:
         if self._event is not None:
@@ -214,6 +219,7 @@ class Adis16405:
         value = self.registers.get(address, 0)
         if address == 0x3C:
             self.registers[0x3C] = 0
+        self.reads[address] = self.reads.get(address, 0) + 1
         return value
 
     def _write(self, address: int, byte: int) -> None:
@@ -223,7 +229,7 @@ class Adis16405:
                 if self.deaf > 0:
                     self.deaf -= 1
                 else:
-                    self._boot(RESET_US)
+                    self.reset()
         elif base in OFFSETS and self.writes_fail:
             pass
         elif base in (0x34, 0x36, 0x38, 0x40, 0x48) or base in OFFSETS:

@@ -23,7 +23,7 @@ enum {
 #define DIAG_OVER_RANGE 0x0010U
 #define DIAG_FATAL (DIAG_SELF_TEST | 0x0043U) /* and flash checksum 6, supply above 5.25 V 1, below 4.75 V 0 */
 
-/* Stands where offsets have been written: a reset that was lost, and with it the registers as the sensor's flash has them, shows by it. */
+/* Stands while the sensor is set up: a reset that nobody asked for shows by its absence, one that was lost by its presence. */
 #define MARK 0x15A5U
 
 /* A burst word. */
@@ -48,9 +48,15 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define RESET_PULSE_US 1000U
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
-/* Without a sample; at least 10 periods as well. Less than a reset takes, so that at 67 samples a second or more a sensor that was reset by
- * something else, and has lost its settings and offsets, is set up anew. */
-#define SILENCE_US 150000U
+#define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
+/* Between two samples, or 1.5 periods: a reset by something else takes longer, 170 ms, and leaves a rate of its own. What follows is taken
+ * once the settings have been found to stand. */
+#define DOUBT_US 100000U
+/* Between readings of the settings without a cause, for a read of which a bit error made a write. They take 5 words, and wait for room
+ * between two bursts; five times so long at most. */
+#define CHECK_US 1000000U
+#define CHECK_ROOM_US 250U
+enum { CHECKS_TRIED = 3 };
 #define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
 #define BACKOFF_MIN_US 100000U
 #define BACKOFF_MAX_US 10000000U
@@ -96,6 +102,33 @@ static float offset_step(const adis16405_t *self, size_t channel)
     return channel < 3U ? 0.0125F : self->scale[channel];
 }
 
+/* Whether the settings are those of the start: GOOD if so, ALTERED if one read twice alike is not. */
+typedef enum { UNSURE, GOOD, ALTERED } settings_t;
+
+static settings_t settings(adis16405_t *self)
+{
+    static const uint8_t address[] = {SMPL_PRD, SENS_AVG, MSC_CTRL, ALM_MAG1};
+    enum { COUNT = sizeof address };
+    const uint16_t wanted[COUNT] = {self->sample_period, self->filter, MSC_CTRL_READY, MARK};
+    uint16_t found[1 + COUNT];
+    for (unsigned i = 0; i <= COUNT; i++) { /* an answer comes with the next word */
+        if (!self->bus->word(self->bus->context, (uint16_t)(i < COUNT ? address[i] << 8 : 0), &found[i])) {
+            return UNSURE;
+        }
+    }
+    settings_t result = GOOD;
+    for (unsigned i = 0; i < COUNT; i++) {
+        uint16_t value;
+        if (found[1U + i] != wanted[i]) {
+            result = UNSURE;
+            if (read_surely(self, address[i], &value) && value != wanted[i]) {
+                return ALTERED;
+            }
+        }
+    }
+    return result;
+}
+
 /* As a signed number; the bits above are not used. */
 static int16_t offset_value(size_t channel, uint16_t word)
 {
@@ -110,15 +143,6 @@ static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
     uint16_t found;
     return write_byte(self, address, word) && write_byte(self, (uint8_t)(address + 1U), (uint16_t)(word >> 8)) &&
            read_surely(self, address, &found) && offset_value(channel, found) == value;
-}
-
-static bool adds(const adis16405_t *self)
-{
-    bool any = false;
-    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        any = any || self->added[channel] != 0;
-    }
-    return any;
 }
 
 /* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs (the anomaly): it is
@@ -152,7 +176,7 @@ static bool restore_offsets(adis16405_t *self)
         }
     }
     self->based = true;
-    if (adds(self) && !write_register(self, ALM_MAG1, MARK)) {
+    if (!write_register(self, ALM_MAG1, MARK)) {
         return false;
     }
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
@@ -169,6 +193,13 @@ static void enter(adis16405_t *self, uint8_t step, uint64_t now)
     self->state = ADIS16405_STARTING;
     self->step = step;
     self->step_us = now;
+}
+
+/* From here on the sensor is to give samples. */
+static void expect(adis16405_t *self, uint64_t now)
+{
+    self->progress_us = now;
+    self->ready_seen = self->ready_count;
 }
 
 static void begin(adis16405_t *self, uint64_t now)
@@ -337,8 +368,7 @@ void adis16405_pause(adis16405_t *self, bool on)
     if (on) {
         hold(self);
     } else {
-        self->progress_us = self->bus->time_us(self->bus->context);
-        self->ready_seen = self->ready_count;
+        expect(self, self->bus->time_us(self->bus->context));
         listen(self);
     }
 }
@@ -364,12 +394,12 @@ bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], fl
     if (self->state == ADIS16405_RUNNING) {
         hold(self);
         self->tail = self->head;
-        bool done = write_register(self, ALM_MAG1, MARK);
+        bool done = true;
         for (size_t channel = 0; channel < ADIS16405_AXES && done; channel++) {
             done = added[channel] == self->added[channel] || write_offset(self, channel, self->base[channel] + added[channel]);
         }
         self->settling = (uint8_t)(2U + (2U << (self->filter & 7U)));
-        self->progress_us = self->bus->time_us(self->bus->context);
+        expect(self, self->bus->time_us(self->bus->context));
         if (!done) {
             fail(self, ADIS16405_SET_UP, self->progress_us); /* the restart writes what was added before */
             return false;
@@ -434,13 +464,19 @@ static void start_on(adis16405_t *self, uint64_t now)
         fail(self, ADIS16405_STATUS, now);
         return;
     }
-    if (adds(self) && (!read_surely(self, ALM_MAG1, &value) || value != MARK)) { /* reset by something else in between */
+    settings_t found = UNSURE;
+    for (int i = 0; i < CHECKS_TRIED && found == UNSURE; i++) {
+        found = settings(self);
+    }
+    if (found != GOOD) { /* reset by something else in between */
         fail(self, ADIS16405_SET_UP, now);
         return;
     }
     self->state = ADIS16405_RUNNING;
-    self->progress_us = now;
-    self->ready_seen = self->ready_count;
+    expect(self, now);
+    self->seen_us = now;
+    self->checked_us = now;
+    self->doubtful = false;
     self->equal = 0;
     self->unproven = CHANGES_ASKED;
     self->anchored = false;
@@ -450,8 +486,27 @@ static void start_on(adis16405_t *self, uint64_t now)
     listen(self);
 }
 
+/* Looks after the settings; false: they have been altered, and the sensor is set up anew. */
+static bool look_after(adis16405_t *self, uint64_t now)
+{
+    hold(self);
+    const settings_t found = settings(self);
+    listen(self);
+    self->checked_us = now;
+    self->doubtful = self->doubtful && found != GOOD;
+    if (found == ALTERED) {
+        fail(self, ADIS16405_SET_UP, now);
+    }
+    return found != ALTERED;
+}
+
 static void watch(adis16405_t *self, uint64_t now)
 {
+    const uint64_t unchecked = now - self->checked_us;
+    const bool room = !self->reading && (uint32_t)now - self->stamp + CHECK_ROOM_US < self->nominal_q8 >> 8;
+    if (unchecked >= CHECK_US && (room || unchecked >= 5ULL * CHECK_US) && !look_after(self, now)) {
+        return;
+    }
     if (self->diagnosis_wanted && now - self->diagnosis_us >= DIAGNOSIS_US) {
         uint16_t bits;
         hold(self);
@@ -463,8 +518,7 @@ static void watch(adis16405_t *self, uint64_t now)
         }
         if (read && (bits & DIAG_OVER_RANGE) != 0U && self->excuses < EXCUSES) { /* the samples are refused, the sensor is well */
             self->excuses++;
-            self->progress_us = now;
-            self->ready_seen = self->ready_count;
+            expect(self, now);
         }
     }
     const uint64_t silence = SILENCE_US > 10U * (self->nominal_q8 >> 8) ? SILENCE_US : 10U * (self->nominal_q8 >> 8);
@@ -535,6 +589,12 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         if (self->state != ADIS16405_RUNNING) {
             continue;
         }
+        const uint64_t step = stamp - self->seen_us, period = self->nominal_q8 >> 8, doubt = period + period / 2U;
+        self->seen_us = stamp;
+        self->doubtful = self->doubtful || step > (DOUBT_US > doubt ? DOUBT_US : doubt) || step < period / 2U;
+        if (self->doubtful && (!look_after(self, now) || self->doubtful)) {
+            continue;
+        }
         if (self->settling > 0U) {
             self->settling--;
             continue;
@@ -561,8 +621,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         const uint32_t passed = self->counters.samples > 0U ? periods(self, stamp) : 1U;
         *missing = passed > 0U ? passed - 1U : 0U;
         self->last_us = stamp;
-        self->progress_us = now;
-        self->ready_seen = self->ready_count;
+        expect(self, now);
         self->excuses = 0;
         self->good++;
         self->counters.samples++;

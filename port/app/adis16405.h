@@ -6,7 +6,8 @@
  *   - the first reading has ND (new data) set and EA (error/alarm) clear on all six inertial channels,
  *   - the second one has the same 14 bits everywhere,
  *   - XGYRO_OUT has not lost its sign bit (known anomaly of the part: a step of +2^13 LSB).
- * Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
+ * After a pause, or with samples that come too fast, the settings are read first (something else may have reset the sensor), and once a
+ * second without a cause. Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
  * and the sensor's own sample period, which is tracked.
  *
  * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the
@@ -52,7 +53,7 @@ typedef enum {
 typedef enum {
     ADIS16405_NO_FAULT = 0,
     ADIS16405_ABSENT = 1,    /* PRODUCT_ID is not 16405 */
-    ADIS16405_SET_UP = 2,    /* a register did not read back as written, or a reset did not come about */
+    ADIS16405_SET_UP = 2,    /* a register did not read back as written, or has changed since; or a reset did not come about */
     ADIS16405_SELF_TEST = 3, /* an axis failed it, or it did not end */
     ADIS16405_SILENT = 4,    /* no data-ready */
     ADIS16405_NO_DATA = 5,   /* data-ready, but no sample that passes the checks */
@@ -96,7 +97,10 @@ typedef struct {
     volatile bool diagnosis_wanted;
     uint64_t diagnosis_us; /* when it was read last */
     /* main loop, of the samples */
+    uint64_t seen_us;      /* stamp of the last reading taken from the queue */
+    uint64_t checked_us;   /* when the settings were read last */
     uint64_t last_us;      /* stamp of the last sample delivered */
+    bool doubtful;         /* none is delivered until the settings have been found to stand */
     bool anchored;
     uint64_t anchored_us;  /* stamp of `last` */
     uint8_t unsure;        /* readings in a row that could be negative ones less their sign */

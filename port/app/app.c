@@ -119,7 +119,7 @@ static void save(app_t *app, uint32_t now)
     }
 }
 
-#if SELFCAL_MODEL_GATE
+#if SELFCAL_MODEL_GATE || APP_CORRECTED_MS
 /* Whether the bank will keep this sample out for a fault of the sensor's, which it then counts. */
 static bool faulty(const app_t *app, const float reading[])
 {
@@ -131,7 +131,9 @@ static bool faulty(const app_t *app, const float reading[])
     }
     return false;
 }
+#endif
 
+#if SELFCAL_MODEL_GATE
 /* Takes what the gate has measured at rest for its noise, after SELFCAL_GATE_MEASURED_MIN windows of it and whenever there are twice as
  * many. */
 static void learn_noise(app_t *app)
@@ -210,6 +212,8 @@ static bool take_sample(app_t *app)
 #if APP_CORRECTED_MS
         app->passed += (uint64_t)missing + 1U;
         memcpy(app->reading, reading, sizeof reading);
+        app->reading_ms = app->port->time_ms(app->port->context);
+        app->newer = !faulty(app, reading);
 #endif
         return true;
     case PORT_END: app->ended = true; return false;
@@ -275,13 +279,13 @@ static const uint64_t command_key[2] = {APP_COMMAND_KEY};
 enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
 #define RESTART_MS 100U /* for the answer to leave */
 
-static void answer(app_t *app, uint8_t command, uint8_t result)
+static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result)
 {
     app->told.command_count += result == SELFCAL_ANSWER_RESULT_DONE ? 1U : 0U;
     app->told.command_refused_count += result == SELFCAL_ANSWER_RESULT_DONE ? 0U : 1U;
-    app->answering = true;
-    app->answer_item = SELFCAL_ANSWER_RESULT;
-    app->answer = (uint32_t)command << SELFCAL_ANSWER_COMMAND_SHIFT | (uint32_t)result << SELFCAL_ANSWER_RESULT_SHIFT;
+    to->waiting = true;
+    to->item = SELFCAL_ANSWER_RESULT;
+    to->value = (uint32_t)command << SELFCAL_ANSWER_COMMAND_SHIFT | (uint32_t)result << SELFCAL_ANSWER_RESULT_SHIFT;
 }
 
 /* Bit of an axis of the model in a command. */
@@ -324,6 +328,7 @@ static uint8_t write_offsets(app_t *app, uint32_t axes)
         }
 #endif
 #if APP_CORRECTED_MS
+        app->newer = false; /* the reading is one from before */
         app->last_report[axis].bias_mean += amount;
         for (uint8_t h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
             app->last_report[axis].hypothesis[h].bias_mean += amount;
@@ -369,7 +374,7 @@ static void obey(app_t *app, uint32_t now)
 {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
-    if (command == 0U || app->answering || app->module == NULL) {
+    if (command == 0U || app->answer[OF_ORDER].waiting || app->module == NULL) {
         return;
     }
     app->ordered = 0;
@@ -387,7 +392,7 @@ static void obey(app_t *app, uint32_t now)
         app->restarting = true;
         app->restart_ms = now;
     }
-    answer(app, command, result);
+    answer(app, &app->answer[OF_ORDER], command, result);
 }
 
 /* What is wrong with a command's argument or time. */
@@ -410,16 +415,17 @@ void app_command(app_t *app, const uint8_t data[8])
     const uint32_t now = app->port->time_ms(app->port->context);
     const uint8_t command = data[0];
     const uint32_t argument = (uint32_t)data[1] | (uint32_t)data[2] << 8 | (uint32_t)data[3] << 16;
+    answer_t *at_once = &app->answer[AT_ONCE];
     if (command == SELFCAL_ANSWER_COMMAND_CHALLENGE) {
         uint32_t number = 0;
         const bool asked = argument == 0U && data[4] == 0U && data[5] == 0U && data[6] == 0U && data[7] == 0U;
         if (asked && app->module != NULL && app->module->random(app->module->context, &number) &&
             command_open(&app->command, number, now)) {
-            app->answering = true;
-            app->answer_item = SELFCAL_ANSWER_CHALLENGE;
-            app->answer = number;
+            at_once->waiting = true;
+            at_once->item = SELFCAL_ANSWER_CHALLENGE;
+            at_once->value = app->command.challenge;
         } else {
-            answer(app, command, asked ? SELFCAL_ANSWER_RESULT_NOT_NOW : SELFCAL_ANSWER_RESULT_OUT_OF_RANGE);
+            answer(app, at_once, command, asked ? SELFCAL_ANSWER_RESULT_NOT_NOW : SELFCAL_ANSWER_RESULT_OUT_OF_RANGE);
         }
         return;
     }
@@ -432,7 +438,7 @@ void app_command(app_t *app, const uint8_t data[8])
             app->period_ms = argument;
             app->due_ms = now + argument;
         }
-        answer(app, command, result);
+        answer(app, at_once, command, result);
         return;
     }
     app->ordered = command;
@@ -541,10 +547,12 @@ static bool begin_frames(app_t *app)
         return true;
     }
 #if APP_COMMANDS
-    if (app->answering) {
-        app->answering = false;
-        (void)selfcal_telemetry_answer(&app->telemetry, app->answer_item, app->answer, now);
-        return true;
+    for (unsigned i = 0; i < ANSWERS; i++) {
+        if (app->answer[i].waiting) {
+            app->answer[i].waiting = false;
+            (void)selfcal_telemetry_answer(&app->telemetry, app->answer[i].item, app->answer[i].value, now);
+            return true;
+        }
     }
     if (app->restarting && now - app->restart_ms > RESTART_MS) {
         app->module->restart(app->module->context);
@@ -554,15 +562,16 @@ static bool begin_frames(app_t *app)
     return false;
 }
 
-/* A corrected sample, if one is due. After all else: on a wire too slow for them one would always be. */
+/* A corrected sample, if one is due, of a sample that none has been of, and that is sound. After all else: on a wire too slow for them one would always be. */
 static bool begin_corrected(app_t *app)
 {
 #if APP_CORRECTED_MS
     const uint32_t now = app->port->time_ms(app->port->context);
-    if (app->passed > 0U && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt) {
+    if (app->newer && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt) {
+        app->newer = false;
         app->corrected_ms = now;
         correct(app);
-        (void)selfcal_telemetry_corrected(&app->telemetry, &app->corrected, now);
+        (void)selfcal_telemetry_corrected(&app->telemetry, &app->corrected, app->reading_ms);
         return true;
     }
 #endif

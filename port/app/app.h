@@ -30,6 +30,16 @@
 #define APP_COMMANDS 0
 #endif
 
+#if APP_COMMANDS
+/* An answer yet to be sent: of what comes of an order when it is obeyed, and of all that is answered as it comes. Private. */
+enum { OF_ORDER, AT_ONCE, ANSWERS };
+typedef struct {
+    bool waiting;
+    uint8_t item;
+    uint32_t value;
+} answer_t;
+#endif
+
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */
 typedef struct {
     const port_t *port;
@@ -63,15 +73,15 @@ typedef struct {
     selfcal_report_t last_report[SELFCAL_MODEL_AXES];
     bool has_report[SELFCAL_MODEL_AXES];
     float reading[SELFCAL_MODEL_AXES]; /* the newest */
+    uint32_t reading_ms;
+    bool newer;            /* than the last corrected sample, and sound */
     selfcal_corrected_t corrected;
 #endif
 #if APP_COMMANDS
     command_t command;
     uint8_t ordered;        /* command that is obeyed between reports; 0: none */
     uint32_t argument;      /* ... and its argument */
-    bool answering;         /* `answer` is yet to be sent */
-    uint8_t answer_item;
-    uint32_t answer;
+    answer_t answer[ANSWERS];
     bool restarting;        /* once the answer is out */
     uint32_t restart_ms;    /* since when */
     float bias[SELFCAL_MODEL_AXES]; /* of the last reports; NAN: none */

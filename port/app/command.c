@@ -38,15 +38,30 @@ uint64_t command_siphash(const uint64_t key[2], uint64_t message)
     return v[0] ^ v[1] ^ v[2] ^ v[3];
 }
 
-bool command_open(command_t *self, uint32_t challenge, uint32_t now_ms)
+static void pause(command_t *self, uint32_t now_ms)
 {
-    if (self->penalty && now_ms - self->wrong_ms < COMMAND_PENALTY_MS) {
+    self->paused = true;
+    self->paused_ms = now_ms;
+}
+
+static bool stands(const command_t *self, uint32_t now_ms)
+{
+    return self->open && now_ms - self->opened_ms <= COMMAND_CHALLENGE_MS;
+}
+
+bool command_open(command_t *self, uint32_t number, uint32_t now_ms)
+{
+    if (stands(self, now_ms)) {
+        return true;
+    }
+    self->paused = self->paused && now_ms - self->paused_ms < COMMAND_PAUSE_MS;
+    if (self->paused) {
         return false;
     }
-    self->penalty = false;
     self->open = true;
-    self->challenge = challenge;
+    self->challenge = number;
     self->opened_ms = now_ms;
+    pause(self, now_ms);
     return true;
 }
 
@@ -57,15 +72,14 @@ static uint32_t little32(const uint8_t bytes[4])
 
 uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms)
 {
-    if (!self->open || now_ms - self->opened_ms > COMMAND_CHALLENGE_MS) {
-        self->open = false;
+    const bool stood = stands(self, now_ms);
+    self->open = false;
+    if (!stood) {
         return SELFCAL_ANSWER_RESULT_NO_CHALLENGE;
     }
-    self->open = false;
     const uint64_t said = (uint64_t)self->challenge | (uint64_t)little32(data) << 32;
     if ((uint32_t)command_siphash(key, said) != little32(data + 4)) {
-        self->penalty = true;
-        self->wrong_ms = now_ms;
+        pause(self, now_ms);
         return SELFCAL_ANSWER_RESULT_WRONG_TAG;
     }
     return SELFCAL_ANSWER_RESULT_DONE;

@@ -1,9 +1,10 @@
 /* Commands over the telemetry's wire: the COMMAND message of selfcal.dbc, built in only with APP_COMMAND_KEY.
  *
  * The host asks for a challenge and gets a random number; the command's tag must be the low 32 bits of SipHash-2-4, under a key of
- * 128 bits that both know, over that number and the command. A challenge is good for one try and CHALLENGE_MS. So a frame that is
- * recorded and sent again does nothing, and a random one has one chance in 2^32 if a challenge is open at all. After a wrong tag there
- * is no challenge for COMMAND_PENALTY_MS: trying them all takes 136 years.
+ * 128 bits that both know, over that number and the command. A challenge is good for one try and COMMAND_CHALLENGE_MS; asked for again
+ * before that it is the same one. After a new challenge and after a wrong tag there is no other for COMMAND_PAUSE_MS. So a frame that is
+ * recorded does nothing unless its challenge comes again, once in 2^32 of them: who has recorded k commands and keeps asking waits
+ * 136/k years. A random tag has one chance in 2^32 a try: trying them all takes 136 years.
  * What it does not give: secrecy; protection of a key that is read out of the flash; service while somebody floods the wire, sends
  * wrong tags, or keeps asking for challenges.
  *
@@ -15,19 +16,20 @@
 #include <stdint.h>
 
 #define COMMAND_CHALLENGE_MS 10000U
-#define COMMAND_PENALTY_MS 1000U
+#define COMMAND_PAUSE_MS 1000U
 
 typedef struct {
-    bool open; /* a challenge is */
-    bool penalty;
-    uint32_t challenge, opened_ms, wrong_ms;
+    bool open;   /* a challenge is */
+    bool paused; /* ... and none other is given, since paused_ms */
+    uint32_t challenge, opened_ms, paused_ms;
 } command_t;
 
 /* SipHash-2-4 of 8 bytes, given as one little-endian number. */
 uint64_t command_siphash(const uint64_t key[2], uint64_t message);
 
-/* A new challenge, in place of any other. False: not so soon after a wrong tag. */
-bool command_open(command_t *self, uint32_t challenge, uint32_t now_ms);
+/* Whether there is a challenge to answer, `challenge` of the structure: the one that is open, or a new one, the random `number`. False:
+ * not so soon after another or a wrong tag. */
+bool command_open(command_t *self, uint32_t number, uint32_t now_ms);
 
 /* Checks the tag of a command and uses up the challenge. Returns SELFCAL_ANSWER_RESULT_DONE, _NO_CHALLENGE or _WRONG_TAG. */
 uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms);

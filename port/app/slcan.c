@@ -7,6 +7,7 @@
 #endif
 
 #define CR '\r'
+#define LF '\n'
 #define BEL '\a'
 
 void slcan_init(slcan_t *self)
@@ -38,7 +39,7 @@ static bool take_command(slcan_t *self)
 {
     uint32_t head = 0;
     uint8_t data[8] = {0};
-    if (!self->open || self->length != SLCAN_LINE_BYTES || self->line[0] != 't') {
+    if (!self->open || self->listening_only || self->length != SLCAN_LINE_BYTES || self->line[0] != 't') {
         return false;
     }
     for (unsigned i = 1; i < SLCAN_LINE_BYTES; i++) {
@@ -74,7 +75,10 @@ static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
         switch (first) {
         case 'C': self->open = false; return reply(answer, "\r");
         case 'O':
-        case 'L': self->open = true; return reply(answer, "\r");
+        case 'L':
+            self->open = true;
+            self->listening_only = first == 'L';
+            return reply(answer, "\r");
         case 'V': return reply(answer, "V0101\r"); /* hardware and software, two digits each */
         case 'v': return reply(answer, "v0101\r");
         case 'N': return reply(answer, "NSCAL\r");
@@ -92,6 +96,9 @@ static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
 
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES])
 {
+    if (byte == LF) { /* of hosts that end a line with both */
+        return 0;
+    }
     if (byte == CR) {
         const size_t length = command(self, answer);
         self->length = 0;

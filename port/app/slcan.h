@@ -22,6 +22,7 @@
 
 typedef struct {
     bool open;       /* frames may be sent */
+    bool listening_only; /* ... and none is taken */
     uint8_t length;  /* of the line so far; one more than `line` stands for any that is longer */
     char line[SLCAN_LINE_BYTES];
 #ifdef APP_COMMAND_KEY
@@ -33,7 +34,7 @@ typedef struct {
 void slcan_init(slcan_t *self);
 
 /* Takes one byte from the host. Returns how many bytes of `answer` are to be written back: 0 within a line. A line ends in
- * CR. C closes; O and L open, also when open; S0 to S8 and an empty line are accepted and change nothing; V, v and N are
+ * CR, or in CR and LF. C closes; O and L open, also when open, L for listening only: no command is taken; S0 to S8 and an empty line are accepted and change nothing; V, v and N are
  * answered; anything else is answered BEL. With commands, "t2088" and 16 hexadecimal digits on an open channel are a command. */
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]);
 

@@ -4,8 +4,8 @@
 
 For each TARGET reads build/TARGET/selfcal.elf (`make firmware`), what gcc says of each function's stack beside its
 objects (.su) and port/TARGET/budget.json: greatest `flash`, `ram` (without stack) and `stack` in bytes, and under
-`calls` for each source file that calls through pointers the const tables of functions it calls through. Exit code 1
-above a budget.
+`calls` for each source file that calls through pointers the const tables of functions it calls through, or for a
+function of it (`app.c:app_command`) the functions. Exit code 1 above a budget.
 
 The worst stack is that of the deepest path through the call graph of the linked image, read from its disassembly, from
 the reset vector, and upon it the deepest of the interrupt handlers with what the processor pushes (they share one
@@ -213,9 +213,10 @@ class Image:
                 raise FirmwareError(f"recursion: {' -> '.join(names)}")
             targets = function.goes_to
             if function.by_pointer:
-                if function.source not in calls:
+                through = calls.get(f"{function.source}:{function.name}", calls.get(function.source))
+                if through is None:
                     raise FirmwareError(f"{function.name} in {function.source} calls by pointer: say what in `calls`")
-                targets = targets.union(*map(self.functions_in, calls[function.source]))
+                targets = targets.union(*map(self.functions_in, through))
             path.append(address)
             below = max((depth(target) for target in targets), default=(0, []))
             path.pop()

@@ -157,8 +157,10 @@ class Tap:
 
     def mistimed(self) -> int:
         """Steps between pushed samples that are more than one sample, and a thousandth of the step, off the time
-        between the samples by the sensor's clock: for a sensor that was reset, whose count then stood still."""
-        period = self.board.sensor.period_us()
+        between the samples by the sensor's clock, at the rate it is to have: for a sensor that was reset, whose count
+        then stood still."""
+        sensor = self.board.sensor
+        period = sensor.period_us() * (self.board.value("sensor.sample_period") + 1) / (sensor.registers[0x36] + 1)
         made = {tuple(readings([sample])[0].tolist()): us for _, us, sample in self.board.sensor.taken}
         # of a sensor that stands still two repeats are taken: what it made is the first
         made_new = [pushed for k, pushed in enumerate(self.pushed) if k == 0 or pushed[1] != self.pushed[k - 1][1]]

@@ -59,6 +59,9 @@ def new_answers(board: parts.Board, since: int) -> list[dict[str, float]]:
 
 
 def challenge(board: parts.Board) -> int:
+    """The one that is open, or a new one: not within a second of another."""
+    if board.value("app.command.paused"):
+        board.run(1.0)
     since = len(board.frames)
     board.can.say(COMMAND_ID, verb.payload("challenge"))
     board.run(0.05)
@@ -180,6 +183,38 @@ def test_commands_are_obeyed_once() -> None:
     assert board.machine.violations == board.machine.faults == []
 
 
+def test_challenges_come_one_a_second() -> None:
+    """Until it is used a challenge is the same one, and then there is none for what is left of the second: that one
+    comes again, as a recorded command needs, takes 2^32 s."""
+    board = Board(image(**IDLE), seed=39)
+    board.run(0.9)
+    number = challenge(board)
+    for _ in range(20):
+        since = len(board.frames)
+        board.can.say(COMMAND_ID, verb.payload("challenge"))
+        board.run(0.02)
+        (answer,) = new_answers(board, since)
+        assert int(answer["challenge"]) == number
+    assert order(board, verb.payload("telemetry_period", 250, key=KEY, challenge=number)) == [RESULT["done"]]
+    assert order(board, verb.payload("challenge")) == [RESULT["not_now"]]
+    board.run(1.0)
+    assert challenge(board) != number
+
+
+def test_an_answer_outlives_the_next_question() -> None:
+    """A challenge that is asked for while a save is under way: both are answered."""
+    board = Board(image(**IDLE), seed=31)
+    board.run(0.9)
+    number, since = challenge(board), len(board.frames)
+    board.can.say(COMMAND_ID, verb.payload("save", key=KEY, challenge=number))
+    board.machine.at(3e5, lambda: board.can.say(COMMAND_ID, verb.payload("challenge")))
+    board.run(3.0)
+    answers = new_answers(board, since)
+    assert [answer["result"] for answer in answers if answer.get("command") == COMMAND["save"]] == [RESULT["done"]]
+    assert len(answers) == 2
+    assert board.value("app.told.state_saves") == 1
+
+
 def test_commands_over_the_serial_line() -> None:
     """The same as SLCAN text; only whole lines of the right identifier, length and digits on an open channel."""
     board = Board(image(**SERIAL), seed=32)
@@ -215,6 +250,10 @@ def test_commands_over_the_serial_line() -> None:
     answer = say(line(verb.payload("telemetry_period", 200, key=KEY, challenge=number)))
     assert b"t2098" in answer
     assert board.value("app.period_ms") == 200
+    assert say("L").startswith(b"\r")  # listening only
+    assert say(line(verb.payload("challenge"))).startswith(b"\a")
+    assert say("C") == b"\r"
+    assert say("\nV\r\n\r\nO\r\n").startswith(b"V0101\r\r\r")  # of a host that ends a line with both
     assert board.machine.violations == []
 
 
@@ -226,7 +265,12 @@ def test_random_command_frames_do_nothing() -> None:
     board = Board(image(**IDLE), seed=33)
     tap = Tap(board)
     board.run(0.9)
-    recorded = [verb.payload("reset", key=KEY, challenge=challenge(board)) for _ in range(3)]
+    recorded = []
+    for _ in range(3):
+        number = challenge(board)
+        recorded.append(verb.payload("reset", key=KEY, challenge=number))
+        used_up = verb.payload("telemetry_period", 1, key=KEY, challenge=number)
+        assert order(board, used_up) == [RESULT["out_of_range"]]
     before = {name: board.value(name) for name in ("app.period_ms", "app.told.state_saves", "app.told.command_count")}
     passed = 0
     for trial in range(trials):
@@ -301,6 +345,7 @@ def test_corrected_samples_equal_the_host_s() -> None:
                 decoder.corrected = {}
         done = len(board.frames)
     assert board.machine.violations == []
+    assert not [at for at, _, _ in heard if 8.7e3 < at["time_ms"] < 11.5e3], "of samples that were not measured"
     host, passed = host_of(path), np.cumsum([missing + 1 for missing, _ in tap.seen])
     compared: dict[str, list[tuple[int, float, float]]] = {axis: [] for axis in AXES}  # n, time in s, sd
     worst, before = 0.0, 0
@@ -333,6 +378,39 @@ def test_corrected_samples_equal_the_host_s() -> None:
         assert over_gap[-1][0] - over_gap[0][0] > 2.0, axis
         assert all(sd <= later for (_, sd), (_, later) in pairwise(over_gap)), axis
         assert over_gap[0][1] < over_gap[-1][1], axis
+
+
+def corrected(board: parts.Board, since: int) -> list[dict[str, float]]:
+    """Sets of corrected samples among the frames heard from the `since`-th on."""
+    decoder, found = Decoder(), []
+    for message in messages(board, since):
+        decoder.feed(message)
+        if "motion" in decoder.corrected:
+            found.append(decoder.corrected)
+            decoder.corrected = {}
+    return found
+
+
+def test_corrected_samples_are_of_sound_samples() -> None:
+    """None of a saturated reading; none of a reading from before the offsets were written with the bias of after: az by
+    all of gravity, of which 0.6 m/s^2 is 6 sd of the noise."""
+    board = Board(image(**ORDERS), seed=36)
+    board.run(7.0)
+    since = len(board.frames)
+    for axes in (32, 0, 32, 0, 32):
+        assert obey(board, "write_offsets", axes, seconds=0.5) == [RESULT["done"]]
+    found = corrected(board, since)
+    assert len(found) > 20
+    assert max(abs(one["corrected_az"]) for one in found) < 0.6
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0], 6400.0, *rest(k)[2:])
+    board.run(0.1)
+    since = len(board.frames)
+    board.run(1.0)
+    assert corrected(board, since) == []
+    board.sensor.source = rest
+    board.run(0.5)
+    assert corrected(board, since) != []
 
 
 def test_offsets_are_written_and_taken_out_of_the_estimate() -> None:

@@ -22,7 +22,7 @@ QUIET = ("quiet", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0", True)
 SERIAL = ("serial", "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0 -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD=1000000", True)
 TARGETS = ("stm32f405", "cortex-m0")
 #: codes of `sensor_fault` in selfcal.dbc
-ABSENT, SELF_TEST, SILENT, NO_DATA, STUCK, STATUS = 1, 3, 4, 5, 6, 7
+ABSENT, SET_UP, SELF_TEST, SILENT, NO_DATA, STUCK, STATUS = range(1, 8)
 STARTING, RUNNING, FAILED = 1, 2, 3
 
 
@@ -119,6 +119,75 @@ def test_sensor_fails_and_heals(name: str) -> None:
     assert tap.wrong() == 0
     assert tap.mistimed() == 0
     tell(f"sensor {name}", 1, 1)
+
+
+def set_up(board: parts.Board | parts.NrfBoard) -> dict[int, int]:
+    """The sensor's MSC_CTRL, SMPL_PRD and SENS_AVG."""
+    return {address: board.sensor.registers[address] for address in (0x34, 0x36, 0x38)}
+
+
+@pytest.mark.parametrize("when_us", [2e3, 8e3, 15e3])
+def test_a_reset_during_the_self_test(when_us: float) -> None:
+    """A spike resets the sensor while it tests itself at the start: its defaults look like the end of the test, but its
+    rate and filter are not what was set."""
+    board = Board(image(*QUIET), seed=1)
+    tap = Tap(board)
+    while not board.sensor.registers[0x34] & 0x0400:
+        board.run(1e-3)
+    board.run(when_us / 1e6)
+    board.sensor.reset()
+    board.run(3.0)
+    assert status(board)["sensor_fault"] == SET_UP
+    assert status(board)["sensor_state"] == RUNNING
+    assert set_up(board) == {0x34: 0x0006, 0x36: 15, 0x38: 0x0401}
+    assert len(tap.pushed) > 100
+    assert sound(board, None, 0)
+    assert tap.wrong() == tap.mistimed() == 0
+
+
+def test_a_reset_while_the_flash_is_at_work() -> None:
+    """Nobody sees the sensor's silence then: what follows the pause is taken only once the settings have been read."""
+    board = saver("stm32f405")
+    tap = Tap(board)
+    board.run(1.0)
+    before, erase = set_up(board), board.flash._erase
+
+    def spoil(number: int) -> None:
+        if board.flash._erase == spoil:
+            board.flash._erase = erase
+            board.machine.at(5e3, board.sensor.reset)
+        erase(number)
+
+    board.flash._erase = spoil
+    while board.value("app.told.state_saves") < 1:
+        board.run(0.1)
+    taken = len(tap.pushed)
+    board.run(3.0)
+    assert board.sensor.resets >= 3  # power, start, spike
+    assert set_up(board) == before
+    assert board.value("sensor.state") == 1
+    assert len(tap.pushed) > taken + 50
+    assert not board.machine.violations
+    assert tap.wrong() == tap.mistimed() == 0
+
+
+def test_altered_settings_are_found() -> None:
+    """A read that a bit error made a write, here of the range: seen within 1 s by the readings of the settings, which
+    cost no sample."""
+    board = Board(image(*QUIET), seed=6)
+    tap = Tap(board)
+    board.run(6.0)
+    assert sum(tap.skips) == 0
+    assert board.sensor.reads[0x38] >= 5 + 2  # 2 at the start
+    board.sensor.registers[0x38] = 0x0101
+    board.run(1.1)
+    assert (board.value("sensor.state"), board.value("sensor.fault")) != (1, 0)
+    board.run(2.0)
+    assert status(board)["sensor_fault"] == SET_UP
+    assert status(board)["sensor_state"] == RUNNING
+    assert board.sensor.registers[0x38] == 0x0401
+    assert sound(board, None, 0)
+    assert tap.mistimed() == 0
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,13 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "bench"))
 
 import image_sizes  # noqa: E402
+from firmware import image  # noqa: E402
 from image_sizes import FirmwareError, Image  # noqa: E402
 
 from selfcal import recording as recording_module  # noqa: E402
 from selfcal.model import Model  # noqa: E402
 from selfcal.recording import load  # noqa: E402
+from selfcal.verbs.command import build_flag  # noqa: E402
 from selfcal.verbs.replay import TARGETS, build, emulator, write_rows  # noqa: E402
 from selfcal.wire import load_dbc  # noqa: E402
 
@@ -156,13 +158,30 @@ def test_the_images_keep_their_budgets(capsys: pytest.CaptureFixture[str], monke
     assert "cortex-m0: stack is " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("target", "flags"),
+    [
+        ("stm32f405", "-DBOARD_CAN_KBITPS=250 -DAPP_CORRECTED_MS=100"),
+        ("stm32f405", f"-DBOARD_CAN_KBITPS=0 -DAPP_CORRECTED_MS=100 {build_flag(bytes(16))}"),
+        ("cortex-m0", build_flag(bytes(16))),
+    ],
+)
+def test_images_of_the_guide_keep_the_budgets(target: str, flags: str) -> None:
+    """With all that can be built in, as the guide says it."""
+    elf = image(f"guide-{target}-{len(flags)}", flags, target=target)
+    configured, budget = Image(elf), image_sizes.read_budget(target)
+    assert configured.flash() <= budget["flash"]
+    assert configured.ram() <= budget["ram"]
+    assert configured.stack(budget["calls"])[0] <= budget["stack"]
+
+
 @pytest.mark.usefixtures("images")
 def test_the_cortex_m0_image_starts() -> None:
     """As it is, on the emulated board: no sensor there, but the main loop turns and the UART's interrupts answer."""
-    image = ROOT / "build" / "cortex-m0" / "selfcal.elf"
+    elf = ROOT / "build" / "cortex-m0" / "selfcal.elf"
     board = ["-M", *TARGETS["cortex-m0"].board, "-display", "none", "-monitor", "none", "-serial", "stdio"]
     module = subprocess.Popen(
-        ["qemu-system-arm", *board, "-kernel", str(image)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ["qemu-system-arm", *board, "-kernel", str(elf)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert module.stdin is not None and module.stdout is not None
     try:

@@ -164,6 +164,24 @@ def test_offsets_are_written_and_kept() -> None:
     assert not made.machine.violations
 
 
+def test_a_reset_during_a_report() -> None:
+    """The main loop is away for longer than the sensor's silence lasts: the samples' stamps tell."""
+    flags = "-DBOARD_REPORT_MS=5000 -DBOARD_GATE=0"
+    made = NrfBoard(image("m0-busy", flags, True, 1.024, target="cortex-m0"), seed=5)
+    tap = Tap(made)
+    while not made.value("app.computing"):
+        made.run(0.1)
+    made.run(0.2)
+    settings = {address: made.sensor.registers[address] for address in (0x34, 0x36, 0x38)}
+    made.sensor.reset()
+    made.run(1.5)
+    assert made.value("app.computing")
+    assert made.value("sensor.counters.faults") >= 1
+    assert {address: made.sensor.registers[address] for address in settings} == settings
+    assert tap.wrong() == tap.mistimed() == 0
+    assert well(made)
+
+
 @pytest.mark.skipif(MANY == 1, reason="ten minutes: make campaigns")
 def test_a_whole_report_of_six_axes() -> None:
     """All laws on six axes at 16 MHz, minutes of work: the module stays up, and every axis arrives."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 CHALLENGE = "challenge"
 #: s to wait for a challenge, and for an answer: a module obeys between reports, and a Cortex-M0's takes 200 s.
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
+#: s after a challenge or a wrong tag within which a module gives no other.
+PAUSE_S = 1.0
 #: Orders that go to no module.
 OWN_ORDERS = ("new-key", "build-flag")
 _MASK = 2**64 - 1
@@ -139,14 +141,21 @@ def command(
         raise UserError("to which module? --channel names its serial port (/dev/ttyACM0), or the --interface's channel")
     key = read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
-        link.bus.send(frame(payload(CHALLENGE)))
-        challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE])
+        for wait in (PAUSE_S, PAUSE_S, 0.0):
+            link.bus.send(frame(payload(CHALLENGE)))
+            challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE])
+            if challenge is not None:
+                break
+            time.sleep(wait)
+        else:
+            raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
         link.bus.send(frame(payload(order, argument, key=key, challenge=challenge)))
         result = _await(link, "result", ANSWER_S, codes("command")[order])
     return next((name for name, number in codes("result").items() if number == result), str(result))
 
 
-def _await(link: Link, signal: str, timeout_s: float, about: int) -> int:
+def _await(link: Link, signal: str, timeout_s: float, about: int) -> int | None:
+    """A signal of the answer, None if it is another; raises UserError if none comes within `timeout_s`."""
     decoder = Decoder()
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0 and not link.closed:
@@ -156,8 +165,8 @@ def _await(link: Link, signal: str, timeout_s: float, about: int) -> int:
         decoder.feed(message)
         if signal in decoder.answer:
             return int(decoder.answer[signal])
-        if decoder.answer.get("command") == about:  # refused
-            raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
+        if decoder.answer.get("command") == about:
+            return None
         decoder.answer.clear()
     if signal == "result":
         raise UserError(f"the module gave a challenge, but no word within {timeout_s:g} s of what came of the command")
