@@ -338,6 +338,17 @@ class Link:
                 break
         return None
 
+    def open_again(self) -> None:
+        """Open the channel of a serial line once more; on other buses nothing happens."""
+        import can
+        from can.interfaces.slcan import slcanBus
+
+        try:
+            if isinstance(self.bus, slcanBus):
+                self.bus.open()
+        except (OSError, can.CanError):
+            self.closed = True
+
     def close(self) -> None:
         """Close the channel; a line that is gone already is no error."""
         import can
