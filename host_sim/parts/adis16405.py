@@ -55,6 +55,7 @@ class Adis16405:
         # statistics
         self.frames = self.bursts = self.resets = 0
         self.reads: dict[int, int] = {}  # of registers, by address
+        self.made_with: list[tuple[int, int]] = []  # SMPL_PRD and SENS_AVG of each of `taken`
         self.index = 0
         self._event: Event | None = None
         self.power_on()
@@ -133,6 +134,7 @@ class Adis16405:
                     for value, address in zip(self.source(index), OFFSETS, strict=True)
                 )
                 self.taken.append((index, self.machine.time_us, sample))
+                self.made_with.append((self.registers[0x36], self.registers[0x38]))
                 words = [self.supply, *sample, 0, 0, 0, 0, 0]
                 for address, word in zip(OUTPUTS, words, strict=True):
                     self.out[address] = word & 0x3FFF

@@ -49,12 +49,12 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
 #define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
-/* Between two samples, or 1.5 periods: a reset by something else takes longer, 170 ms, and leaves a rate of its own. What follows is taken
+/* Between two samples, or 1.5 periods, or less than 3/4 of one: a reset by something else takes longer, 170 ms, and leaves a rate of its own. What follows is taken
  * once the settings have been found to stand. */
 #define DOUBT_US 100000U
-/* Between readings of the settings without a cause, for a read of which a bit error made a write. They take 5 words, and wait for room
- * between two bursts; five times so long at most. */
-#define CHECK_US 1000000U
+/* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does to the settings what is
+ * looked for. They take 5 words, and wait for room between two bursts; five times so long at most, then at the cost of a sample. */
+#define CHECK_US 10000000U
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
 #define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
@@ -212,6 +212,7 @@ static void begin(adis16405_t *self, uint64_t now)
 static void fail(adis16405_t *self, adis16405_fault_t fault, uint64_t now)
 {
     self->listening = false;
+    self->tail = self->head; /* what waits may be of a sensor that was no longer set up */
     self->state = ADIS16405_FAILED;
     self->fault = fault;
     self->step_us = now;
@@ -503,7 +504,8 @@ static bool look_after(adis16405_t *self, uint64_t now)
 static void watch(adis16405_t *self, uint64_t now)
 {
     const uint64_t unchecked = now - self->checked_us;
-    const bool room = !self->reading && (uint32_t)now - self->stamp + CHECK_ROOM_US < self->nominal_q8 >> 8;
+    const uint32_t period = self->nominal_q8 >> 8;
+    const bool room = !self->reading && (uint32_t)now - self->stamp + CHECK_ROOM_US < period - period / 4U;
     if (unchecked >= CHECK_US && (room || unchecked >= 5ULL * CHECK_US) && !look_after(self, now)) {
         return;
     }
@@ -521,7 +523,7 @@ static void watch(adis16405_t *self, uint64_t now)
             expect(self, now);
         }
     }
-    const uint64_t silence = SILENCE_US > 10U * (self->nominal_q8 >> 8) ? SILENCE_US : 10U * (self->nominal_q8 >> 8);
+    const uint64_t silence = SILENCE_US > 10U * period ? SILENCE_US : 10U * period;
     if (now - self->progress_us > silence && self->head == self->tail) {
         /* One data-ready may come from plugging; a sensor gives one a period. */
         fail(self, self->ready_count - self->ready_seen < 3U ? ADIS16405_SILENT : ADIS16405_NO_DATA, now);
@@ -591,7 +593,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         }
         const uint64_t step = stamp - self->seen_us, period = self->nominal_q8 >> 8, doubt = period + period / 2U;
         self->seen_us = stamp;
-        self->doubtful = self->doubtful || step > (DOUBT_US > doubt ? DOUBT_US : doubt) || step < period / 2U;
+        self->doubtful = self->doubtful || step > (DOUBT_US > doubt ? DOUBT_US : doubt) || step < period - period / 4U;
         if (self->doubtful && (!look_after(self, now) || self->doubtful)) {
             continue;
         }

@@ -5,8 +5,8 @@
  * before that it is the same one. After a new challenge and after a wrong tag there is no other for COMMAND_PAUSE_MS. So a frame that is
  * recorded does nothing unless its challenge comes again, once in 2^32 of them: who has recorded k commands and keeps asking waits
  * 136/k years. A random tag has one chance in 2^32 a try: trying them all takes 136 years.
- * What it does not give: secrecy; protection of a key that is read out of the flash; service while somebody floods the wire, sends
- * wrong tags, or keeps asking for challenges.
+ * What it does not give: secrecy; protection of a key that is read out of the flash; service while somebody floods the wire or sends
+ * wrong tags.
  *
  * SipHash: Aumasson & Bernstein, INDOCRYPT 2012, 489-508. */
 #ifndef COMMAND_H

@@ -155,6 +155,14 @@ class Tap:
         made = {tuple(row) for row in readings([sample for _, _, sample in self.board.sensor.taken]).tolist()}
         return sum(sample not in made for _, sample in self.pushed)
 
+    def foreign(self) -> int:
+        """Pushed samples that the sensor made with other settings than the driver's."""
+        sensor, value = self.board.sensor, self.board.value
+        wanted = value("sensor.sample_period"), value("sensor.filter")
+        made = map(tuple, readings([sample for _, _, sample in sensor.taken]).tolist())
+        settings = dict(zip(made, sensor.made_with, strict=True))
+        return sum(settings[sample] != wanted for _, sample in self.pushed if sample in settings)
+
     def mistimed(self) -> int:
         """Steps between pushed samples that are more than one sample, and a thousandth of the step, off the time
         between the samples by the sensor's clock, at the rate it is to have: for a sensor that was reset, whose count

@@ -185,7 +185,7 @@ def test_a_reset_during_a_report() -> None:
     assert made.value("app.work.hypothesis") == 2
     assert made.value("sensor.counters.faults") >= 1
     assert {address: made.sensor.registers[address] for address in settings} == settings
-    assert tap.wrong() == tap.mistimed() == 0
+    assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
     assert well(made)
 
 

@@ -29,6 +29,7 @@ STATISTICS = ("mean", "median", "sd", "q05", "q95")
 
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
+BACK_MS = 5000  # a corrected sample may be so much older than what was sent before it
 RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter
 
 
@@ -156,11 +157,7 @@ class Decoder:
 
     def __init__(self, *, from_start: bool = False) -> None:
         database = load_dbc()
-        self._messages = {
-            message.frame_id: message
-            for message in database.messages
-            if message.name != COMMAND
-        }
+        self._messages = {message.frame_id: message for message in database.messages if message.name != COMMAND}
         self.statistics = Statistics()
         #: Last value of each status signal.
         self.status: dict[str, float] = {}
@@ -265,8 +262,8 @@ class Decoder:
         self._origin = frames_sent + 1 - self._sent  # first of this stream, or the module has started anew
 
     def _advance(self, time_ms: int) -> None:
-        ahead = (time_ms - self.time_ms) % 2**32
-        self.time_ms = self.time_ms + ahead if ahead < 2**31 else time_ms  # else the module has started anew
+        ahead = (time_ms - self.time_ms + BACK_MS) % 2**32 - BACK_MS
+        self.time_ms = self.time_ms + max(0, ahead) if ahead < 2**31 else time_ms  # else the module has started anew
 
     def _assemble(self, axis: str, item: int, jump: int, second: int, values: dict[str, float]) -> list[AxisReport]:
         """Add a frame to its report. Frames of a report follow each other in ascending item order, so a jump of the
