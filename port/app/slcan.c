@@ -96,7 +96,7 @@ static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
 
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES])
 {
-    if (byte == LF) { /* of hosts that end a line with both */
+    if (byte == LF && self->length == 0U) { /* of hosts that end a line with both */
         return 0;
     }
     if (byte == CR) {

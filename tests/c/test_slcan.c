@@ -52,6 +52,12 @@ static void test_listen_only_opens_too(void)
     TEST_ASSERT_TRUE(slcan.open);
 }
 
+static void test_lines_may_end_in_both(void)
+{
+    TEST_ASSERT_EQUAL_STRING("\r\rV0101\r\r", answers("C\r\nO\r\nV\r\n\r\n"));
+    TEST_ASSERT_TRUE(slcan.open);
+}
+
 static void test_identification(void)
 {
     TEST_ASSERT_EQUAL_STRING("V0101\rv0101\rNSCAL\r", answers("V\rv\rN\r"));
@@ -60,7 +66,7 @@ static void test_identification(void)
 
 static void test_anything_else_is_refused(void)
 {
-    static const char *const line[] = {"S\r",  "S9\r", "S66\r", "s0000\r", "o\r", "OO\r", "\nO\r", "t1000\r", "Z1\r",
+    static const char *const line[] = {"S\r",  "S9\r", "S66\r", "s0000\r", "o\r", "OO\r", "O\nO\r", "t1000\r", "Z1\r",
                                        "VV\r", " \r",  "C\n\r", "\x80\r",  "\a\r"};
     for (size_t i = 0; i < sizeof line / sizeof line[0]; i++) {
         TEST_ASSERT_EQUAL_STRING_MESSAGE("\a", answers(line[i]), line[i]);
@@ -115,7 +121,7 @@ static void test_two_million_random_bytes(void)
         TEST_ASSERT_EQUAL_HEX8(0x55, answer[SLCAN_ANSWER_BYTES]);
         if (byte != '\r') {
             TEST_ASSERT_EQUAL_size_t(0, got);
-            if (length < sizeof line - 1U) {
+            if (length < sizeof line - 1U && !(byte == '\n' && length == 0U)) {
                 line[length++] = (char)byte;
             }
             continue;
@@ -137,6 +143,7 @@ int main(void)
     RUN_TEST(test_frame_is_a_lawicel_line);
     RUN_TEST(test_python_can_opens_and_closes);
     RUN_TEST(test_listen_only_opens_too);
+    RUN_TEST(test_lines_may_end_in_both);
     RUN_TEST(test_identification);
     RUN_TEST(test_anything_else_is_refused);
     RUN_TEST(test_overlong_line_is_refused_and_forgotten);
