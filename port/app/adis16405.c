@@ -49,11 +49,11 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
 #define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
-/* Between two samples, or 1.5 periods, or less than 3/4 of one: a reset by something else takes longer, 170 ms, and leaves a rate of its own. What follows is taken
- * once the settings have been found to stand. */
+/* Samples further apart than this and 1.5 periods, or closer than 3/4 of one: something else may have reset the sensor, which takes 170 ms
+ * and leaves a rate of its own. What follows is taken once the settings have been found to stand. */
 #define DOUBT_US 100000U
-/* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does to the settings what is
- * looked for. They take 5 words, and wait for room between two bursts; five times so long at most, then at the cost of a sample. */
+/* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does to the settings what
+ * is looked for. They take 5 words, and wait for room between two bursts; five times so long at most, then at the cost of a sample. */
 #define CHECK_US 10000000U
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
@@ -601,7 +601,7 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
             self->settling--;
             continue;
         }
-        if (self->anchored && stamp - self->anchored_us > 10U * (uint64_t)(self->nominal_q8 >> 8)) {
+        if (self->anchored && stamp - self->anchored_us > 10U * period) {
             self->anchored = false;
             self->unsure = 0;
         }

@@ -6,8 +6,9 @@
  *   - the first reading has ND (new data) set and EA (error/alarm) clear on all six inertial channels,
  *   - the second one has the same 14 bits everywhere,
  *   - XGYRO_OUT has not lost its sign bit (known anomaly of the part: a step of +2^13 LSB).
- * After a pause, or with samples that come too fast, the settings are read first (something else may have reset the sensor), and every
- * ten seconds without a cause, fifty at most. Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
+ * After a pause, or with samples that come too fast, the settings are read first (something else may have reset the sensor), and
+ * every ten seconds without a cause, fifty at most.
+ * Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
  * and the sensor's own sample period, which is tracked.
  *
  * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the

@@ -213,7 +213,7 @@ static bool take_sample(app_t *app)
         app->passed += (uint64_t)missing + 1U;
         memcpy(app->reading, reading, sizeof reading);
         app->reading_ms = app->port->time_ms(app->port->context);
-        app->newer = !faulty(app, reading);
+        app->newer = true;
 #endif
         return true;
     case PORT_END: app->ended = true; return false;
@@ -562,13 +562,17 @@ static bool begin_frames(app_t *app)
     return false;
 }
 
-/* A corrected sample, if one is due, of a sample that none has been of, and that is sound. After all else: on a wire too slow for them one would always be. */
+/* A corrected sample, if one is due, of a sample that none has been of, and that is sound. After all else: on a wire too slow for them
+ * one would always be. */
 static bool begin_corrected(app_t *app)
 {
 #if APP_CORRECTED_MS
     const uint32_t now = app->port->time_ms(app->port->context);
-    if (app->newer && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt) {
+    const bool due = app->newer && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt;
+    if (due) {
         app->newer = false;
+    }
+    if (due && !faulty(app, app->reading)) {
         app->corrected_ms = now;
         correct(app);
         (void)selfcal_telemetry_corrected(&app->telemetry, &app->corrected, app->reading_ms);

@@ -74,7 +74,7 @@ typedef struct {
     bool has_report[SELFCAL_MODEL_AXES];
     float reading[SELFCAL_MODEL_AXES]; /* the newest */
     uint32_t reading_ms;
-    bool newer;            /* than the last corrected sample, and sound */
+    bool newer;            /* than what was last looked at for a corrected sample */
     selfcal_corrected_t corrected;
 #endif
 #if APP_COMMANDS

@@ -6,9 +6,11 @@ import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import can
 import numpy as np
@@ -30,6 +32,7 @@ CORES = {"stm32f405": "cortex-m4f", "cortex-m0": "cortex-m0"}
 from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is there
 from unicorn import arm_const as arm  # noqa: E402
 
+T = TypeVar("T")
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 #: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
 #: their rows go to build/campaigns.txt as well.
@@ -102,6 +105,11 @@ def status(board: parts.Board) -> dict[str, float]:
     return reports(messages(board))[0].status
 
 
+def set_up(board: parts.Board | parts.NrfBoard) -> dict[int, int]:
+    """The sensor's MSC_CTRL, SMPL_PRD and SENS_AVG."""
+    return {address: board.sensor.registers[address] for address in (0x34, 0x36, 0x38)}
+
+
 def readings(samples: list[tuple[int, ...]]) -> NDArray[np.float32]:
     """LSB to deg/s and m/s^2 as the data sheet scales them, in the driver's float arithmetic [n, 6]."""
     scale = np.array([0.05] * 3 + [0.032656145] * 3, dtype=np.float32)
@@ -150,17 +158,21 @@ class Tap:
         self.place += count
         self.skips.append(count)
 
+    def _made(self, each: Iterable[T]) -> dict[tuple[float, ...], T]:
+        """What belongs to each sample that the sensor made, by its readings."""
+        rows = readings([sample for _, _, sample in self.board.sensor.taken]).tolist()
+        return dict(zip(map(tuple, rows), each, strict=True))
+
     def wrong(self) -> int:
         """Pushed samples that are none of those the sensor made."""
-        made = {tuple(row) for row in readings([sample for _, _, sample in self.board.sensor.taken]).tolist()}
+        made = self._made(self.board.sensor.taken)
         return sum(sample not in made for _, sample in self.pushed)
 
     def foreign(self) -> int:
         """Pushed samples that the sensor made with other settings than the driver's."""
         sensor, value = self.board.sensor, self.board.value
         wanted = value("sensor.sample_period"), value("sensor.filter")
-        made = map(tuple, readings([sample for _, _, sample in sensor.taken]).tolist())
-        settings = dict(zip(made, sensor.made_with, strict=True))
+        settings = self._made(sensor.made_with)
         return sum(settings[sample] != wanted for _, sample in self.pushed if sample in settings)
 
     def mistimed(self) -> int:
@@ -169,7 +181,7 @@ class Tap:
         then stood still."""
         sensor = self.board.sensor
         period = sensor.period_us() * (self.board.value("sensor.sample_period") + 1) / (sensor.registers[0x36] + 1)
-        made = {tuple(readings([sample])[0].tolist()): us for _, us, sample in self.board.sensor.taken}
+        made = self._made(us for _, us, _ in sensor.taken)
         # of a sensor that stands still two repeats are taken: what it made is the first
         made_new = [pushed for k, pushed in enumerate(self.pushed) if k == 0 or pushed[1] != self.pushed[k - 1][1]]
         off = 0

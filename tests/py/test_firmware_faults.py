@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from firmware import MANY, Board, NrfBoard, Tap, image, messages, parts, readings, reports, status, tell
+from firmware import MANY, Board, NrfBoard, Tap, image, messages, parts, readings, reports, set_up, status, tell
 from parts.flash import half_erased, half_programmed
 from unicorn import UC_HOOK_CODE, Uc
 from unicorn import arm_const as arm
@@ -121,11 +121,6 @@ def test_sensor_fails_and_heals(name: str) -> None:
     assert tap.wrong() == 0
     assert tap.mistimed() == 0
     tell(f"sensor {name}", 1, 1)
-
-
-def set_up(board: parts.Board | parts.NrfBoard) -> dict[int, int]:
-    """The sensor's MSC_CTRL, SMPL_PRD and SENS_AVG."""
-    return {address: board.sensor.registers[address] for address in (0x34, 0x36, 0x38)}
 
 
 @pytest.mark.parametrize("when_us", [2e3, 8e3, 15e3])

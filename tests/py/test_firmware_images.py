@@ -14,20 +14,19 @@ import time
 from pathlib import Path
 
 import pytest
+from firmware import ROOT, image
 
-ROOT = Path(__file__).resolve().parents[2]
+from selfcal import recording as recording_module
+from selfcal.model import Model
+from selfcal.recording import load
+from selfcal.verbs.command import build_flag
+from selfcal.verbs.replay import TARGETS, build, emulator, write_rows
+from selfcal.wire import load_dbc
+
 sys.path.insert(0, str(ROOT / "tests" / "bench"))
 
-import image_sizes  # noqa: E402
-from firmware import image  # noqa: E402
-from image_sizes import FirmwareError, Image  # noqa: E402
-
-from selfcal import recording as recording_module  # noqa: E402
-from selfcal.model import Model  # noqa: E402
-from selfcal.recording import load  # noqa: E402
-from selfcal.verbs.command import build_flag  # noqa: E402
-from selfcal.verbs.replay import TARGETS, build, emulator, write_rows  # noqa: E402
-from selfcal.wire import load_dbc  # noqa: E402
+import image_sizes
+from image_sizes import FirmwareError, Image
 
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})

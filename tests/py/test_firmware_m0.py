@@ -7,7 +7,7 @@ Truths: the samples that the sensor's model made; the sensor's registers; the ho
 from __future__ import annotations
 
 import pytest
-from firmware import MANY, NrfBoard, Tap, image, messages, parts, reports, status, tell
+from firmware import MANY, NrfBoard, Tap, image, messages, parts, reports, set_up, status, tell
 from unicorn import UC_HOOK_CODE, Uc
 
 from selfcal.verbs import command as verb
@@ -178,13 +178,13 @@ def test_a_reset_during_a_report() -> None:
     tap = Tap(made)
     while not (made.value("app.computing") and made.value("app.work.hypothesis") == 2):
         made.run(0.1)  # Gauss-Markov takes seconds
-    settings = {address: made.sensor.registers[address] for address in (0x34, 0x36, 0x38)}
+    settings = set_up(made)
     made.sensor.reset()
     made.run(1.5)
     assert made.value("app.computing")
     assert made.value("app.work.hypothesis") == 2
     assert made.value("sensor.counters.faults") >= 1
-    assert {address: made.sensor.registers[address] for address in settings} == settings
+    assert set_up(made) == settings
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
     assert well(made)
 
