@@ -230,13 +230,15 @@ static void place_nodes(selfcal_t *self) {
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
+            /* Where the drift hides the white noise a deviation beyond the last node may still count. */
+            const selfcal_real_t above = markov ? R(1.25) : R(0.5);
             ln_range_t ln_sigma = sigma[axis];
             if (is_sum(hypothesis->law) && hypothesis->law == SELFCAL_MOVING_AVERAGE) {
                 ln_sigma.hi -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_max);
                 ln_sigma.lo -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_min);
             }
             rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - ln_sigma.hi - R(0.5));
-            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - ln_sigma.lo + R(0.5));
+            rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - ln_sigma.lo + above);
             alpha_lo = r_fmin(alpha_lo, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min);
             alpha_hi = r_fmax(alpha_hi, (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max);
         }

@@ -3,7 +3,7 @@
 
 /* The prices that selfcal.h states. */
 #ifdef SELFCAL_FIXED
-SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 72);
+SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 68);
 #elif !defined(SELFCAL_REAL_DOUBLE)
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
 #endif

@@ -3,6 +3,7 @@
 typedef struct {
     T ln_v; /* ln of the innovations' variance over sigma_v^2 of the data */
     T ln_s; /* ln of what the filter itself takes it to be, over its own sigma_v^2 */
+    T gain, p; /* phi K; 1 - psi */
 } NAME(expected_t);
 
 /* The converged filter of (rho, 1 - phi = beta), a random walk with a beta of 0, over white noise and a first-order drift of deviation
@@ -14,12 +15,12 @@ static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *
     const T b = one_less_phi_sq - q;
     const T root = T_sqrt(b * b + T_(4.0) * q);
     const T p_inf = b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
-    const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf); /* phi K */
-    const T p = gain + beta;                                     /* 1 - psi */
+    const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf);
+    const T p = gain + beta;
     const T c = (T)truth->rate;
     const T white_less_1 = gain * gain / (p * (T_(2.0) - p));
     const T drift = (beta * beta * (T_(1.0) + (T_(1.0) - p) * (T_(1.0) - c)) + T_(2.0) * (T_(1.0) - beta) * p * c) /
                     (p * (T_(2.0) - p) * (p + c - p * c));
-    const NAME(expected_t) e = {T_log1p((T)truth->variance * drift + white_less_1), T_log1p(p_inf)};
+    const NAME(expected_t) e = {T_log1p((T)truth->variance * drift + white_less_1), T_log1p(p_inf), gain, p};
     return e;
 }

@@ -113,6 +113,16 @@ extern "C" {
 #error "SELFCAL_SIGMA_CELLS must be 8 and SELFCAL_HISTOGRAM 32 at least"
 #endif
 
+/* Frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even in
+ * their logarithm, from 1/n to pi a bank interval. Less than 0.46 nepers apart they do for the reports' tolerances; fewer: less time.
+ * 4.5 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HISTOGRAM anyway. */
+#ifndef SELFCAL_LINES
+#define SELFCAL_LINES 40
+#endif
+#if SELFCAL_LINES < 8 || SELFCAL_LINES > 64 || SELFCAL_LINES % 2 != 0
+#error "SELFCAL_LINES must be an even number, 8 to 64"
+#endif
+
 /* Nodes one grid dimension holds at most. */
 #ifndef SELFCAL_GRID_MAX
 #define SELFCAL_GRID_MAX 24
@@ -253,8 +263,8 @@ typedef struct {
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
  * sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
- * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way. Where the nodes lie decides
- * how well the likelihood is interpolated, not the prior. */
+ * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way, of e^1.25 above sigma_m. Where the
+ * nodes lie decides how well the likelihood is interpolated, not the prior. */
 typedef struct {
     selfcal_law_t law;
     float ln_probability;        /* prior */
@@ -350,14 +360,15 @@ typedef struct {
     selfcal_real_t u_inf; /* innovation of the regressor "1" once settled */
     selfcal_real_t e;     /* that innovation at the next sample less u_inf */
     bool level;           /* d = e = 0: the kernel sums plain nu */
+#ifdef SELFCAL_FIXED
+    uint8_t g_shift, u_shift, w_shift; /* of a level node: g, u/s and 1/s are each mantissa * 2^-shift */
+#endif
     uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
     uint32_t level_from;  /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;      /* sum u^2 / s */
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
 #ifdef SELFCAL_FIXED
-    /* Of a level node g, u/s and 1/s, each mantissa * 2^-shift. */
     int32_t g_mantissa, u_mantissa, w_mantissa;
-    uint8_t g_shift, u_shift, w_shift;
 #endif
 } selfcal_node_t;
 
@@ -382,7 +393,7 @@ typedef struct {
 } selfcal_block_t;
 #endif
 
-/* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 72 in the fixed-point one, and 20
+/* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 68 in the fixed-point one, and 20
  * more per axis (check.c holds it to that). */
 #define SELFCAL_SIZE(nodes, axes) \
     ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
@@ -710,12 +721,23 @@ typedef struct {
     selfcal_wide_t first[SELFCAL_REGRESSORS_MAX], second[SELFCAL_REGRESSORS_MAX], own[SELFCAL_REGRESSORS_MAX]; /* private */
 } selfcal_coefficients_t;
 
+#define SELFCAL_FITTED (SELFCAL_LINES + SELFCAL_LINES / 2)
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {
-    selfcal_real_t variance, rate; /* of the drift over sigma_v^2; 1 - its pole */
+    selfcal_real_t variance, rate; /* of a first-order drift over sigma_v^2; 1 - its pole */
     selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
+    /* What the nodes show besides, of either sign: lines at frequencies omega, then edges, one of two lines each (see posterior.c). */
+    bool fitted;
+    selfcal_real_t distance[SELFCAL_LINES]; /* |1 - e^(i omega)|^2 */
+    selfcal_real_t power[SELFCAL_FITTED];
 } selfcal_truth_t;
+
+/* Least squares for them by rotations: a triangle, row by row, its right side behind each. Private. */
+#define SELFCAL_TRIANGLE (SELFCAL_FITTED * (SELFCAL_FITTED + 3) / 2)
+typedef struct {
+    selfcal_real_t triangle[SELFCAL_TRIANGLE];
+} selfcal_fit_t;
 
 /* Scratch of a report under way. Private but for reading `gathered`; may be shared by all axes and reused. */
 typedef struct {
@@ -731,10 +753,9 @@ typedef struct {
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
     uint16_t best_node;
-    bool refined;            /* the expectation is about the peak, no longer about the best node */
     bool moved;              /* the box is to change after a pass */
     uint8_t cells;           /* a dimension: fewer in the search than in the sums */
-    selfcal_truth_t truth, truth_before;
+    selfcal_truth_t truth;
     /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
     selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
     selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
@@ -743,7 +764,7 @@ typedef struct {
     selfcal_real_t lo[2], width[2];
     selfcal_real_t limit_lo[2], limit_hi[2];
     selfcal_real_t found_lo[2], found_hi[2];
-    selfcal_real_t best, best_at[2], best_ln[SELFCAL_PARAMETERS];
+    selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
     selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
     selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
     uint8_t basis_first[SELFCAL_REPORT_CELLS];
@@ -752,7 +773,10 @@ typedef struct {
     /* posterior sums */
     selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
-    selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+    union {
+        selfcal_fit_t fit; /* before the search */
+        selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+    } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
     /* sums of selfcal_decay_t over the nodes of each alpha */

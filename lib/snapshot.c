@@ -61,13 +61,15 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_t, step_beta, FLOAT)          \
     F(selfcal_t, step_floored, BOOL)
 
+#define FIXED_NODE_SHIFTS(F)       \
+    F(selfcal_node_t, g_shift, U8) \
+    F(selfcal_node_t, u_shift, U8) \
+    F(selfcal_node_t, w_shift, U8)
+
 #define FIXED_NODE_FIELDS(F)           \
     F(selfcal_node_t, g_mantissa, U32) \
     F(selfcal_node_t, u_mantissa, U32) \
-    F(selfcal_node_t, w_mantissa, U32) \
-    F(selfcal_node_t, g_shift, U8)     \
-    F(selfcal_node_t, u_shift, U8)     \
-    F(selfcal_node_t, w_shift, U8)
+    F(selfcal_node_t, w_mantissa, U32)
 
 #define BLOCK_FIELDS(F, PART) PART(selfcal_t, sums, selfcal_block_t)
 
@@ -86,6 +88,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_scale_t, most_sum, U32)
 #else
 #define FIXED_BANK_FIELDS(F, PART)
+#define FIXED_NODE_SHIFTS(F)
 #define FIXED_NODE_FIELDS(F)
 #define SCALE_FIELDS(F)
 #define BLOCK_FIELDS(F, PART)   \
@@ -160,6 +163,7 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, u_inf, REAL)     \
     F(selfcal_node_t, e, REAL)         \
     F(selfcal_node_t, level, BOOL)     \
+    FIXED_NODE_SHIFTS(F)               \
     F(selfcal_node_t, steady, U32)     \
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
