@@ -50,8 +50,8 @@ static bool valid_priors(const selfcal_prior_t prior[], size_t axes) {
     return true;
 }
 
-static bool valid_grid(const selfcal_grid_t *grid) {
-    return grid->nodes >= 6U && grid->nodes <= SELFCAL_GRID_MAX && grid->fit != NULL;
+static bool valid_grid(const selfcal_grid_t *grid, uint16_t most) {
+    return grid->nodes >= 6U && grid->nodes <= most && grid->fit != NULL;
 }
 
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
@@ -105,8 +105,9 @@ static bool valid_model(const selfcal_model_t *model) {
         }
 #endif
         if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) ||
-            rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) || (rho && !valid_grid(hypothesis->rho)) ||
-            (alpha && !valid_grid(hypothesis->alpha)) || hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
+            rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) ||
+            (rho && !valid_grid(hypothesis->rho, SELFCAL_GRID_MAX)) || (alpha && !valid_grid(hypothesis->alpha, SELFCAL_ALPHA_MAX)) ||
+            hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
             return false;
         }
         nodes += hypothesis_nodes(hypothesis);
@@ -150,11 +151,11 @@ static void init_node(selfcal_t *self, uint16_t index) {
     node->beta = (selfcal_real_t)beta;
     node->q = (selfcal_real_t)q;
     node->p_inf = (selfcal_real_t)p_inf;
-    node->c = (selfcal_real_t)((1.0 - one_less_phi_sq) / (1.0 + p_inf));
-    node->d = (selfcal_real_t)(p_first - p_inf);
+    node->gains.moving.c = (selfcal_real_t)((1.0 - one_less_phi_sq) / (1.0 + p_inf));
+    node->gains.moving.d = (selfcal_real_t)(p_first - p_inf);
     const selfcal_wide_t g_inf = (1.0 - beta) * p_inf / (1.0 + p_inf) + beta;
     node->u_inf = g_inf > 0.0 ? (selfcal_real_t)(beta / g_inf) : R(1.0);
-    node->e = R(1.0) - node->u_inf;
+    node->gains.moving.e = R(1.0) - node->u_inf;
 }
 
 /* Between what ln of an axis's sigma_v lies, as its first batch shows it: with D_i the differences of neighbours,
@@ -313,22 +314,23 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
     const span_t span = gains->span;
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
     selfcal_real_t a = R(0.0), short_of = R(0.0);
-    const selfcal_real_t pull = node->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
+    selfcal_moving_t *now = &node->gains.moving;
+    const selfcal_real_t pull = now->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
     for (uint32_t i = span.from; i < span.to; i++) {
         const selfcal_real_t r = batch->r[i];
-        const selfcal_real_t p = r_fmax(node->p_inf + node->d, R(0.0));
+        const selfcal_real_t p = r_fmax(node->p_inf + now->d, R(0.0));
         const selfcal_real_t s = r + p;
         const selfcal_real_t inv_s = R(1.0) / s;
         const selfcal_real_t gain = p * inv_s;
         const selfcal_real_t g = r_fma(gain, -node->beta, gain) + node->beta;
         gains->g[i] = g;
         gains->inv_s[i] = inv_s;
-        const selfcal_real_t u = node->u_inf + node->e;
+        const selfcal_real_t u = node->u_inf + now->e;
         gains->u[i] = u * inv_s;
         short_of += r_fma_exact(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
         a = r_fma(u, gains->u[i], a);
-        node->e = r_fma(-g, node->e, node->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, node->d);
-        node->d = node->c * inv_s * r_fma(r, node->d, (r - R(1.0)) * p * node->p_inf);
+        now->e = r_fma(-g, now->e, now->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, now->d);
+        now->d = now->c * inv_s * r_fma(r, now->d, (r - R(1.0)) * p * node->p_inf);
         if (r < R(0.5)) { /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
             const selfcal_wide_t ln_s = log((selfcal_wide_t)r + (selfcal_wide_t)p);
             const selfcal_real_t hi = (selfcal_real_t)ln_s;
@@ -354,14 +356,15 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
     const span_t span = gains->span;
     const selfcal_real_t g = steady_g(node);
     selfcal_real_t a = R(0.0);
+    selfcal_moving_t *now = &node->gains.moving;
     gains->scale = steady_inv_s(node);
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_real_t u = node->u_inf + node->e;
+        const selfcal_real_t u = node->u_inf + now->e;
         gains->g[i] = g;
         gains->inv_s[i] = R(1.0);
         gains->u[i] = u;
         a = r_fma(u, u, a);
-        node->e = r_fma(-g, node->e, node->e);
+        now->e = r_fma(-g, now->e, now->e);
     }
     sum_add_scaled(&node->a, gains->scale, a);
 }
@@ -395,6 +398,7 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     for (size_t i = from; i < to; i++) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
+        selfcal_moving_t *now = &node->gains.moving;
 #if SELFCAL_TERMS_MAX > 1
         if (selfcal_is_term_node(node)) {
             selfcal_terms_run(self, j, &span);
@@ -405,12 +409,12 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
             node->steady += span.to - span.from;
             continue;
         }
-        if (whole && node->d == R(0.0)) {
+        if (whole && now->d == R(0.0)) {
             gains_steady(node, &gains);
             run(self, j, &gains);
             node->steady += span.to - span.from;
-            if (r_fabs(node->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
-                node->e = R(0.0);
+            if (r_fabs(now->e) <= r_fmax(SETTLED * node->u_inf, U_ZERO)) {
+                now->e = R(0.0);
                 node->level = self->columns == NULL;
                 if (node->level) {
                     node->level_from = node->steady;
@@ -421,8 +425,8 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
             leave_level(self, j);
             gains_varying(batch, node, &gains);
             run(self, j, &gains);
-            if (r_fabs(node->d) <= CONVERGED * node->p_inf) {
-                node->d = R(0.0);
+            if (r_fabs(now->d) <= CONVERGED * node->p_inf) {
+                now->d = R(0.0);
             }
         }
     }
@@ -434,6 +438,7 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
     for (size_t i = from; i < to; i++) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
+        selfcal_moving_t *now = &node->gains.moving;
 #if SELFCAL_TERMS_MAX > 1
         if (selfcal_is_term_node(node)) {
             selfcal_terms_gap(self, j, count);
@@ -444,16 +449,16 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
             continue; /* the constant law: nothing changes */
         }
         leave_level(self, j);
-        const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)node->d, e = (selfcal_wide_t)node->e;
+        const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)now->d, e = (selfcal_wide_t)now->e;
         if (node->beta == R(0.0)) {
-            node->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);
+            now->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);
             continue; /* the prediction x stays */
         }
         const selfcal_wide_t less = -expm1(intervals * log1p(-beta)); /* 1 - phi^count */
         const selfcal_wide_t less_sq = less * (2.0 - less);
         const selfcal_wide_t stationary = (selfcal_wide_t)node->q / (beta * (2.0 - beta));
-        node->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
-        node->e = (selfcal_real_t)(e + less * (1.0 - (selfcal_wide_t)node->u_inf - e));
+        now->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
+        now->e = (selfcal_real_t)(e + less * (1.0 - (selfcal_wide_t)node->u_inf - e));
         if (self->columns != NULL) {
             self->model->regressors->code->gap(self, j, less);
         } else {
@@ -583,10 +588,11 @@ selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_node_t *node = &self->node[index];
+    const selfcal_moving_t now = moving_of(node);
     const size_t k = (size_t)index * self->model->axes + axis;
     const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
     const selfcal_wide_t phi = 1.0 - beta;
-    const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)node->d;
+    const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)now.d;
     view->law = self->model->hypothesis[place.hypothesis].law;
     view->ln_rho = (selfcal_wide_t)place.ln_rho;
     view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
@@ -608,12 +614,12 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
     view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
     /* The filter holds the prediction for the next interval, phi times the drift now. */
     view->drift = x / phi;
-    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)node->e - beta) / phi;
+    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)now.e - beta) / phi;
     if (phi > 0.03) {
         view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);
     } else {
         /* P' = phi^2 P(now) + q has lost P(now): it is that after a sample, unless a gap has just let it grow. */
-        const bool gap = (selfcal_wide_t)node->d > 1e-3 * (selfcal_wide_t)node->p_inf;
+        const bool gap = (selfcal_wide_t)now.d > 1e-3 * (selfcal_wide_t)node->p_inf;
         view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
     }
 }

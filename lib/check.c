@@ -2,9 +2,7 @@
 #include "kernel.h"
 
 /* The prices that selfcal.h states. */
-#ifdef SELFCAL_FIXED
-SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 68);
-#elif !defined(SELFCAL_REAL_DOUBLE)
+#ifndef SELFCAL_REAL_DOUBLE
 SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
 #endif
 #if SELFCAL_TERMS_MAX > 1 && !defined(SELFCAL_REAL_DOUBLE) && !defined(SELFCAL_FIXED)
@@ -162,8 +160,8 @@ static bool kernel_is_sound(const selfcal_t *self, size_t j) {
     if (node->level) {
         selfcal_node_t settled = *node;
         selfcal_kernel_mantissas(&settled);
-        if (settled.g_mantissa != node->g_mantissa || settled.u_mantissa != node->u_mantissa ||
-            settled.w_mantissa != node->w_mantissa || settled.g_shift != node->g_shift || settled.u_shift != node->u_shift ||
+        if (settled.gains.settled.g != node->gains.settled.g || settled.gains.settled.u != node->gains.settled.u ||
+            settled.gains.settled.w != node->gains.settled.w || settled.g_shift != node->g_shift || settled.u_shift != node->u_shift ||
             settled.w_shift != node->w_shift) {
             return false;
         }
@@ -217,7 +215,8 @@ static bool terms_are_sound(const selfcal_t *self) {
 static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     const size_t j = kernel_node(self, i);
     const selfcal_node_t *node = &self->node[j];
-    if ((self->n > 0U || i < self->ran) && (node->c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
+    const selfcal_moving_t now = moving_of(node);
+    if ((self->n > 0U || i < self->ran) && (now.c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
         return false;
     }
     /* Some may have run over the batch that waits. */
@@ -225,10 +224,10 @@ static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     /* P' = phi^2 r P/(r + P) + q: q <= P at any time, and with r = 1 P' < 1 + q */
     if (!within(node->beta, R(0.0), R(1.0)) || !within(node->q, R(0.0), Q_MAX) ||
         !within(node->p_inf, node->q * (R(1.0) - SLACK), (R(1.0) + node->q) * (R(1.0) + SLACK)) ||
-        !within(node->c, R(0.0), R(1.0)) || !isfinite(node->d) || node->p_inf + node->d < node->q - SLACK * node->p_inf ||
+        !within(now.c, R(0.0), R(1.0)) || !isfinite(now.d) || node->p_inf + now.d < node->q - SLACK * node->p_inf ||
         !within(node->u_inf, R(0.0), R(1.0)) ||
-        !within(node->u_inf + node->e, -SLACK, R(1.0) + SLACK) ||
-        (node->level ? node->d != R(0.0) || node->e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
+        !within(node->u_inf + now.e, -SLACK, R(1.0) + SLACK) ||
+        (node->level ? now.d != R(0.0) || now.e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
         return false;
     }

@@ -14,7 +14,7 @@ static moments_t predict_law(selfcal_law_t law, const selfcal_posterior_t *poste
     }
     if (has_decay(law)) {
         selfcal_real_t fall = R(0.0), growth = R(0.0);
-        for (unsigned j = 0; j < SELFCAL_GRID_MAX; j++) {
+        for (unsigned j = 0; j < SELFCAL_ALPHA_MAX; j++) {
             const selfcal_decay_t *decay = &posterior->decay[j];
             selfcal_real_t psi[SELFCAL_TERMS_MAX];
             for (unsigned a = 0; a < SELFCAL_TERMS_MAX; a++) { /* of terms that a law has not, all else is 0 */

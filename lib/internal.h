@@ -249,7 +249,7 @@ void selfcal_terms_init(selfcal_t *self, unsigned char *memory);
 bool selfcal_terms_sound(const selfcal_t *self);
 /* Node `j` belongs to a sum. */
 static inline bool selfcal_is_term_node(const selfcal_node_t *node) {
-    return node->c == R(0.0); /* never of another law */
+    return !node->level && node->gains.moving.c == R(0.0); /* never of another law */
 }
 void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place);
 void selfcal_terms_run(selfcal_t *self, size_t j, const struct span *span);

@@ -60,7 +60,7 @@ void selfcal_kernel_settle(selfcal_t *self, size_t j);
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
 
 #ifdef SELFCAL_FIXED
-/* g, u/s and 1/s of a level node as the integer kernels take them. */
+/* g, u/s and 1/s of a level node as the integer kernels take them, in place of how they moved. */
 void selfcal_kernel_mantissas(selfcal_node_t *node);
 #endif
 
@@ -150,6 +150,18 @@ static inline selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {
 static inline selfcal_real_t steady_g(const selfcal_node_t *node) {
     const selfcal_real_t gain = node->p_inf / (R(1.0) + node->p_inf);
     return r_fma(gain, -node->beta, gain) + node->beta;
+}
+
+/* A level node of the integer kernels keeps no room for these: its gains do not move. */
+static inline selfcal_moving_t moving_of(const selfcal_node_t *node) {
+#ifdef SELFCAL_FIXED
+    if (node->level) {
+        const selfcal_real_t phi = R(1.0) - node->beta;
+        const selfcal_moving_t still = {phi * phi / (R(1.0) + node->p_inf), R(0.0), R(0.0)};
+        return still;
+    }
+#endif
+    return node->gains.moving;
 }
 
 /* What a level node's samples have added to A since it became level. */

@@ -273,7 +273,7 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
  *   nu/4 2^30, hi^2 < 16 * (2^27.6 / 2^14)^2 < 2^32, |hi lo| < 2^30, lo^2 2^28;
  *   nu/4 = 2^12 hi + lo, (nu/4)^2 = 2^24 hi^2 + 2^13 hi lo + lo^2: nothing is rounded. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
-    const int32_t g = node->g_mantissa;
+    const int32_t g = node->gains.settled.g;
     const uint32_t shift = node->g_shift;
     const int32_t *const end = d + count;
     int32_t v = -*x, sum = 0, cross = 0;
@@ -307,7 +307,7 @@ static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
 /* 32-bit products, in 64 bits; g nu is rounded to nearest. Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62),
  * nu^2 < 2^60. */
 static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
-    const int32_t g = node->g_mantissa;
+    const int32_t g = node->gains.settled.g;
     const uint32_t shift = node->g_shift;
     const int32_t *const end = d + count;
     int32_t v = -*x;
@@ -339,17 +339,16 @@ void selfcal_kernel_mantissas(selfcal_node_t *node) {
     const selfcal_real_t g = steady_g(node), u = inv_s.hi * node->u_inf;
     const selfcal_real_t u_lo = r_fma_exact(inv_s.hi, node->u_inf, -u) + inv_s.lo * node->u_inf;
     node->g_shift = (uint8_t)gain_shift(g);
-    node->g_mantissa = to_fixed(g, node->g_shift + 14);
+    node->gains.settled.g = to_fixed(g, node->g_shift + 14);
     const int u_shift = mantissa_shift(u, 30);
-    node->u_mantissa = to_fixed(u, u_shift) + to_fixed(u_lo, u_shift);
+    node->gains.settled.u = to_fixed(u, u_shift) + to_fixed(u_lo, u_shift);
     node->u_shift = (uint8_t)(u_shift - SUM_BITS - 6 - b_bits(node));
     node->w_shift = (uint8_t)mantissa_shift(inv_s.hi, 30);
-    node->w_mantissa = to_fixed(inv_s.hi, node->w_shift) + to_fixed(inv_s.lo, node->w_shift);
+    node->gains.settled.w = to_fixed(inv_s.hi, node->w_shift) + to_fixed(inv_s.lo, node->w_shift);
 }
 
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j) {
-    (void)self;
-    (void)j;
+    self->node[j].gains.moving = moving_of(&self->node[j]);
 }
 
 /* `floored`: the nodes round g nu down. */
@@ -391,8 +390,8 @@ static void level_node(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
         const level_sums_t sums = run_level(node, self->step[axis], count, &self->x[k]);
-        const int64_t b = node->u_mantissa != 0 ? scaled(sums.b * node->u_mantissa, node->u_shift) : 0;
-        add_sums(self, k, axis, b, weigh(sums.c, (uint32_t)node->w_mantissa, node->w_shift));
+        const int64_t b = node->gains.settled.u != 0 ? scaled(sums.b * node->gains.settled.u, node->u_shift) : 0;
+        add_sums(self, k, axis, b, weigh(sums.c, (uint32_t)node->gains.settled.w, node->w_shift));
     }
 }
 
@@ -401,7 +400,7 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) 
         const size_t j = kernel_node(self, i);
         const selfcal_node_t *node = &self->node[j];
         if (node->level) {
-            make_steps(self, span, node->beta, FLOORED && node->g_mantissa != 0);
+            make_steps(self, span, node->beta, FLOORED && node->gains.settled.g != 0);
             level_node(self, j, span.to - span.from);
         }
     }

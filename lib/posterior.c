@@ -489,7 +489,7 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
     }
     for (uint16_t i = 0; hypothesis->rho != NULL && i < work->cells; i++) {
         const selfcal_real_t z = (cell_middle(work, 0, i) - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
-        work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->basis[i]);
+        work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->scratch.cells.basis[i]);
     }
 }
 
@@ -567,8 +567,8 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     cell->ln_sigma = R(0.0);
     const uint8_t first = work->basis_first[i];
     for (uint16_t k = 0; k < 6U; k++) {
-        cell->profile = r_fma(work->basis[i][k], row->profile[first + k], cell->profile);
-        cell->ln_sigma = r_fma(work->basis[i][k], row->ln_sigma[first + k], cell->ln_sigma);
+        cell->profile = r_fma(work->scratch.cells.basis[i][k], row->profile[first + k], cell->profile);
+        cell->ln_sigma = r_fma(work->scratch.cells.basis[i][k], row->ln_sigma[first + k], cell->ln_sigma);
     }
     /* Beyond the nodes the spline's part is held and the expectation carries on. */
     const selfcal_t *bank = work->bank;
@@ -724,7 +724,7 @@ static void begin_sum(selfcal_work_t *work) {
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
     memset(work->field, 0, sizeof work->field);
-    memset(work->scratch.histogram, 0, sizeof work->scratch.histogram);
+    memset(work->scratch.cells.histogram, 0, sizeof work->scratch.cells.histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
@@ -747,7 +747,7 @@ static spread_t spread_over(selfcal_work_t *work, unsigned p, selfcal_real_t wid
     const selfcal_real_t step = histogram_step(work, p);
     const selfcal_real_t per_step = step > R(0.0) ? R(1.0) / step : R(0.0);
     const selfcal_real_t half = R(0.5) * width * per_step;
-    const spread_t spread = {work->scratch.histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    const spread_t spread = {work->scratch.cells.histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
     return spread;
 }
 
@@ -885,7 +885,7 @@ static void step_sum(selfcal_work_t *work) {
         }
         const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.first[0] + sum.second[0]; /* times (N / best N)^2 */
         for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
-            const selfcal_real_t basis = has_drift ? work->basis[i][k] : R(1.0);
+            const selfcal_real_t basis = has_drift ? work->scratch.cells.basis[i][k] : R(1.0);
             const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
             weight[at] += sum.mass * basis;
             weight_sq[at] += mass_sq * basis;
@@ -918,7 +918,7 @@ static selfcal_real_t quantile(const selfcal_work_t *work, unsigned p, selfcal_r
     selfcal_real_t below = R(0.0);
     const selfcal_real_t wanted = share * total;
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
-        const selfcal_real_t mass = work->scratch.histogram[p][bin];
+        const selfcal_real_t mass = work->scratch.cells.histogram[p][bin];
         if (below + mass >= wanted && mass > R(0.0)) {
             return work->range_lo[p] + ((selfcal_real_t)bin + (wanted - below) / mass) * step;
         }
@@ -935,7 +935,7 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
         const selfcal_real_t from = work->range_lo[p] + (selfcal_real_t)bin * step;
         const selfcal_real_t part = r_fmin(hi, from + step) - r_fmax(lo, from);
         if (part > R(0.0) && step > R(0.0)) {
-            mass += work->scratch.histogram[p][bin] * r_fmin(part / step, R(1.0));
+            mass += work->scratch.cells.histogram[p][bin] * r_fmin(part / step, R(1.0));
         }
     }
     return mass;
@@ -950,9 +950,9 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     selfcal_real_t total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
         const selfcal_real_t at = ((selfcal_real_t)bin + R(0.5)) * step;
-        total += work->scratch.histogram[p][bin];
-        ln_first = r_fma(work->scratch.histogram[p][bin], at, ln_first);
-        ln_second = r_fma(work->scratch.histogram[p][bin] * at, at, ln_second);
+        total += work->scratch.cells.histogram[p][bin];
+        ln_first = r_fma(work->scratch.cells.histogram[p][bin], at, ln_first);
+        ln_second = r_fma(work->scratch.cells.histogram[p][bin] * at, at, ln_second);
     }
     const selfcal_real_t ln_mean = ln_first / total;
     const selfcal_real_t ln_sd = r_sqrt(r_fmax(ln_second / total - ln_mean * ln_mean, R(0.0)));

@@ -115,7 +115,7 @@ extern "C" {
 
 /* Frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even in
  * their logarithm, from 1/n to pi a bank interval. Less than 0.46 nepers apart they do for the reports' tolerances; fewer: less time.
- * 4.5 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HISTOGRAM anyway. */
+ * 4.5 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HISTOGRAM + 24 SELFCAL_REPORT_CELLS anyway. */
 #ifndef SELFCAL_LINES
 #define SELFCAL_LINES 40
 #endif
@@ -129,6 +129,14 @@ extern "C" {
 #endif
 #if SELFCAL_GRID_MAX < 6 || SELFCAL_GRID_MAX > 64
 #error "SELFCAL_GRID_MAX must be 6 (a quintic spline needs six) to 64"
+#endif
+
+/* Those of alpha, or of a sum's ratio: 16 bytes each in every hypothesis of a report, and 24 in its scratch. */
+#ifndef SELFCAL_ALPHA_MAX
+#define SELFCAL_ALPHA_MAX SELFCAL_GRID_MAX
+#endif
+#if SELFCAL_ALPHA_MAX < 6 || SELFCAL_ALPHA_MAX > SELFCAL_GRID_MAX
+#error "SELFCAL_ALPHA_MAX must be 6 to SELFCAL_GRID_MAX"
 #endif
 
 /* Nodes one hypothesis holds at most: 16 bytes each in a report's scratch. */
@@ -349,27 +357,37 @@ typedef struct {
     uint32_t regressor_not_finite; /* samples kept out because a regressor's value was not finite or SELFCAL_SAMPLE_MAX */
 } selfcal_counters_t;
 
+/* How a filter's gains move, and what the integer kernels keep once they do not. Private, as is what follows. */
+typedef struct {
+    selfcal_real_t c; /* phi^2 / (1 + p_inf): contraction of d */
+    selfcal_real_t d; /* predicted variance less p_inf; exactly 0 once converged */
+    selfcal_real_t e; /* innovation of the regressor "1" at the next sample less u_inf */
+} selfcal_moving_t;
+typedef struct {
+    int32_t g, u, w; /* phi K + beta, u/s and 1/s: each times 2^shift */
+} selfcal_settled_t;
+
 /* One filter: the gain side, shared by all axes because covariances do not depend on the data. Relative to sigma_v.
- * Private; here so that the caller can size it. */
+ * Here so that the caller can size it. */
 typedef struct {
     selfcal_real_t beta;  /* 1 - phi */
     selfcal_real_t q;     /* drift variance added per interval */
     selfcal_real_t p_inf; /* predicted variance once converged */
-    selfcal_real_t c;     /* phi^2 / (1 + p_inf): contraction of d */
-    selfcal_real_t d;     /* predicted variance less p_inf; exactly 0 once converged */
     selfcal_real_t u_inf; /* innovation of the regressor "1" once settled */
-    selfcal_real_t e;     /* that innovation at the next sample less u_inf */
-    bool level;           /* d = e = 0: the kernel sums plain nu */
+    union {
+        selfcal_moving_t moving;
 #ifdef SELFCAL_FIXED
-    uint8_t g_shift, u_shift, w_shift; /* of a level node: g, u/s and 1/s are each mantissa * 2^-shift */
+        selfcal_settled_t settled; /* of a level node instead: moving_of() */
+#endif
+    } gains;
+    bool level; /* d = e = 0: the kernel sums plain nu */
+#ifdef SELFCAL_FIXED
+    uint8_t g_shift, u_shift, w_shift;
 #endif
     uint32_t steady;      /* samples seen with d = 0: their ln s is added when asked for */
     uint32_t level_from;  /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;      /* sum u^2 / s */
     selfcal_sum_t ln_s;   /* sum ln s of the other samples */
-#ifdef SELFCAL_FIXED
-    int32_t g_mantissa, u_mantissa, w_mantissa;
-#endif
 } selfcal_node_t;
 
 #ifdef SELFCAL_FIXED
@@ -393,8 +411,7 @@ typedef struct {
 } selfcal_block_t;
 #endif
 
-/* Bytes of memory selfcal_init() needs: for each node 56 in the float build, 68 in the fixed-point one, and 20
- * more per axis (check.c holds it to that). */
+/* Bytes of memory selfcal_init() needs: for each node 56, and 20 more per axis (check.c holds it to that). */
 #define SELFCAL_SIZE(nodes, axes) \
     ((size_t)(nodes) * (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
 
@@ -705,7 +722,7 @@ typedef struct {
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
-    selfcal_decay_t decay[SELFCAL_GRID_MAX]; /* where a term decays: of each node of alpha or of the ratio; else 0 */
+    selfcal_decay_t decay[SELFCAL_ALPHA_MAX]; /* where a term decays: of each node of alpha or of the ratio; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {
@@ -766,8 +783,7 @@ typedef struct {
     selfcal_real_t found_lo[2], found_hi[2];
     selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
     selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
-    selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
-    uint8_t basis_first[SELFCAL_REPORT_CELLS];
+    uint8_t basis_first[SELFCAL_REPORT_CELLS]; /* first node of each row of scratch.cells.basis */
     /* sigma_v cells: offsets in ln from the conditional mode, with their weights */
     selfcal_real_t delta[SELFCAL_SIGMA_CELLS], delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS], delta_width;
     /* posterior sums */
@@ -775,12 +791,15 @@ typedef struct {
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
     union {
         selfcal_fit_t fit; /* before the search */
-        selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+        struct {
+            selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
+            selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+        } cells;
     } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
     /* sums of selfcal_decay_t over the nodes of each alpha */
-    selfcal_wide_t bias_decay[SELFCAL_GRID_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
+    selfcal_wide_t bias_decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_work_t;
 
 /* Starts a report on one axis. SELFCAL_TOO_SHORT if there are too few samples; of a bank that forgets, the first step that looks at

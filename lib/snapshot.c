@@ -66,11 +66,6 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, u_shift, U8) \
     F(selfcal_node_t, w_shift, U8)
 
-#define FIXED_NODE_FIELDS(F)           \
-    F(selfcal_node_t, g_mantissa, U32) \
-    F(selfcal_node_t, u_mantissa, U32) \
-    F(selfcal_node_t, w_mantissa, U32)
-
 #define BLOCK_FIELDS(F, PART) PART(selfcal_t, sums, selfcal_block_t)
 
 #define BLOCK_SUM_FIELDS(F)           \
@@ -89,7 +84,6 @@ static const uint8_t kind_size[KINDS] = {
 #else
 #define FIXED_BANK_FIELDS(F, PART)
 #define FIXED_NODE_SHIFTS(F)
-#define FIXED_NODE_FIELDS(F)
 #define SCALE_FIELDS(F)
 #define BLOCK_FIELDS(F, PART)   \
     F(selfcal_t, first, FLOAT)  \
@@ -158,17 +152,14 @@ static const uint8_t kind_size[KINDS] = {
     F(selfcal_node_t, beta, REAL)      \
     F(selfcal_node_t, q, REAL)         \
     F(selfcal_node_t, p_inf, REAL)     \
-    F(selfcal_node_t, c, REAL)         \
-    F(selfcal_node_t, d, REAL)         \
     F(selfcal_node_t, u_inf, REAL)     \
-    F(selfcal_node_t, e, REAL)         \
+    F(selfcal_node_t, gains, REAL)     \
     F(selfcal_node_t, level, BOOL)     \
     FIXED_NODE_SHIFTS(F)               \
     F(selfcal_node_t, steady, U32)     \
     F(selfcal_node_t, level_from, U32) \
     F(selfcal_node_t, a, REAL)         \
-    F(selfcal_node_t, ln_s, REAL)      \
-    FIXED_NODE_FIELDS(F)
+    F(selfcal_node_t, ln_s, REAL)
 
 #define COLUMN_FIELDS(F)               \
     F(selfcal_column_t, z, REAL)       \

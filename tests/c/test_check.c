@@ -186,13 +186,13 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(node[1].q = INFINITY);
     BROKEN(node[1].p_inf = NAN);
     BROKEN(node[1].p_inf = -1.0F);
-    BROKEN(node[1].c = 1.5F);
-    BROKEN(node[1].d = -1.1F * node[1].p_inf);
-    BROKEN(node[1].d = NAN);
+    BROKEN(node[1].gains.moving.c = 1.5F);
+    BROKEN(node[1].gains.moving.d = -1.1F * node[1].p_inf);
+    BROKEN(node[1].gains.moving.d = NAN);
     BROKEN(node[1].u_inf = 1.5F);
-    BROKEN(node[1].e = 1.5F);
-    BROKEN(node[level].d = 1e-9F);
-    BROKEN(node[level].e = 1e-9F);
+    BROKEN(node[1].gains.moving.e = 1.5F);
+    BROKEN(node[level].gains.moving.d = 1e-9F);
+    BROKEN(node[level].gains.moving.e = 1e-9F);
     BROKEN(node[level].level_from = node[level].steady + 1U);
     BROKEN(node[level].level = false);
     BROKEN(node[1].a.hi = -1.0F);
@@ -211,7 +211,7 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
     BROKEN(node[level].g_shift++);
     BROKEN(node[level].u_shift = 64);
-    BROKEN(node[level].w_mantissa++);
+    BROKEN(node[level].gains.settled.w++);
 #else
     BROKEN(bank.b[0].hi = NAN);
     BROKEN(bank.b[last].lo = INFINITY);

@@ -20,7 +20,18 @@ from selfcal.tables import make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
-from agreement import MODEL, REPORT_LIMIT, a_record, dense, on_nodes, push, report_differences, tables_of
+from agreement import (
+    MODEL,
+    REPORT_LIMIT,
+    Floats,
+    a_record,
+    dense,
+    exact_report,
+    on_nodes,
+    push,
+    report_differences,
+    tables_of,
+)
 from conftest import worst_difference
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,27 +43,23 @@ LENGTHS = [int(float(n)) for n in os.environ.get("SELFCAL_LENGTHS", "10,100,1000
 
 @pytest.mark.parametrize("n", LENGTHS)
 def test_report_over_the_whole_prior(n: int) -> None:
-    tables = tables_of(MODEL)
-    records = (a_record(law, n, seed)[0] for law in MODEL.hypotheses for seed in range(DRAWS))
-    values = np.array([report_differences(y, tables)[0] for y in records])
-    good = (values <= REPORT_LIMIT).all(axis=1).mean()
-    (e, m, s), (we, wm, ws) = np.quantile(values, 0.9, axis=0), values.max(axis=0)
-    print(
-        f"\nn={n}: 9 records in 10 within d ln evidence {e:.3f}, d mean {m:.3f} sd, sd {100 * s:.1f} %; "
-        f"worst {we:.3f}, {wm:.3f} sd, {100 * ws:.1f} %; all tolerances kept in {100 * good:.0f} %"
-    )
-    assert good == 1.0
-
-
-@pytest.mark.parametrize("n", LENGTHS)
-def test_16_nodes_a_dimension_are_enough(n: int) -> None:
-    """The design's bound for Gauss-Markov, 16 of rho and 12 of alpha; a random walk takes 20 (on 16 one record in
-    twenty is 0.05 to 0.2 nat off at 10^5 samples)."""
-    tables = on_nodes(tables_of(MODEL), 20, (16, 12))
-    records = (a_record(law, n, seed)[0] for law in MODEL.hypotheses for seed in range(DRAWS))
-    values = np.array([report_differences(y, tables)[0] for y in records])
-    print(f"\nn={n}: worst {values.max(axis=0).round(3)}")
-    assert (values <= REPORT_LIMIT).all()
+    """On the default nodes, and on the fewest that do: the design's bound of 16 a dimension for Gauss-Markov (12 of
+    alpha), 20 for a random walk (on 16 one record in twenty is 0.05 to 0.2 nat off at 10^5 samples)."""
+    default = tables_of(MODEL)
+    found: dict[str, list[Floats]] = {"default": [], "20, 16 x 12": []}
+    for law in MODEL.hypotheses:
+        for seed in range(DRAWS):
+            y = a_record(law, n, seed)[0]
+            exact = exact_report(y, default)
+            for each, tables in zip(found.values(), (default, on_nodes(default, 20, (16, 12))), strict=True):
+                each.append(report_differences(y, tables, exact)[0])
+    for nodes, values in found.items():
+        (e, m, s), (we, wm, ws) = np.quantile(values, 0.9, axis=0), np.max(values, axis=0)
+        print(
+            f"\nn={n}, {nodes} nodes: 9 records in 10 within d ln evidence {e:.3f}, d mean {m:.3f} sd, "
+            f"sd {100 * s:.1f} %; worst {we:.3f}, {wm:.3f} sd, {100 * ws:.1f} %"
+        )
+        assert (np.array(values) <= REPORT_LIMIT).all()
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
@@ -81,7 +88,7 @@ def test_a_grid_too_coarse_for_the_record_says_so() -> None:
 
 def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
     """Three recordings of the simulated sensor, six axes on shared nodes, against dense ones: probabilities within
-    0.01, means within 0.05 sd, the goals of such an image. (Of twenty tried one was off by 0.012.)"""
+    0.01, means within 0.05 sd, the goals of such an image. (Of a hundred tried five were off by up to 0.013.)"""
     document = (ROOT / "tests" / "data" / "simulated_adis16405.yaml").read_text(encoding="utf-8")
     assert "duration_s: 3600.0" in document
     (tmp_path / "model.yaml").write_text(document.replace("duration_s: 3600.0", "duration_s: 1200.0"), encoding="utf-8")

@@ -42,6 +42,7 @@ def codegen(
 
 def _header(model: Model, tables: Tables) -> str:
     largest = max((grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid), default=0)
+    alpha = max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=0)
     most = max(h.nodes for h in tables.hypotheses)
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
     return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
@@ -71,6 +72,8 @@ def _header(model: Model, tables: Tables) -> str:
 
 #if SELFCAL_GRID_MAX < {largest}
 #error "set SELFCAL_GRID_MAX to {largest}: this model has a grid of so many nodes"
+#elif SELFCAL_ALPHA_MAX < {alpha}
+#error "set SELFCAL_ALPHA_MAX to {alpha}: this model has a grid of so many nodes of alpha"
 #elif SELFCAL_HYPOTHESIS_NODES_MAX < {most}
 #error "set SELFCAL_HYPOTHESIS_NODES_MAX to {most}: this model has a hypothesis of so many nodes"
 #endif
