@@ -34,10 +34,10 @@ enum { FIRST_CHANNEL = 1 }; /* after the supply */
 
 /* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no motion,
  * and with nothing to compare with what could be a negative reading is refused. */
-enum { SIGN_STEP = 4096, SIGN_UNSURE = 8192 - 6000 };
+enum { SIGN_STEP = 4096 };
 /* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones once XGYRO_OFF is not
  * negative. Not of those beyond all the sensor can read, 350 deg/s. */
-enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000 };
+enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000, SIGN_UNSURE = 8192 - SIGN_BEYOND };
 /* Readings of DIAG_STAT in a row, 0.1 s apart, that excuse missing samples; starts that MARK ends before its registers are believed. */
 enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
@@ -182,7 +182,7 @@ static bool restore_offsets(adis16405_t *self)
     for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
         const int32_t value = self->base[channel] + self->added[channel];
         if (write[channel] && ((channel == 0U && value < 0) || !write_offset(self, channel, value))) {
-            return false; /* of another part's saved state, say: until it is taken back */
+            return false; /* of another part's saved state, say: until it is taken back (adis16405_offsets(), all 0) */
         }
     }
     return true;

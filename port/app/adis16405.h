@@ -29,6 +29,9 @@
 #ifndef ADIS16405_QUEUE
 #define ADIS16405_QUEUE 1024U
 #endif
+#if ADIS16405_QUEUE < 8 || (ADIS16405_QUEUE & (ADIS16405_QUEUE - 1)) != 0
+#error "ADIS16405_QUEUE must be a power of two, 8 at least"
+#endif
 
 typedef struct adis16405_bus {
     void *context;

@@ -84,6 +84,7 @@ static void restore(app_t *app)
             (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
             (void)tell_sensor(app);
             app->told.state_found = older == 0 ? 1U : 2U;
+            app->restored = true;
             return;
         }
         app->told.state_refused = (uint32_t)-status;
@@ -204,6 +205,11 @@ static bool take_sample(app_t *app)
     uint32_t missing = 0;
     switch (app->port->sample(app->port->context, reading, &missing)) {
     case PORT_SAMPLE:
+        if (app->restored) { /* the driver's first: what passed since the start is missing as well */
+            const double passed = 1e-3 * (double)app->port->time_ms(app->port->context) * (double)SELFCAL_MODEL_RATE_HZ;
+            app->restored = false;
+            missing += (uint32_t)passed;
+        }
         if (missing > 0) {
             pass(app, missing);
         }
@@ -275,7 +281,8 @@ static void tell(app_t *app)
 #if APP_COMMANDS
 /* -------------------------------------------------------------------------------------------------------------- commands */
 
-static const uint64_t command_key[2] = {APP_COMMAND_KEY};
+static const uint64_t command_key[] = {APP_COMMAND_KEY};
+typedef char the_key_has_two_halves[sizeof command_key == 16U ? 1 : -1];
 enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
 #define RESTART_MS 100U /* for the answer to leave */
 
@@ -294,12 +301,15 @@ static uint32_t axis_bit(uint8_t axis)
     return 1UL << port_axis(selfcal_model_axis_name[axis]);
 }
 
-/* Has the sensor take off the biases of `axes`, or, with none, what it has been told to add. All that was learnt is kept. */
+/* Has the sensor take off the biases of `axes`, or, with none, what it has been told to add. All that was learnt is kept. To take that
+ * back is always possible: a sensor put in place of the one that was told may refuse it, and never run. */
 static uint8_t write_offsets(app_t *app, uint32_t axes)
 {
     float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
     uint32_t found = 0;
-    if (motion(app) == SELFCAL_STATUS_MOTION_MOVING) {
+    tell(app);
+    if (axes != 0U &&
+        (app->told.motion == SELFCAL_STATUS_MOTION_MOVING || app->told.sensor_state != SELFCAL_STATUS_SENSOR_STATE_RUNNING)) {
         return SELFCAL_ANSWER_RESULT_NOT_NOW;
     }
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
@@ -374,6 +384,7 @@ static void obey(app_t *app, uint32_t now)
 {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
+    command_pass(&app->command, now);
     if (command == 0U || app->answer[OF_ORDER].waiting || app->module == NULL) {
         return;
     }

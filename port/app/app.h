@@ -51,6 +51,7 @@ typedef struct {
     bool worked_out;  /* ... is, and waits for the wire */
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
+    bool restored;    /* a saved state was, and no sample has come since */
     bool put_off;     /* the last turn left a slice of a report to this one */
     bool waiting;     /* `frame` is made but not taken yet */
     bool refused;     /* the port has refused it, since refused_ms */

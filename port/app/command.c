@@ -49,12 +49,18 @@ static bool stands(const command_t *self, uint32_t now_ms)
     return self->open && now_ms - self->opened_ms <= COMMAND_CHALLENGE_MS;
 }
 
+void command_pass(command_t *self, uint32_t now_ms)
+{
+    self->open = stands(self, now_ms);
+    self->paused = self->paused && now_ms - self->paused_ms < COMMAND_PAUSE_MS;
+}
+
 bool command_open(command_t *self, uint32_t number, uint32_t now_ms)
 {
-    if (stands(self, now_ms)) {
+    command_pass(self, now_ms);
+    if (self->open) {
         return true;
     }
-    self->paused = self->paused && now_ms - self->paused_ms < COMMAND_PAUSE_MS;
     if (self->paused) {
         return false;
     }

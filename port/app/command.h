@@ -31,6 +31,9 @@ uint64_t command_siphash(const uint64_t key[2], uint64_t message);
  * not so soon after another or a wrong tag. */
 bool command_open(command_t *self, uint32_t number, uint32_t now_ms);
 
+/* To be called more often than the time comes round: what is over stays so. */
+void command_pass(command_t *self, uint32_t now_ms);
+
 /* Checks the tag of a command and uses up the challenge. Returns SELFCAL_ANSWER_RESULT_DONE, _NO_CHALLENGE or _WRONG_TAG. */
 uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms);
 

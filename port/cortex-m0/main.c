@@ -6,6 +6,9 @@
 #ifndef BOARD_REPORT_MS
 #define BOARD_REPORT_MS 600000
 #endif
+#if BOARD_REPORT_MS < 100 || BOARD_REPORT_MS > 2000000000
+#error "BOARD_REPORT_MS: 100 to 2000000000"
+#endif
 
 static reset_cause_t reset_cause;
 

@@ -70,6 +70,9 @@ void sensor_burst_handler(void);
 #ifndef BOARD_USART_BAUD
 #define BOARD_USART_BAUD 115200
 #endif
+#if BOARD_USART_BAUD < 9600 || BOARD_USART_BAUD > 2000000
+#error "BOARD_USART_BAUD: 9600 to 2000000"
+#endif
 
 typedef struct {
     uint32_t dropped;  /* frames taken from the application and not sent */

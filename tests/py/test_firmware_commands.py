@@ -528,4 +528,53 @@ def test_offsets_that_cannot_be_written() -> None:
     board.sensor.source = lambda k: (rest(k)[0] + (900.0 if k % 20 < 10 else 0.0), *rest(k)[1:])
     board.run(3.0)
     assert obey(board, "write_offsets", 2, seconds=1.6) == [RESULT["not_now"]]
+    board.sensor.source = rest
+    board.run(4.0)
+    board.sensor.plug(False)
+    board.run(1.0)
+    assert obey(board, "write_offsets", 2, seconds=1.6) == [RESULT["not_now"]]
     assert board.machine.violations == []
+
+
+def test_offsets_of_another_sensor() -> None:
+    """What was taken off one sensor, and saved, would leave another with a negative XGYRO_OFF: it does not start, until
+    all is taken back."""
+    board = Board(image(**ORDERS), seed=38)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0] + 3.0, *rest(k)[1:])
+    board.sensor.factory[0x1A] = 40
+    board.sensor.power_on()
+    board.run(7.0)
+    assert obey(board, "write_offsets", 1, seconds=1.6) == [RESULT["done"]]
+    assert obey(board, "save", seconds=3.5) == [RESULT["done"]]
+    board.sensor.factory[0x1A] = 0
+    board.power_cycle()
+    board.run(4.0)
+    told = status(board)
+    assert told["sensor_fault"] == 2
+    assert told["offset_gx"] < 0.0
+    assert told["samples"] == board.value("app.bank.counters.samples")
+    assert obey(board, "write_offsets", 0, seconds=1.6) == [RESULT["done"]]
+    board.run(4.0)
+    told = status(board)
+    assert (told["sensor_state"], told["offset_gx"]) == (2, 0.0)
+
+
+def test_time_before_the_first_sample_of_a_restored_bank() -> None:
+    """The sensor comes 20 s after a start with saved state: so long a gap, beside the time for which the module may
+    have been off."""
+    board = Board(image(**ORDERS), seed=36)
+    board.run(4.0)
+    assert obey(board, "save", seconds=3.5) == [RESULT["done"]]
+    board.power_cycle()
+    before = board.machine.now_us
+    board.sensor.plug(False)
+    board.run(20.0)
+    known = board.value("app.bank.counters.missing")
+    board.sensor.plug(True)
+    tap = Tap(board)
+    while not tap.seen:
+        board.run(0.1)
+    passed = 1e-6 * (board.machine.now_us - before) * RATE_HZ
+    missing = board.value("app.bank.counters.missing") - known
+    assert abs(missing - passed) < 0.2 * RATE_HZ + RATE_HZ / BANK_HZ  # a look, a bank interval

@@ -288,6 +288,22 @@ def test_lost_sign_bit() -> None:
     assert sound(board, tap, 0)
 
 
+def test_lost_sign_bit_after_pauses() -> None:
+    """At -340 deg/s, beyond the nominal range, a reading less its sign is +70, and nothing before it tells."""
+    board = Board(image(*QUIET), seed=14)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0] - 6800.0, *rest(k)[1:])
+    board.sensor.lose_sign = lambda k: k % 10 == 0
+    tap = Tap(board)
+    for _ in range(12):
+        board.run(0.8)
+        board.sensor.silent = True
+        board.run(0.12)
+        board.sensor.silent = False
+    assert len(tap.pushed) > 500
+    assert tap.wrong() == 0
+
+
 def test_missed_and_stale_samples_become_gaps_in_place() -> None:
     """Data-ready without new data, and samples whose data-ready is missed, at random: every sample stays in its
     place."""

@@ -174,6 +174,24 @@ def test_images_of_the_guide_keep_the_budgets(target: str, flags: str) -> None:
     assert configured.stack(budget["calls"])[0] <= budget["stack"]
 
 
+@pytest.mark.parametrize(
+    ("target", "flags"),
+    [
+        ("stm32f405", "-DBOARD_SAVE_PERIOD_S=0"),
+        ("stm32f405", "-DBOARD_SAVE_PERIOD_S=4294968U"),
+        ("stm32f405", "-DBOARD_REPORT_MS=0"),
+        ("stm32f405", "-DBOARD_CAN_KBITPS=800"),
+        ("stm32f405", "-DBOARD_USART_BAUD=1200"),
+        ("stm32f405", "-DADIS16405_QUEUE=1000"),
+        ("stm32f405", "-DAPP_COMMAND_KEY=0x1ULL"),
+        ("cortex-m0", "-DBOARD_CAN_KBITPS=500"),
+    ],
+)
+def test_options_that_cannot_work_do_not_compile(target: str, flags: str) -> None:
+    with pytest.raises(subprocess.CalledProcessError):
+        image(f"refused-{target}", flags, target=target)
+
+
 @pytest.mark.usefixtures("images")
 def test_the_cortex_m0_image_starts() -> None:
     """As it is, on the emulated board: no sensor there, but the main loop turns and the UART's interrupts answer."""

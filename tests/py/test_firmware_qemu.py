@@ -44,7 +44,7 @@ LIBM_SD, LIBM_P, LIBM_NAT = 2e-4, 1e-4, 2e-3
 #: The goal for each core, its node counts included.
 REFERENCE_P = {"cortex-m4f": 2e-3, "cortex-m0": 1e-2}
 #: ... of parameters' means in posterior sd and of the sd itself, under laws of this probability or more: those of a
-#: report on the default grid, of fixed point the means alone (12 x 7 nodes add some per cent to an sd).
+#: report on the default grid, of fixed point the means alone (14 x 7 nodes add some per cent to an sd).
 REFERENCE_MEAN = {"cortex-m4f": 0.05, "cortex-m0": 0.05}
 REFERENCE_SD = {"cortex-m4f": 0.03, "cortex-m0": math.inf}
 LEAST_P = 1e-3

@@ -38,24 +38,26 @@ def test_counts_and_log_over_a_serial_line(tmp_path: Path) -> None:
     assert logged == [(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in sent]
 
 
-def test_a_channel_that_was_not_heard_is_opened_again() -> None:
-    """A module that saves its state while the host opens: only the second opening reaches it."""
+def test_a_channel_that_falls_silent_is_opened_again() -> None:
+    """A module that saves its state while the host opens: only the second opening reaches it. Then it restarts, and its
+    channel is closed."""
     sent = lines(stream(21, 3))
     master, slave = os.openpty()
     tty.setraw(slave)
 
     def module() -> None:
         heard = b""
-        while heard.count(b"O\r") < 2:
-            heard += os.read(master, 64)
-        os.write(master, text_of(sent))
+        for openings in (2, 3):
+            while heard.count(b"O\r") < openings:
+                heard += os.read(master, 64)
+            os.write(master, text_of(sent))
 
     thread = threading.Thread(target=module, daemon=True)
     thread.start()
-    statistics = monitor(channel=os.ttyname(slave), duration=8.0)
+    statistics = monitor(channel=os.ttyname(slave), duration=10.0)
     os.close(master)
     os.close(slave)
-    assert statistics.received == len(sent)
+    assert statistics.received == 2 * len(sent)
 
 
 def test_any_python_can_interface() -> None:

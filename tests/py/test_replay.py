@@ -266,6 +266,11 @@ def test_a_retired_axis_is_named(tmp_path: Path) -> None:
     assert "gy: retired" not in done.stderr
     axes = json.loads((tmp_path / "report.json").read_text())["axes"]
     assert axes["gx"]["samples_kept_out"]["saturated"] == 3000
+    # with a report at the end alone there is none from before
+    done = command(tmp_path / "log.csv", "--report-every", "600", "--json", tmp_path / "report.json")
+    assert done.returncode == 0
+    assert "gx: retired as dead on the way; left out: it has no report from before" in done.stderr
+    assert list(json.loads((tmp_path / "report.json").read_text())["axes"]) == ["gy"]
     assert axes["gy"]["samples_kept_out"]["saturated"] == 0
 
 

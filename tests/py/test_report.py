@@ -63,7 +63,7 @@ def test_report_over_the_whole_prior(n: int) -> None:
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
-    """As measured above and in lib/posterior.c: 12 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too
+    """As measured above and in lib/posterior.c: 14 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too
     few from the start, the others hold to 10^6. Parameters in the middle of the priors, none off the grid."""
     truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 100_000, 5)[0][:, None]
@@ -88,7 +88,7 @@ def test_a_grid_too_coarse_for_the_record_says_so() -> None:
 
 def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
     """Three recordings of the simulated sensor, six axes on shared nodes, against dense ones: probabilities within
-    0.01, means within 0.05 sd, the goals of such an image. (Of a hundred tried five were off by up to 0.013.)"""
+    0.01, means within 0.05 sd, the goals of such an image. (A hundred of them tried do, and 45 parts of real ones.)"""
     document = (ROOT / "tests" / "data" / "simulated_adis16405.yaml").read_text(encoding="utf-8")
     assert "duration_s: 3600.0" in document
     (tmp_path / "model.yaml").write_text(document.replace("duration_s: 3600.0", "duration_s: 1200.0"), encoding="utf-8")

@@ -13,7 +13,8 @@ from selfcal.live import View, frame_counts
 from selfcal.wire import Decoder, Statistics, open_bus
 
 LOGS = (".asc", ".blf", ".csv", ".trc")
-#: s without any frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s.
+#: s without a frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s, and one
+#: that has restarted says nothing until then.
 REOPEN_S = 3.0
 
 
@@ -47,16 +48,17 @@ def monitor(
                 logger = stack.enter_context(can.Logger(str(log)))
             except OSError as error:
                 raise UserError(f"{log}: cannot write: {error.strerror}") from error
-        asked = time.monotonic()
+        heard = time.monotonic()
         view = stack.enter_context(View(decoder, link, f"{interface} {channel}"))
         try:
             while not link.closed and (end is None or time.monotonic() < end):
                 frame = link.recv(0.25 if end is None else min(0.25, max(0.0, end - time.monotonic())))
                 if frame is None:
-                    if decoder.statistics.received == 0 and time.monotonic() - asked > REOPEN_S:
-                        link.open_again()
-                        asked = time.monotonic()
+                    if time.monotonic() - heard > REOPEN_S:
+                        link.open_again()  # a module that has restarted waits for that
+                        heard = time.monotonic()
                     continue
+                heard = time.monotonic()
                 if logger is not None:
                     logger(frame)
                 view.show(decoder.feed(frame))

@@ -122,7 +122,7 @@ def replay(
         )
     firmware = build(loaded_model, recording.rate_hz, names, target)
     history = run(firmware, recording, loaded_model, names, report_every, target, gate)
-    document = _document(recording, loaded_model, names, history, gate)
+    document = _document(recording, loaded_model, history, gate)
     if json is not None:
         write_json(document, json)
     if plot is not None:
@@ -269,7 +269,8 @@ def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str,
 
 
 def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]], target: str) -> bool:
-    """Follow the telemetry until the module has finished; false if it fell silent before."""
+    """Follow the telemetry until the module has finished; false if it fell silent before. Of `history` retired axes
+    without a report are taken out."""
     decoder = Decoder(from_start=True)
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s) as view:
@@ -287,20 +288,24 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
         alarms, blocks = (decoder.status.get(name, 0.0) for name in ("gate_alarm_count", "blocks_moving_count"))
         said += f"\ngate: rest ended {alarms:.0f} times; {blocks:.0f} bank intervals begun and given up for motion"
     retired = int(decoder.status.get("axes_retired", 0.0))
-    for name in history:
-        if history[name] and retired >> AXES.index(name) & 1:
-            said += f"\n{name}: retired as dead on the way; its last report is from before"
+    for name in [name for name in history if retired >> AXES.index(name) & 1]:
+        said += f"\n{name}: retired as dead on the way; "
+        if history[name]:
+            said += "its last report is from before"
+        else:
+            said += "left out: it has no report from before"
+            del history[name]
     Console(stderr=True).print(said, highlight=False, soft_wrap=True)
     return decoder.finished
 
 
 def _document(
-    recording: Recording, model: Model, axes: Sequence[str], history: Mapping[str, Sequence[AxisReport]], gate: bool
+    recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], gate: bool
 ) -> dict[str, Any]:
     found = {}
-    for name in axes:
+    for name, reports in history.items():
         try:
-            found[name] = _identified(recording, model, name, history[name], gate)
+            found[name] = _identified(recording, model, name, reports, gate)
         except UserError as error:
             raise UserError(f"{recording.path}: column {name}: {error}") from error
     document = to_document(recording, found)
