@@ -108,6 +108,9 @@ bool spi_burst(void *context)
 
 void spi_handler(void)
 {
+    if (SPI0_READY == 0U) {
+        return; /* still pending from a burst that stop_burst() broke off */
+    }
     SPI0_READY = 0U; /* before RXD is read: that lets the next byte in */
     const uint8_t byte = (uint8_t)SPI0_RXD;
     if (sent < BURST_BYTES) {
