@@ -193,7 +193,8 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (selfcal_retired(self, axis)) {
-        return SELFCAL_AXIS_RETIRED;
+        self->shifted[axis] += amount;
+        return SELFCAL_OK;
     }
     if (self->position > 0U && !self->dropped) {
         open_gap(self);

@@ -606,8 +606,8 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
 /* From the next sample on the sensor itself adds `amount` (unit) to the readings of an axis, say because its offset register was
  * written with the bias. Everything known is kept, and the bias goes up by `amount`: only the origin of the sums and of the bias's
  * prior moves, to the last digits of a float. The interval in progress yields no value. Not while a report is under way: begin it anew.
- * SELFCAL_BAD_ARGUMENT, and nothing changes: no such axis, or `amount` or the sum of all of them is not below SELFCAL_SAMPLE_MAX;
- * SELFCAL_AXIS_RETIRED. */
+ * SELFCAL_BAD_ARGUMENT, and nothing changes: no such axis, or `amount` or the sum of all of them is not below SELFCAL_SAMPLE_MAX. Of a
+ * retired axis that sum alone is kept. */
 selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount);
 
 /* The following take a bank that selfcal_init() has prepared and an axis of its model; anything else is a bug (SELFCAL_ASSERT). */

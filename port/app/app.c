@@ -106,10 +106,34 @@ bool app_healthy(const app_t *app)
            (!app->refused || now - app->refused_ms < PATIENCE_MS);
 }
 
+/* `count` samples are missing. */
+static void pass(app_t *app, uint32_t count)
+{
+#if SELFCAL_MODEL_GATE
+    if (app->gated && selfcal_gate_skip(&app->gate, count) == SELFCAL_MOVING) {
+        (void)selfcal_moving(&app->bank);
+    }
+#endif
+    (void)selfcal_skip(&app->bank, count);
+}
+
+/* Samples from the start, or the last call, to now. */
+static uint32_t absent(app_t *app)
+{
+    const uint32_t now = app->port->time_ms(app->port->context);
+    const double passed = 1e-3 * (double)(now - app->absent_ms) * (double)SELFCAL_MODEL_RATE_HZ;
+    app->absent_ms = now;
+    return (uint32_t)passed;
+}
+
 /* Between reports, because the bank must stand still. */
 static void save(app_t *app, uint32_t now)
 {
     const port_module_t *module = app->module;
+    const uint32_t count = app->restored ? absent(app) : 0U;
+    if (count > 0U) {
+        pass(app, count);
+    }
     app->saved_ms = now;
     const bool whole = module->save_begin(module->context) &&
                        selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK;
@@ -163,17 +187,6 @@ static void leave_out_retired(app_t *app)
 }
 #endif
 
-/* `count` samples are missing. */
-static void pass(app_t *app, uint32_t count)
-{
-#if SELFCAL_MODEL_GATE
-    if (app->gated && selfcal_gate_skip(&app->gate, count) == SELFCAL_MOVING) {
-        (void)selfcal_moving(&app->bank);
-    }
-#endif
-    (void)selfcal_skip(&app->bank, count);
-}
-
 /* By the rule at selfcal_moving(). */
 static void give(app_t *app, const float reading[])
 {
@@ -206,9 +219,8 @@ static bool take_sample(app_t *app)
     switch (app->port->sample(app->port->context, reading, &missing)) {
     case PORT_SAMPLE:
         if (app->restored) { /* the driver's first: what passed since the start is missing as well */
-            const double passed = 1e-3 * (double)app->port->time_ms(app->port->context) * (double)SELFCAL_MODEL_RATE_HZ;
             app->restored = false;
-            missing += (uint32_t)passed;
+            missing += absent(app);
         }
         if (missing > 0) {
             pass(app, missing);
@@ -364,6 +376,7 @@ static uint8_t forget(app_t *app)
 #endif
     }
     app->fresh = false;
+    app->restored = false;
 #if SELFCAL_MODEL_GATE
     if (app->gated) { /* its windows go on: the bank must start with one of them */
         (void)app_gate(app);

@@ -52,6 +52,7 @@ typedef struct {
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
     bool restored;    /* a saved state was, and no sample has come since */
+    uint32_t absent_ms; /* ... time up to which that is in the bank */
     bool put_off;     /* the last turn left a slice of a report to this one */
     bool waiting;     /* `frame` is made but not taken yet */
     bool refused;     /* the port has refused it, since refused_ms */

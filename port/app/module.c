@@ -12,8 +12,8 @@
 #ifndef BOARD_SAVE_PERIOD_S
 #define BOARD_SAVE_PERIOD_S 21600U
 #endif
-#if BOARD_SAVE_PERIOD_S < 1 || BOARD_SAVE_PERIOD_S > 4294967
-#error "BOARD_SAVE_PERIOD_S: 1 to 4294967 (milliseconds are counted in 32 bits)"
+#if BOARD_SAVE_PERIOD_S < 1 || BOARD_SAVE_PERIOD_S > 4000000
+#error "BOARD_SAVE_PERIOD_S: 1 to 4000000 (milliseconds are counted in 32 bits)"
 #endif
 
 static app_t app;

@@ -8,10 +8,6 @@
 
 #include "module.h"
 
-#if defined BOARD_CAN_KBITPS || defined BOARD_USART_BAUD
-#error "this board's wire is SLCAN at 115200 bit/s: there is no BOARD_CAN_KBITPS, and no other BOARD_USART_BAUD"
-#endif
-
 enum {
     PIN_READY = 20, /* edge 12 */
     PIN_RESET = 18, /* edge 8 */

@@ -2,6 +2,10 @@
 #include "board.h"
 #include "nrf51.h"
 
+#if defined BOARD_CAN_KBITPS || defined BOARD_USART_BAUD
+#error "this board's wire is SLCAN at 115200 bit/s: there is no BOARD_CAN_KBITPS, and no other BOARD_USART_BAUD"
+#endif
+
 /* Milliseconds between reports of all axes: each takes this core seconds. */
 #ifndef BOARD_REPORT_MS
 #define BOARD_REPORT_MS 600000

@@ -569,8 +569,13 @@ def test_time_before_the_first_sample_of_a_restored_bank() -> None:
     board.power_cycle()
     before = board.machine.now_us
     board.sensor.plug(False)
-    board.run(20.0)
+    board.run(1.0)
     known = board.value("app.bank.counters.missing")
+    board.run(9.0)
+    assert obey(board, "save", seconds=3.5) == [RESULT["done"]]  # what has passed so far is in it
+    kept = board.value("app.bank.counters.missing") - known
+    assert abs(kept - 1e-6 * (board.machine.now_us - before) * RATE_HZ) < 4.0 * RATE_HZ
+    board.run(10.0)
     board.sensor.plug(True)
     tap = Tap(board)
     while not tap.seen:
