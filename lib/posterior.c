@@ -4,9 +4,9 @@
  * t = ln sigma_v and t^ its mode at a node,
  *     ln p = profile(node) - n_eff (delta + e^(-2 delta)/2 - 1/2),   delta = t - t^,   t^ = ln(residual / n_eff) / 2,
  * so the shape in delta is one for all nodes, and only profile and t^ have to be interpolated between nodes, in ln rho and
- * ln alpha. Both follow from the innovations' variance. What that is expected to be, for data of the law's own best node, has a
+ * ln alpha. Both follow from the innovations' variance. What that is expected to be, for data of the best of all nodes, has a
  * closed form (expected() below); it carries the terms of order n. Those of order sqrt(n) say by how much the data's spectrum
- * happens to differ from that one: this is fitted to the nodes (begin_fit() below). A quintic spline takes what is left, a few nats.
+ * happens to differ from that one: this is fitted to the nodes of all laws (step_fit() below). A quintic spline takes what is left.
  * n_eff = n - w: the bias takes the share w = P0 A/(P0 A + sigma_v^2)
  * of one sample, 1 under a wide bias prior; w is taken at the best node (exact for w = 0 or 1, else first order in delta). With
  * regressors in use each coefficient takes such a share as well.
@@ -17,7 +17,7 @@
 #include "internal.h"
 
 /* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
-enum { GATHER, PEAK, SIGMA, VALUES, FIT, SOLVE, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE,
+enum { GATHER, TRUTH, FIT, SOLVE, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE,
        WHOLE };
 #define STEP_NODES 3U
 #define STEP_SCANNED_CELLS 24U
@@ -148,88 +148,73 @@ static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_al
     return pole ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
-/* Takes (rho, alpha) as what made the data. A drift slower than the record looks like a random walk within it, and its level
- * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
-static void set_truth(selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
-    const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
-    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
-    selfcal_real_t rate = R(0.0), variance = r_exp(R(2.0) * ln_rho);
-    if (pole) {
-        rate = r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s;
-    }
-    const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
-    selfcal_truth_t *truth = &work->truth;
-    truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
-    truth->rate = -r_expm1(-slow);
-    truth->fitted = false;
-    truth->ln_v = (selfcal_wide_t)expected(ln_rho, beta_at(work, ln_alpha), truth).ln_v; /* any that is near will do */
-    truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
-}
-
 static bool has_expectation(const selfcal_work_t *work) {
     return hypothesis_of(work)->rho != NULL && !is_sum(hypothesis_of(work)->law);
 }
 
-/* |1 - phi e^(i omega)|^2 (what passes) and |1 - psi e^(i omega)|^2 (what is held back) of a filter, at |1 - e^(i omega)|^2 = distance. */
-typedef struct {
-    selfcal_real_t beta_sq, phi, phi_gain, p_sq, psi;
-} response_t;
-
-static response_t response_of(selfcal_real_t beta, selfcal_real_t gain, selfcal_real_t p) {
-    const selfcal_real_t phi = R(1.0) - beta;
-    const response_t filter = {beta * beta, phi, phi * gain, p * p, R(1.0) - p};
-    return filter;
-}
-
-static selfcal_real_t passed(const response_t *filter, selfcal_real_t distance) {
-    return r_fma(filter->phi, distance, filter->beta_sq);
-}
-
-static selfcal_real_t held_back(const response_t *filter, selfcal_real_t distance) {
-    return r_fma(filter->psi, distance, filter->p_sq);
-}
-
-/* ln of the innovations' variance with lines and edges over what it is without them, e^ln_v. */
-static selfcal_real_t ln_fitted(const selfcal_truth_t *truth, const response_t *filter, selfcal_real_t ln_v) {
-    selfcal_real_t more = R(0.0);
-    for (unsigned m = 0; m < SELFCAL_LINES; m++) {
-        const selfcal_real_t line = passed(filter, truth->distance[m]) * truth->power[m];
-        more += r_fma(filter->phi_gain, truth->power[SELFCAL_LINES + m / 2U], line) / held_back(filter, truth->distance[m]);
-    }
-    return r_log1p(r_fmax(more * r_exp(-ln_v), R(-0.9)));
-}
-
-/* What the expectation says of the two fields; the splines hold the rest. */
+/* What the expectation says of the two fields, the splines hold the rest; and of which filter. */
 typedef struct {
     selfcal_real_t profile, ln_sigma;
+    selfcal_real_t beta_sq, phi, p_sq, psi; /* |1 - phi e^(i omega)|^2 = beta_sq + phi distance, |1 - psi e^(i omega)|^2 = p_sq + psi distance */
+    selfcal_real_t edge, level;             /* see lines and edges below */
+    selfcal_real_t ln_v, per_v;             /* of the innovations' variance without lines and edges, ln and inverse */
 } expectation_t;
 
-static expectation_t expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha) {
-    const selfcal_truth_t *truth = &work->truth;
-    if (!has_expectation(work)) {
-        const expectation_t none = {R(0.0), R(0.0)};
-        return none;
+/* The edge that goes with line m; the level is behind it. */
+static unsigned end_of(unsigned m) {
+    return SELFCAL_LINES + (m & ~1U);
+}
+
+/* What lines and edges add to the variance. */
+static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e) {
+    selfcal_real_t more = R(0.0), ends = R(0.0);
+    for (unsigned m = 0; m < SELFCAL_LINES; m++) {
+        const selfcal_real_t distance = truth->distance[m];
+        const selfcal_real_t passed = r_fma(e->phi, distance, e->beta_sq), held_back = r_fma(e->psi, distance, e->p_sq);
+        if (m % 2U == 0U) {
+            ends = r_fma(e->edge, truth->power[end_of(m)], e->level * truth->power[end_of(m) + 1U]);
+        }
+        more += r_fma(passed, truth->power[m], ends) / held_back;
     }
-    const selfcal_real_t beta = beta_at(work, ln_alpha);
-    response_t filter;
+    return more;
+}
+
+static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, expectation_t *e) {
+    const selfcal_truth_t *truth = &work->truth;
+    memset(e, 0, sizeof *e);
+    if (!has_expectation(work)) {
+        return;
+    }
+    const selfcal_real_t beta = beta_at(work, ln_alpha), n = (selfcal_real_t)work->bank->weight;
+    selfcal_real_t gain, p;
     selfcal_wide_t ln_v, ln_s;
     if (truth->wide) {
-        const expected_t_wide e = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
-        filter = response_of(beta, (selfcal_real_t)e.gain, (selfcal_real_t)e.p);
-        ln_v = e.ln_v;
-        ln_s = e.ln_s;
+        const expected_t_wide wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
+        gain = (selfcal_real_t)wide.gain;
+        p = (selfcal_real_t)wide.p;
+        ln_v = wide.ln_v;
+        ln_s = wide.ln_s;
     } else {
-        const expected_t e = expected(ln_rho, beta, truth);
-        filter = response_of(beta, e.gain, e.p);
-        ln_v = (selfcal_wide_t)e.ln_v;
-        ln_s = (selfcal_wide_t)e.ln_s;
+        const expected_t real = expected(ln_rho, beta, truth);
+        gain = real.gain;
+        p = real.p;
+        ln_v = (selfcal_wide_t)real.ln_v;
+        ln_s = (selfcal_wide_t)real.ln_s;
     }
+    const selfcal_real_t h = gain / p;
+    e->beta_sq = beta * beta;
+    e->phi = R(1.0) - beta;
+    e->p_sq = p * p;
+    e->psi = R(1.0) - p;
+    e->edge = gain * h / (R(2.0) - p);
+    e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
+    e->ln_v = (selfcal_real_t)ln_v;
+    e->per_v = r_exp(-e->ln_v);
     if (truth->fitted) {
-        ln_v += (selfcal_wide_t)ln_fitted(truth, &filter, (selfcal_real_t)ln_v);
+        ln_v += (selfcal_wide_t)r_log1p(r_fmax(fitted(truth, e) * e->per_v, R(-0.99)));
     }
-    const expectation_t result = {(selfcal_real_t)(-0.5 * work->bank->weight * (ln_v - truth->ln_v)),
-                                  (selfcal_real_t)(0.5 * (ln_v - ln_s))};
-    return result;
+    e->profile = (selfcal_real_t)(-0.5 * work->bank->weight * (ln_v - truth->ln_v));
+    e->ln_sigma = (selfcal_real_t)(0.5 * (ln_v - ln_s));
 }
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
@@ -322,8 +307,10 @@ static uint16_t part(selfcal_work_t *work, unsigned step, uint16_t whole) {
 
 /* Node values [rho][alpha] become spline coefficients: along alpha, then along rho. `transposed`: posterior means of the basis functions
  * become weights of the node values; the mean of anything the spline interpolates is the sum of its node values under them.
- * Some lines; true after the last. */
-static bool step_transform(selfcal_work_t *work, bool transposed, const selfcal_real_t in[], selfcal_real_t out[]) {
+ * Some lines of one of the two; true after the last. */
+static bool step_transform(selfcal_work_t *work, bool transposed, int which) {
+    const selfcal_real_t *in = work->scratch.grid.field[which];
+    selfcal_real_t *out = work->scratch.grid.spline[which];
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
     const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha), lines = (uint16_t)(rows + columns);
     for (uint16_t i = part(work, STEP_LINES, lines); i < work->at; i++) {
@@ -337,14 +324,21 @@ static bool step_transform(selfcal_work_t *work, bool transposed, const selfcal_
     return work->at == lines;
 }
 
-/* The best node settles n_eff, by the share of the bias there, and is the first guess of what made the data. */
-static void step_peak(selfcal_work_t *work) {
+/* The best node of the hypothesis settles n_eff, by the share of the bias there; that of all with an expectation is the first guess of
+ * what made the data. */
+static void step_peak(selfcal_work_t *work, uint16_t nodes) {
     const selfcal_wide_t n = work->bank->weight;
     if (work->at == 0U) {
         work->peak = (selfcal_wide_t)-INFINITY;
         work->n_eff = n - (selfcal_wide_t)work->unknowns;
     }
-    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
+    for (uint16_t k = part(work, step_nodes(work), nodes); k < work->at; k++) {
+        if (work->stage == TRUTH) {
+            work->hypothesis = place_of(work, k).hypothesis;
+            if (!has_expectation(work)) {
+                continue;
+            }
+        }
         selfcal_wide_t share;
         const field_t field = node_field(work, k, n - (selfcal_wide_t)work->unknowns, &share);
         if (field.profile > work->peak) {
@@ -355,23 +349,16 @@ static void step_peak(selfcal_work_t *work) {
     }
 }
 
-static void step_sigma(selfcal_work_t *work) {
-    sigma_cells(work);
-    if (hypothesis_of(work)->rho != NULL) {
-        const selfcal_place_t place = place_of(work, work->best_node);
-        set_truth(work, place.ln_rho, place.ln_alpha);
-    }
-}
-
 /* What the splines have to carry at the nodes. */
 static void step_values(selfcal_work_t *work) {
     for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         const selfcal_place_t place = place_of(work, k);
-        const expectation_t expected_of = expectation(work, place.ln_rho, place.ln_alpha);
+        expectation_t e;
         selfcal_wide_t unused;
         const field_t exact = node_field(work, k, work->n_eff, &unused);
-        work->field[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)expected_of.profile);
-        work->field[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)expected_of.ln_sigma);
+        expectation(work, place.ln_rho, place.ln_alpha, &e);
+        work->scratch.grid.field[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)e.profile);
+        work->scratch.grid.field[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)e.ln_sigma);
     }
 }
 
@@ -379,17 +366,24 @@ static void step_values(selfcal_work_t *work) {
 
 /* The innovations nu = (1 - phi B)/(1 - psi B) y, psi = phi (1 - K), have over data of the spectrum S(omega) the variance
  *     v = mean over omega of S |1 - phi e^(i omega)|^2 / |1 - psi e^(i omega)|^2.
- * So all that (rho, alpha) sees of the data is a function of one variable, psi, smoothed along ln(1 - psi) by 1/(1 + e^2x), and the
- * nodes together show it far more closely than their rows and columns seem to. What S has beyond the spectrum supposed is fitted
- * to the nodes as lines, even in ln omega. And where a record ends (or begins: time may run either way) the squares lack
- * phi (phi - psi) w^2, w = y/(1 - psi B): the edges. Taken into the expectation, they leave to the splines less than a few nats,
- * however long the record. A priori a line's power scatters as a periodogram does, and an edge's as large as its spectrum makes it. */
-#define FIT_PRECISION R(5.0) /* 0.5/0.1: they leave 0.1 nat of a node's ln-likelihood -n/2 ln v */
+ * So all that (rho, alpha) sees of the data, of whatever law, is a function of one variable, psi, smoothed along ln(1 - psi) by
+ * 1/(1 + e^2x), and the nodes together show it far more closely than their rows and columns seem to. What S has beyond the spectrum
+ * supposed is fitted to all nodes as lines, even in ln omega. With zeros for what came before the record and after it, S tells
+ * of squares that were never summed: at either end the zeros would have added (the filter being at rest, time running either way)
+ *     edge w^2,  edge = (phi - psi)^2/(1 - psi^2),  w = y/(1 - psi B) there,
+ * and taking the readings about their generalised least squares mean, not their plain one, takes off another
+ *     level (w1 + w2)^2,  level = h^2 (1 - phi)/(n (1 - phi) + 2 h),  h = (phi - psi)/(1 - psi).
+ * Both functions of psi are fitted as well, a term for each two lines. Taken into the expectation, all these leave to the splines
+ * less than a nat, however long the record. A priori a line's power scatters as a periodogram does, and an end's as large as its
+ * spectrum makes it. */
+#define FIT_PRECISION R(50.0) /* 0.5/0.01: they leave 0.01 nat of a node's ln-likelihood -n/2 ln v */
 #define FIT_MOST R(1e6)
+/* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
+#define UNSETTLED R(200.0)
 
 /* Of ln omega, from 1/n to pi. */
 static selfcal_real_t line_step(selfcal_real_t weight) {
-    return (R(1.1447299) + r_log(weight)) / (selfcal_real_t)(SELFCAL_LINES - 1);
+    return (R(1.7917595) + r_log(weight)) / (selfcal_real_t)(SELFCAL_LINES - 1);
 }
 
 static void begin_fit(selfcal_work_t *work) {
@@ -401,16 +395,17 @@ static void begin_fit(selfcal_work_t *work) {
     selfcal_real_t *diagonal = fit->triangle;
     for (unsigned m = 0; m < SELFCAL_LINES; m++) {
         const selfcal_real_t omega_sq = omega * omega;
-        truth->distance[m] = omega_sq / r_fma(R(0.1487), omega_sq, R(1.0)); /* nearly, and just 4 at pi: where a line lies is free */
+        truth->distance[m] = omega_sq / r_fma(R(0.22222222), omega_sq, R(1.0)); /* 4 where omega is 6: where a line lies is free */
         const selfcal_real_t spectrum =
             R(1.0) + R(2.0) * truth->variance * truth->rate / r_fma(truth->rate, truth->rate, truth->distance[m]);
         const selfcal_real_t share = omega * step / (R(3.1415927) * weight); /* of its band in the record's frequencies */
         truth->power[m] = spectrum * r_sqrt(share); /* until the fit is solved, a prior deviation */
-        truth->power[SELFCAL_LINES + m / 2U] = R(4.0) * spectrum * share; /* two ends, a band of two lines */
+        selfcal_real_t *ends = &truth->power[end_of(m)]; /* of both lines as of the second */
+        ends[0] = ends[1] = R(4.0) * spectrum * share; /* two ends, a band of two lines */
         omega *= ratio;
     }
     for (unsigned m = 0; m < SELFCAL_FITTED; m++) {
-        *diagonal = R(1.0);
+        *diagonal = R(1.0) / (FIT_PRECISION * weight); /* prior deviations of 1, over the nodes' */
         diagonal += SELFCAL_FITTED + 1U - m;
     }
 }
@@ -429,28 +424,68 @@ static void rotate_in(selfcal_fit_t *fit, selfcal_real_t row[SELFCAL_FITTED + 1]
     }
 }
 
-/* A node's row: its variance over that expected, less that of the best node, by lines and edges of their prior deviations. One a step. */
-static void step_fit(selfcal_work_t *work) {
-    const selfcal_truth_t *truth = &work->truth;
-    if (work->at == 0U) {
-        begin_fit(work);
-    }
-    const uint16_t k = work->at++;
+/* Takes the best node as what made the data. A drift slower than the record looks like a random walk within it, and its level
+ * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
+static void set_truth(selfcal_work_t *work) {
+    const selfcal_place_t place = place_of(work, work->best_node);
+    work->hypothesis = place.hypothesis;
+    const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
+    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    const selfcal_real_t variance = r_exp(R(2.0) * place.ln_rho);
+    const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
+    const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
+    selfcal_truth_t *truth = &work->truth;
+    truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
+    truth->rate = -r_expm1(-slow);
+    expectation_t e;
+    expectation(work, place.ln_rho, place.ln_alpha, &e);
+    truth->ln_v = (selfcal_wide_t)e.ln_v; /* any that is near will do */
+    truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
+}
+
+/* Of a node of the bank, of any law, ln of sigma_v's mode less its expectation: what all that have one see in the data is one thing. */
+static selfcal_wide_t off_expectation(selfcal_work_t *work, uint16_t k, expectation_t *e) {
     const selfcal_place_t place = place_of(work, k);
-    const selfcal_real_t beta = beta_at(work, place.ln_alpha);
-    const expected_t e = expected(place.ln_rho, beta, truth);
-    const response_t filter = response_of(beta, e.gain, e.p);
-    const selfcal_real_t weight = FIT_PRECISION * (selfcal_real_t)work->bank->weight, per_v = weight * r_exp(-e.ln_v);
+    selfcal_wide_t unused;
+    work->hypothesis = place.hypothesis;
+    expectation(work, place.ln_rho, place.ln_alpha, e);
+    return node_field(work, k, work->n_eff, &unused).ln_sigma - (selfcal_wide_t)e->ln_sigma;
+}
+
+static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_wide_t off) {
+    const selfcal_truth_t *truth = &work->truth;
+    work->truth.pair = work->truth.pair || hypothesis_of(work)->alpha != NULL;
+    const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
+    const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n)), per_v = weight * e->per_v;
     selfcal_real_t row[SELFCAL_FITTED + 1];
     memset(row, 0, sizeof row);
     for (unsigned m = 0; m < SELFCAL_LINES; m++) {
-        const selfcal_real_t scaled = per_v / held_back(&filter, truth->distance[m]);
-        row[m] = scaled * passed(&filter, truth->distance[m]) * truth->power[m];
-        row[SELFCAL_LINES + m / 2U] += scaled * filter.phi_gain * truth->power[SELFCAL_LINES + m / 2U];
+        const unsigned ends = end_of(m);
+        const selfcal_real_t share = per_v / r_fma(e->psi, truth->distance[m], e->p_sq);
+        row[m] = share * r_fma(e->phi, truth->distance[m], e->beta_sq) * truth->power[m];
+        row[ends] += share * e->edge * truth->power[ends];
+        row[ends + 1U] += share * e->level * truth->power[ends + 1U];
     }
-    const selfcal_real_t off = work->field[1][k] - work->field[1][work->best_node];
-    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * off), FIT_MOST);
+    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * (selfcal_real_t)off), FIT_MOST);
     rotate_in(&work->scratch.fit, row);
+}
+
+/* First what made the data, then a node a step: its row is its variance over that expected, less that of the best node, by lines and edges
+ * of their prior deviations. True after the last. */
+static bool step_fit(selfcal_work_t *work) {
+    const uint16_t at = work->at++;
+    expectation_t e;
+    if (at == 0U) {
+        set_truth(work);
+        work->ln_sigma_off = off_expectation(work, work->best_node, &e);
+        begin_fit(work);
+        return false;
+    }
+    const selfcal_wide_t off = off_expectation(work, (uint16_t)(at - 1U), &e) - work->ln_sigma_off;
+    if (has_expectation(work)) {
+        add_row(work, &e, off);
+    }
+    return at == work->bank->model->nodes;
 }
 
 static void step_solve(selfcal_work_t *work) {
@@ -489,7 +524,7 @@ static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const self
     }
     for (uint16_t i = 0; hypothesis->rho != NULL && i < work->cells; i++) {
         const selfcal_real_t z = (cell_middle(work, 0, i) - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
-        work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->scratch.cells.basis[i]);
+        work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->scratch.grid.basis[i]);
     }
 }
 
@@ -542,8 +577,8 @@ static void make_row(const selfcal_work_t *work, row_t *row) {
         row->ln_sigma[i] = R(0.0);
         for (uint16_t j = 0; j < taps; j++) {
             const size_t at = (size_t)i * columns + row->basis_first + j;
-            row->profile[i] = r_fma(row->basis[j], work->spline[0][at], row->profile[i]);
-            row->ln_sigma[i] = r_fma(row->basis[j], work->spline[1][at], row->ln_sigma[i]);
+            row->profile[i] = r_fma(row->basis[j], work->scratch.grid.spline[0][at], row->profile[i]);
+            row->ln_sigma[i] = r_fma(row->basis[j], work->scratch.grid.spline[1][at], row->ln_sigma[i]);
         }
     }
 }
@@ -567,8 +602,8 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     cell->ln_sigma = R(0.0);
     const uint8_t first = work->basis_first[i];
     for (uint16_t k = 0; k < 6U; k++) {
-        cell->profile = r_fma(work->scratch.cells.basis[i][k], row->profile[first + k], cell->profile);
-        cell->ln_sigma = r_fma(work->scratch.cells.basis[i][k], row->ln_sigma[first + k], cell->ln_sigma);
+        cell->profile = r_fma(work->scratch.grid.basis[i][k], row->profile[first + k], cell->profile);
+        cell->ln_sigma = r_fma(work->scratch.grid.basis[i][k], row->ln_sigma[first + k], cell->ln_sigma);
     }
     /* Beyond the nodes the spline's part is held and the expectation carries on. */
     const selfcal_t *bank = work->bank;
@@ -578,7 +613,8 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
         const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
         cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
     }
-    const expectation_t e = expectation(work, cell->ln_rho, row->ln_alpha);
+    expectation_t e;
+    expectation(work, cell->ln_rho, row->ln_alpha, &e);
     cell->profile += e.profile;
     cell->ln_sigma += e.ln_sigma;
 }
@@ -700,9 +736,10 @@ static bool end_scan(selfcal_work_t *work) {
 
 /* Whether nodes or lines are too far apart for a record so long. What the data put into a node's sums looks, as a function of ln rho or ln
  * alpha, like white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at the nodes' Nyquist frequency pi/h that is
- * e^(-pi^2/2h). It grows as sqrt(n); on a grid of two dimensions lines see to that, and of what is left there no more comes after some
- * 10^4 samples. Of a law without an expectation all of the ln-likelihood is left to the splines, which grows as n. The limits are measured,
- * on records over the whole prior, n = 100 to 10^6 on 6 to 24 nodes: below them 98 in 100 kept all three tolerances. */
+ * e^(-pi^2/2h). It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
+ * of a random walk beside it, so that lines leave little of it; on such a grid no more comes after some 10^4 samples. Of a law without
+ * an expectation all of the ln-likelihood is left to the splines, which grows as n. The limits are measured, on records over the
+ * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances. */
 static bool too_coarse(const selfcal_work_t *work) {
     /* 0, so that e^-inf is the rest, where there is none. */
     const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]};
@@ -712,8 +749,8 @@ static bool too_coarse(const selfcal_work_t *work) {
         return rest * weight > R(0.08);
     }
     const bool pair = hypothesis_of(work)->alpha != NULL;
-    return rest * r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) > (pair ? R(0.5) : R(0.02)) ||
-           line_step(weight) > R(0.46);
+    return rest * r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) > (work->truth.pair ? R(0.4) : R(0.02)) ||
+           line_step(weight) > R(0.5);
 }
 
 static void begin_sum(selfcal_work_t *work) {
@@ -723,8 +760,8 @@ static void begin_sum(selfcal_work_t *work) {
     work->off_grid = too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0; /* then all of the mass counts as off the grid */
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
-    memset(work->field, 0, sizeof work->field);
-    memset(work->scratch.cells.histogram, 0, sizeof work->scratch.cells.histogram);
+    memset(work->scratch.grid.field, 0, sizeof work->scratch.grid.field);
+    memset(work->scratch.grid.histogram, 0, sizeof work->scratch.grid.histogram);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
@@ -747,7 +784,7 @@ static spread_t spread_over(selfcal_work_t *work, unsigned p, selfcal_real_t wid
     const selfcal_real_t step = histogram_step(work, p);
     const selfcal_real_t per_step = step > R(0.0) ? R(1.0) / step : R(0.0);
     const selfcal_real_t half = R(0.5) * width * per_step;
-    const spread_t spread = {work->scratch.cells.histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    const spread_t spread = {work->scratch.grid.histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
     return spread;
 }
 
@@ -885,7 +922,7 @@ static void step_sum(selfcal_work_t *work) {
         }
         const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.first[0] + sum.second[0]; /* times (N / best N)^2 */
         for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
-            const selfcal_real_t basis = has_drift ? work->scratch.cells.basis[i][k] : R(1.0);
+            const selfcal_real_t basis = has_drift ? work->scratch.grid.basis[i][k] : R(1.0);
             const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
             weight[at] += sum.mass * basis;
             weight_sq[at] += mass_sq * basis;
@@ -905,8 +942,8 @@ static void step_sum(selfcal_work_t *work) {
     for (uint16_t j = 0; j < rows; j++) {
         for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
             const size_t at = (size_t)j * columns + row.basis_first + k;
-            work->field[0][at] = r_fma(weight[j], row.basis[k], work->field[0][at]);
-            work->field[1][at] = r_fma(weight_sq[j], row.basis[k], work->field[1][at]);
+            work->scratch.grid.field[0][at] = r_fma(weight[j], row.basis[k], work->scratch.grid.field[0][at]);
+            work->scratch.grid.field[1][at] = r_fma(weight_sq[j], row.basis[k], work->scratch.grid.field[1][at]);
         }
     }
 }
@@ -918,7 +955,7 @@ static selfcal_real_t quantile(const selfcal_work_t *work, unsigned p, selfcal_r
     selfcal_real_t below = R(0.0);
     const selfcal_real_t wanted = share * total;
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
-        const selfcal_real_t mass = work->scratch.cells.histogram[p][bin];
+        const selfcal_real_t mass = work->scratch.grid.histogram[p][bin];
         if (below + mass >= wanted && mass > R(0.0)) {
             return work->range_lo[p] + ((selfcal_real_t)bin + (wanted - below) / mass) * step;
         }
@@ -935,7 +972,7 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
         const selfcal_real_t from = work->range_lo[p] + (selfcal_real_t)bin * step;
         const selfcal_real_t part = r_fmin(hi, from + step) - r_fmax(lo, from);
         if (part > R(0.0) && step > R(0.0)) {
-            mass += work->scratch.cells.histogram[p][bin] * r_fmin(part / step, R(1.0));
+            mass += work->scratch.grid.histogram[p][bin] * r_fmin(part / step, R(1.0));
         }
     }
     return mass;
@@ -950,9 +987,9 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     selfcal_real_t total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
         const selfcal_real_t at = ((selfcal_real_t)bin + R(0.5)) * step;
-        total += work->scratch.cells.histogram[p][bin];
-        ln_first = r_fma(work->scratch.cells.histogram[p][bin], at, ln_first);
-        ln_second = r_fma(work->scratch.cells.histogram[p][bin] * at, at, ln_second);
+        total += work->scratch.grid.histogram[p][bin];
+        ln_first = r_fma(work->scratch.grid.histogram[p][bin], at, ln_first);
+        ln_second = r_fma(work->scratch.grid.histogram[p][bin] * at, at, ln_second);
     }
     const selfcal_real_t ln_mean = ln_first / total;
     const selfcal_real_t ln_sd = r_sqrt(r_fmax(ln_second / total - ln_mean * ln_mean, R(0.0)));
@@ -1031,16 +1068,16 @@ static void step_bias(selfcal_work_t *work) {
         if (begins && k == 0U) {
             work->bias_about = now.mean;
         }
-        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->spline[0][k] * off;
-        work->bias_weight += (selfcal_wide_t)work->spline[0][k];
+        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+        work->bias_weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
         work->bias_first += weighed;
         work->bias_second += weighed * off;
-        work->bias_own += (selfcal_wide_t)work->spline[1][k] * (v.drift_var + now.own[0]);
+        work->bias_own += (selfcal_wide_t)work->scratch.grid.spline[1][k] * (v.drift_var + now.own[0]);
         if (has_decay(v.law)) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-            const selfcal_wide_t own = (selfcal_wide_t)work->spline[1][k] * best_sq;
+            const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * best_sq;
             selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
             selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
             size_t terms = 1;
@@ -1054,7 +1091,7 @@ static void step_bias(selfcal_work_t *work) {
             }
 #endif
             for (size_t a = 0; a < terms; a++) {
-                const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->spline[0][k] * now.drift[a];
+                const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now.drift[a];
                 selfcal_wide_t with_all = 0.0;
                 for (size_t b = 0; b < terms; b++) {
                     const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
@@ -1280,45 +1317,48 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
                 work->bank = NULL;
                 return SELFCAL_TOO_SHORT; /* the rest is forgotten */
             }
-            go_to(work, PEAK);
+            go_to(work, TRUTH);
         }
         break;
-    case PEAK:
-        step_peak(work);
-        if (work->at == nodes) {
-            work->stage = SIGMA;
-        }
-        break;
-    case SIGMA:
-        step_sigma(work);
-        go_to(work, VALUES);
-        break;
-    case VALUES:
-        step_values(work);
-        if (work->at == nodes) {
-            go_to(work, has_expectation(work) && !work->truth.fitted ? FIT : SPLINE_PROFILE);
+    case TRUTH:
+        step_peak(work, work->bank->model->nodes);
+        if (work->at == work->bank->model->nodes) {
+            work->hypothesis = 0;
+            go_to(work, work->peak > (selfcal_wide_t)-INFINITY ? FIT : PEAK);
         }
         break;
     case FIT:
-        step_fit(work);
-        if (work->at == nodes) {
+        if (step_fit(work)) {
+            work->hypothesis = 0;
             work->stage = SOLVE;
         }
         break;
     case SOLVE:
         step_solve(work);
-        go_to(work, VALUES); /* with less left to the splines */
+        go_to(work, PEAK);
         break;
-    case SPLINE_PROFILE:
-        if (step_transform(work, false, work->field[0], work->spline[0])) {
-            go_to(work, SPLINE_SIGMA);
+    case PEAK:
+        step_peak(work, nodes);
+        if (work->at == nodes) {
+            work->stage = SIGMA;
         }
         break;
+    case SIGMA:
+        sigma_cells(work);
+        go_to(work, VALUES);
+        break;
+    case VALUES:
+        step_values(work);
+        if (work->at == nodes) {
+            go_to(work, SPLINE_PROFILE);
+        }
+        break;
+    case SPLINE_PROFILE:
     case SPLINE_SIGMA:
-        if (step_transform(work, false, work->field[1], work->spline[1])) {
+        if (step_transform(work, false, work->stage - SPLINE_PROFILE)) {
             work->pass = 0;
             work->cells = SEARCH_CELLS;
-            work->stage = BOX;
+            go_to(work, work->stage + 1);
         }
         break;
     case BOX:
@@ -1341,15 +1381,11 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case WEIGHTS:
-        if (step_transform(work, true, work->field[0], work->spline[0])) {
-            go_to(work, WEIGHTS_SQ);
-        }
-        break;
     case WEIGHTS_SQ:
-        if (step_transform(work, true, work->field[1], work->spline[1])) {
+        if (step_transform(work, true, work->stage - WEIGHTS)) {
             work->bias_weight = work->bias_first = work->bias_second = work->bias_own = 0.0;
             memset(work->bias_decay, 0, sizeof work->bias_decay);
-            go_to(work, BIAS);
+            go_to(work, work->stage + 1);
         }
         break;
     case BIAS:

@@ -518,9 +518,9 @@ static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance,
             of->first[r] = of->second[r] = of->own[r] = 0.0;
         }
         const selfcal_wide_t off = fit.mean[i] - (selfcal_wide_t)of->mean[r];
-        of->first[r] += (selfcal_wide_t)work->spline[0][k] * off;
-        of->second[r] += (selfcal_wide_t)work->spline[0][k] * off * off;
-        of->own[r] += (selfcal_wide_t)work->spline[1][k] * fit.var[i] / variance;
+        of->first[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+        of->second[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off * off;
+        of->own[r] += (selfcal_wide_t)work->scratch.grid.spline[1][k] * fit.var[i] / variance;
     }
 }
 

@@ -114,10 +114,10 @@ extern "C" {
 #endif
 
 /* Frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even in
- * their logarithm, from 1/n to pi a bank interval. Less than 0.46 nepers apart they do for the reports' tolerances; fewer: less time.
- * 4.5 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HISTOGRAM + 24 SELFCAL_REPORT_CELLS anyway. */
+ * their logarithm, from 1/n to pi a bank interval. Up to 0.5 nepers apart they do for the reports' tolerances; fewer: less time.
+ * 8 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HYPOTHESIS_NODES_MAX + 16 SELFCAL_HISTOGRAM + 24 SELFCAL_REPORT_CELLS anyway. */
 #ifndef SELFCAL_LINES
-#define SELFCAL_LINES 40
+#define SELFCAL_LINES 36
 #endif
 #if SELFCAL_LINES < 8 || SELFCAL_LINES > 64 || SELFCAL_LINES % 2 != 0
 #error "SELFCAL_LINES must be an even number, 8 to 64"
@@ -738,16 +738,17 @@ typedef struct {
     selfcal_wide_t first[SELFCAL_REGRESSORS_MAX], second[SELFCAL_REGRESSORS_MAX], own[SELFCAL_REGRESSORS_MAX]; /* private */
 } selfcal_coefficients_t;
 
-#define SELFCAL_FITTED (SELFCAL_LINES + SELFCAL_LINES / 2)
+#define SELFCAL_FITTED (SELFCAL_LINES + SELFCAL_LINES)
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {
     selfcal_real_t variance, rate; /* of a first-order drift over sigma_v^2; 1 - its pole */
     selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
-    /* What the nodes show besides, of either sign: lines at frequencies omega, then edges, one of two lines each (see posterior.c). */
-    bool fitted;
+    /* What the nodes show besides, of either sign: lines at frequencies omega, and behind them two of each two lines' band, edges and
+     * level (see posterior.c). */
     selfcal_real_t distance[SELFCAL_LINES]; /* |1 - e^(i omega)|^2 */
     selfcal_real_t power[SELFCAL_FITTED];
+    bool fitted, pair;                      /* ... is known, from nodes in two dimensions among others */
 } selfcal_truth_t;
 
 /* Least squares for them by rotations: a triangle, row by row, its right side behind each. Private. */
@@ -766,35 +767,36 @@ typedef struct {
     bool gathered;    /* the nodes run over the last batch: what is pushed now is later than the report */
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
+    uint16_t best_node;      /* of all: the likeliest */
+    selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
+    selfcal_truth_t truth;
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
     selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
-    uint16_t best_node;
     bool moved;              /* the box is to change after a pass */
     uint8_t cells;           /* a dimension: fewer in the search than in the sums */
-    selfcal_truth_t truth;
-    /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
-    selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
-    selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
-    /* ... as they are, and with sigma_v^2 over that of the best cell */
     /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
     selfcal_real_t lo[2], width[2];
     selfcal_real_t limit_lo[2], limit_hi[2];
     selfcal_real_t found_lo[2], found_hi[2];
     selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
     selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
-    uint8_t basis_first[SELFCAL_REPORT_CELLS]; /* first node of each row of scratch.cells.basis */
+    uint8_t basis_first[SELFCAL_REPORT_CELLS]; /* first node of each row of scratch.grid.basis */
     /* sigma_v cells: offsets in ln from the conditional mode, with their weights */
     selfcal_real_t delta[SELFCAL_SIGMA_CELLS], delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS], delta_width;
     /* posterior sums */
     selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
     union {
-        selfcal_fit_t fit; /* before the search */
+        selfcal_fit_t fit; /* before the first hypothesis */
         struct {
+            /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
+            selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
+            selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
+            /* ... as they are, and with sigma_v^2 over that of the best cell */
             selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
             selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
-        } cells;
+        } grid;
     } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
     selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */

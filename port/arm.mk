@@ -2,7 +2,7 @@
 # SELFCAL_GRID_MAX, SELFCAL_ALPHA_MAX, SELFCAL_HYPOTHESIS_NODES_MAX: the largest of the core's nodes in the default model. Half of the
 # host's cells a dimension: a quarter of the time.
 CONFIG_cells := -DSELFCAL_REPORT_CELLS=48 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_LINES=32
-CONFIG_cortex-m4f := $(CONFIG_cells) -DSELFCAL_GRID_MAX=20 -DSELFCAL_ALPHA_MAX=12 -DSELFCAL_HYPOTHESIS_NODES_MAX=240
+CONFIG_cortex-m4f := $(CONFIG_cells) -DSELFCAL_GRID_MAX=16 -DSELFCAL_ALPHA_MAX=12 -DSELFCAL_HYPOTHESIS_NODES_MAX=192
 # Integers; a node's batch takes 4 sample periods at 819.2 Hz and 48 MHz. Lines and cells so few that an axis's report ends within the 16 s
 # for which its bank has room.
 CONFIG_cortex-m0 := -DSELFCAL_REPORT_CELLS=40 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_HISTOGRAM=64 -DSELFCAL_LINES=20 -DSELFCAL_GRID_MAX=16 \

@@ -177,11 +177,12 @@ static void measure_report(void) {
     /* in the order of the stages in posterior.c */
     static const char *const stage_name[][3] = {
         {"report.gather", "report.gather.worst_step", "report.gather.steps"},
+        {"report.truth", "report.truth.worst_step", "report.truth.steps"},
+        {"report.fit", "report.fit.worst_step", "report.fit.steps"},
+        {"report.solve", "report.solve.worst_step", "report.solve.steps"},
         {"report.peak", "report.peak.worst_step", "report.peak.steps"},
         {"report.sigma", "report.sigma.worst_step", "report.sigma.steps"},
         {"report.values", "report.values.worst_step", "report.values.steps"},
-        {"report.fit", "report.fit.worst_step", "report.fit.steps"},
-        {"report.solve", "report.solve.worst_step", "report.solve.steps"},
         {"report.spline_profile", "report.spline_profile.worst_step", "report.spline_profile.steps"},
         {"report.spline_sigma", "report.spline_sigma.worst_step", "report.spline_sigma.steps"},
         {"report.box", "report.box.worst_step", "report.box.steps"},

@@ -290,11 +290,12 @@ def table(bench: Bench) -> str:
     per("report of one axis", "report")
     for stage, title in (
         ("gather", "nodes over the last samples"),
+        ("truth", "best node of all"),
+        ("fit", "lines and edges, a row a node"),
+        ("solve", "… solved"),
         ("peak", "best node"),
         ("sigma", "cells of σv"),
         ("values", "node values"),
-        ("fit", "lines and edges, a row a node"),
-        ("solve", "… solved"),
         ("spline_profile", "spline fit of the profile"),
         ("spline_sigma", "spline fit of σv's mode"),
         ("box", "first box"),

@@ -13,7 +13,7 @@ from selfcal.model import PLAIN
 from agreement import LIMITS, MODEL, a_record, compare, hold, tables_of
 from conftest import shared_recording
 
-#: Records a law, by length; `make tolerances` takes longer ones too. Nodes: the M4F's, 20 + 20 x 12 + 1.
+#: Records a law, by length; `make tolerances` takes longer ones too. Nodes: the M4F's, 16 + 16 x 12 + 1.
 RECORDS = {10: 20, 100: 20, 1000: 10, 10_000: 3}
 TARGET = "cortex-m4f"
 

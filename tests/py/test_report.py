@@ -1,4 +1,4 @@
-"""The report on the default grid (24 nodes of rho, 16 of alpha, 96 cells) against a dense one, over the whole prior.
+"""The report on the default grid (16 nodes of rho, 12 of alpha, 96 cells) against a dense one, over the whole prior.
 
 The judge is the same code in double on 48 and 40 x 40 nodes with 192 cells, where neither counts any more: 64 and
 56 x 56 nodes give the same to 1e-4. That its sums are right is test_bank.py's business, that its posterior is,
@@ -7,6 +7,7 @@ test_identify.py's. SELFCAL_DRAWS sets the records per law and length (default 4
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 
 from selfcal import _library32
 from selfcal.engines.library import Bank
+from selfcal.model import PLACES
 from selfcal.recording import load
 from selfcal.tables import make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
@@ -23,11 +25,10 @@ from selfcal.verbs.simulate import simulate
 from agreement import (
     MODEL,
     REPORT_LIMIT,
-    Floats,
     a_record,
     dense,
     exact_report,
-    on_nodes,
+    off_grid,
     push,
     report_differences,
     tables_of,
@@ -43,28 +44,73 @@ LENGTHS = [int(float(n)) for n in os.environ.get("SELFCAL_LENGTHS", "10,100,1000
 
 @pytest.mark.parametrize("n", LENGTHS)
 def test_report_over_the_whole_prior(n: int) -> None:
-    """On the default nodes, and on the fewest that do: the design's bound of 16 a dimension for Gauss-Markov (12 of
-    alpha), 20 for a random walk (on 16 one record in twenty is 0.05 to 0.2 nat off at 10^5 samples)."""
-    default = tables_of(MODEL)
-    found: dict[str, list[Floats]] = {"default": [], "20, 16 x 12": []}
-    for law in MODEL.hypotheses:
-        for seed in range(DRAWS):
-            y = a_record(law, n, seed)[0]
-            exact = exact_report(y, default)
-            for each, tables in zip(found.values(), (default, on_nodes(default, 20, (16, 12))), strict=True):
-                each.append(report_differences(y, tables, exact)[0])
-    for nodes, values in found.items():
-        (e, m, s), (we, wm, ws) = np.quantile(values, 0.9, axis=0), np.max(values, axis=0)
-        print(
-            f"\nn={n}, {nodes} nodes: 9 records in 10 within d ln evidence {e:.3f}, d mean {m:.3f} sd, "
-            f"sd {100 * s:.1f} %; worst {we:.3f}, {wm:.3f} sd, {100 * ws:.1f} %"
-        )
-        assert (np.array(values) <= REPORT_LIMIT).all()
+    """On at most 16 nodes a dimension, the design's bound. (The fewest that do are 16 x 12 and 14 of a random walk.)"""
+    tables = tables_of(MODEL)
+    assert all(grid is None or grid.nodes <= 16 for h in tables.hypotheses for grid in (h.rho, h.alpha))
+    found = np.array(
+        [
+            report_differences(y, tables, exact_report(y, tables))[0]
+            for law in MODEL.hypotheses
+            for seed in range(DRAWS)
+            for y in (a_record(law, n, seed)[0],)
+        ]
+    )
+    (e, m, s), (we, wm, ws) = np.quantile(found, 0.9, axis=0), np.max(found, axis=0)
+    print(
+        f"\nn={n}: 9 records in 10 within d ln evidence {e:.3f}, d mean {m:.3f} sd, sd {100 * s:.1f} %; "
+        f"worst {we:.3f}, {wm:.3f} sd, {100 * ws:.1f} %"
+    )
+    assert (found <= REPORT_LIMIT).all()
+
+
+def test_beyond_the_nodes() -> None:
+    """A random walk with a white noise so small that its most likely rho, 3.1, lies above the highest node: there the
+    expectation goes on alone, and holds as it does between nodes. (No grid of the library's judges that: all end where
+    the nodes do. So it is the exact likelihood, x0 integrated in closed form, over 1500 x 1500 values of the priors.)
+    """
+    y = a_record("random_walk", 1000, 12)[0]
+    tables = tables_of(MODEL)
+    (axis,) = tables.axes
+    ln_n, ln_k = (
+        np.linspace(axis.ln_min[PLACES[name]], axis.ln_max[PLACES[name]], 1500) for name in ("N", "K")
+    )  # at an interval of 1 s: sigma_v and sigma_w
+    ln_rho = np.linspace(ln_k[0] - ln_n[-1], ln_k[-1] - ln_n[0], 1500)
+    drift, lost, p = (np.zeros_like(ln_rho) for _ in range(3))
+    a, b, c, d = (np.zeros_like(ln_rho) for _ in range(4))
+    for reading in y:
+        p += np.exp(2.0 * ln_rho)
+        nu, u = reading - drift, 1.0 - lost
+        a, b, c, d = a + u**2 / (1.0 + p), b + u * nu / (1.0 + p), c + nu**2 / (1.0 + p), d + np.log1p(p)
+        drift, lost, p = drift + p / (1.0 + p) * nu, lost + p / (1.0 + p) * u, p / (1.0 + p)
+    ln_sigma, (a, b, c, d, ln_w) = ln_n, (x[:, None] for x in (a, b, c, d, ln_rho))
+    var = np.exp(2.0 * ln_sigma)
+    ln_p = -0.5 * (
+        len(y) * (math.log(2.0 * math.pi) + 2.0 * ln_sigma)
+        + d
+        + (c - b**2 / a) / var
+        + np.log1p(axis.bias_sd**2 * a / var)
+        + (b / a) ** 2 / (var / a + axis.bias_sd**2)
+    )
+    walk = ln_w + ln_sigma
+    ln_p = np.where((walk >= ln_k[0]) & (walk <= ln_k[-1]), ln_p, -np.inf)
+    weight = np.exp(ln_p - ln_p.max())
+    cell = (ln_rho[1] - ln_rho[0]) * (ln_n[1] - ln_n[0]) / ((ln_n[-1] - ln_n[0]) * (ln_k[-1] - ln_k[0]))
+    bank = Bank(tables)
+    push(bank, y)
+    report = bank.report(0)
+    posterior = report.parameters["random_walk"]
+    assert off_grid(bank, 0, report)
+    assert abs(report.log_evidence["random_walk"] - math.log(weight.sum() * cell) - ln_p.max()) <= REPORT_LIMIT[0]
+    for name, ln_value in (("N", np.broadcast_to(ln_sigma, weight.shape)), ("K", walk)):
+        mean = np.average(np.exp(ln_value), weights=weight)
+        sd = math.sqrt(np.average((np.exp(ln_value) - mean) ** 2, weights=weight))
+        assert abs(posterior[name].mean - mean) <= REPORT_LIMIT[1] * sd
+        assert abs(posterior[name].sd / sd - 1.0) <= REPORT_LIMIT[2]
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
-    """As measured above and in lib/posterior.c: 14 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too
-    few from the start, the others hold to 10^6. Parameters in the middle of the priors, none off the grid."""
+    """As measured in lib/posterior.c: 14 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too few from
+    the start, the others hold to 3e5. Parameters in the middle of the priors, none off the grid."""
     truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 100_000, 5)[0][:, None]
     found = {}
