@@ -380,6 +380,9 @@ static void step_values(selfcal_work_t *work) {
 #define FIT_MOST R(1e6)
 /* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
 #define UNSETTLED R(200.0)
+/* Less, by nats below the best node, where intervals are missing: what a node makes of the level on both sides of a gap depends on more than
+ * psi, and by some part in a hundred of those nats. */
+#define FAR R(0.033)
 
 /* Of ln omega, from 1/n to pi. */
 static selfcal_real_t line_step(selfcal_real_t weight) {
@@ -440,23 +443,29 @@ static void set_truth(selfcal_work_t *work) {
     expectation_t e;
     expectation(work, place.ln_rho, place.ln_alpha, &e);
     truth->ln_v = (selfcal_wide_t)e.ln_v; /* any that is near will do */
-    truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)truth->ln_v > WIDE_BEYOND;
+    truth->wide = (selfcal_real_t)work->bank->weight * e.ln_v > WIDE_BEYOND;
 }
 
-/* Of a node of the bank, of any law, ln of sigma_v's mode less its expectation: what all that have one see in the data is one thing. */
-static selfcal_wide_t off_expectation(selfcal_work_t *work, uint16_t k, expectation_t *e) {
+/* Of a node of the bank, of any law: ln of sigma_v's mode is less its expectation then, and the profile what it lacks to the best node's.
+ * What all nodes that have an expectation see in the data is one thing. */
+static void off_expectation(selfcal_work_t *work, uint16_t k, expectation_t *e) {
     const selfcal_place_t place = place_of(work, k);
     selfcal_wide_t unused;
     work->hypothesis = place.hypothesis;
     expectation(work, place.ln_rho, place.ln_alpha, e);
-    return node_field(work, k, work->n_eff, &unused).ln_sigma - (selfcal_wide_t)e->ln_sigma;
+    const field_t field = node_field(work, k, work->n_eff, &unused);
+    e->ln_sigma = (selfcal_real_t)(field.ln_sigma - (selfcal_wide_t)e->ln_sigma);
+    e->profile = (selfcal_real_t)(work->peak - field.profile);
 }
 
-static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_wide_t off) {
+static void add_row(selfcal_work_t *work, const expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
-    work->truth.pair = work->truth.pair || hypothesis_of(work)->alpha != NULL;
+    if (e->level > R(0.0)) {
+        work->truth.pair = true;
+    }
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n)), per_v = weight * e->per_v;
+    const selfcal_real_t far = work->bank->counters.blocks_lost == 0U ? R(0.0) : FAR * e->profile;
+    const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
     selfcal_real_t row[SELFCAL_FITTED + 1];
     memset(row, 0, sizeof row);
     for (unsigned m = 0; m < SELFCAL_LINES; m++) {
@@ -466,7 +475,7 @@ static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_wide_t
         row[ends] += share * e->edge * truth->power[ends];
         row[ends + 1U] += share * e->level * truth->power[ends + 1U];
     }
-    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * (selfcal_real_t)off), FIT_MOST);
+    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * (e->ln_sigma - work->ln_sigma_off)), FIT_MOST);
     rotate_in(&work->scratch.fit, row);
 }
 
@@ -477,13 +486,14 @@ static bool step_fit(selfcal_work_t *work) {
     expectation_t e;
     if (at == 0U) {
         set_truth(work);
-        work->ln_sigma_off = off_expectation(work, work->best_node, &e);
+        off_expectation(work, work->best_node, &e);
+        work->ln_sigma_off = e.ln_sigma;
         begin_fit(work);
         return false;
     }
-    const selfcal_wide_t off = off_expectation(work, (uint16_t)(at - 1U), &e) - work->ln_sigma_off;
+    off_expectation(work, (uint16_t)(at - 1U), &e);
     if (has_expectation(work)) {
-        add_row(work, &e, off);
+        add_row(work, &e);
     }
     return at == work->bank->model->nodes;
 }

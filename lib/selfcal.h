@@ -768,7 +768,7 @@ typedef struct {
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     uint16_t best_node;      /* of all: the likeliest */
-    selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
+    selfcal_real_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
     selfcal_truth_t truth;
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
