@@ -338,6 +338,9 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
             if (!has_expectation(work)) {
                 continue;
             }
+            if (hypothesis_of(work)->alpha != NULL) {
+                work->truth.pair = true;
+            }
         }
         selfcal_wide_t share;
         const field_t field = node_field(work, k, n - (selfcal_wide_t)work->unknowns, &share);
@@ -380,11 +383,11 @@ static void step_values(selfcal_work_t *work) {
 #define FIT_MOST R(1e6)
 /* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
 #define UNSETTLED R(200.0)
-/* Less, by nats below the best node, where intervals are missing: what a node makes of the level on both sides of a gap depends on more than
- * psi, and by some part in a hundred of those nats. */
+/* Less, by nats below the best node, where intervals are missing or regressors in use: what a node makes of the level on both sides of a
+ * gap, or of what the coefficients take up, depends on more than psi, and by some part in a hundred of those nats. */
 #define FAR R(0.033)
 
-/* Of ln omega, from 1/n to pi. */
+/* Of ln omega, from 1/n to 6, which stands for pi (begin_fit() below). */
 static selfcal_real_t line_step(selfcal_real_t weight) {
     return (R(1.7917595) + r_log(weight)) / (selfcal_real_t)(SELFCAL_LINES - 1);
 }
@@ -460,11 +463,8 @@ static void off_expectation(selfcal_work_t *work, uint16_t k, expectation_t *e) 
 
 static void add_row(selfcal_work_t *work, const expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
-    if (e->level > R(0.0)) {
-        work->truth.pair = true;
-    }
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t far = work->bank->counters.blocks_lost == 0U ? R(0.0) : FAR * e->profile;
+    const selfcal_real_t far = work->bank->counters.blocks_lost == 0U && work->mask == 0U ? R(0.0) : FAR * e->profile;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
     selfcal_real_t row[SELFCAL_FITTED + 1];
     memset(row, 0, sizeof row);
@@ -479,6 +479,11 @@ static void add_row(selfcal_work_t *work, const expectation_t *e) {
     rotate_in(&work->scratch.fit, row);
 }
 
+static void go_to(selfcal_work_t *work, int stage) {
+    work->stage = (uint8_t)stage;
+    work->at = 0;
+}
+
 /* First what made the data, then a node a step: its row is its variance over that expected, less that of the best node, by lines and edges
  * of their prior deviations. True after the last. */
 static bool step_fit(selfcal_work_t *work) {
@@ -486,6 +491,11 @@ static bool step_fit(selfcal_work_t *work) {
     expectation_t e;
     if (at == 0U) {
         set_truth(work);
+        if (!work->truth.pair) {
+            work->hypothesis = 0;
+            go_to(work, PEAK); /* the nodes of a random walk alone tell too little */
+            return false;
+        }
         off_expectation(work, work->best_node, &e);
         work->ln_sigma_off = e.ln_sigma;
         begin_fit(work);
@@ -1262,11 +1272,6 @@ static bool step_gather(selfcal_work_t *work) {
     }
     work->batches = work->bank->batches;
     return true;
-}
-
-static void go_to(selfcal_work_t *work, int stage) {
-    work->stage = (uint8_t)stage;
-    work->at = 0;
 }
 
 /* The box of the next pass, or of the sums. */

@@ -114,7 +114,7 @@ extern "C" {
 #endif
 
 /* Frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even in
- * their logarithm, from 1/n to pi a bank interval. Up to 0.5 nepers apart they do for the reports' tolerances; fewer: less time.
+ * their logarithm, from 1/n to the highest. Up to 0.5 nepers apart they do for the reports' tolerances; fewer: less time.
  * 8 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HYPOTHESIS_NODES_MAX + 16 SELFCAL_HISTOGRAM + 24 SELFCAL_REPORT_CELLS anyway. */
 #ifndef SELFCAL_LINES
 #define SELFCAL_LINES 36

@@ -18,7 +18,7 @@ from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.model import PLACES
 from selfcal.recording import load
-from selfcal.tables import make_tables
+from selfcal.tables import AxisTable, make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
@@ -63,14 +63,9 @@ def test_report_over_the_whole_prior(n: int) -> None:
     assert (found <= REPORT_LIMIT).all()
 
 
-def test_beyond_the_nodes() -> None:
-    """A random walk with a white noise so small that its most likely rho, 3.1, lies above the highest node: there the
-    expectation goes on alone, and holds as it does between nodes. (No grid of the library's judges that: all end where
-    the nodes do. So it is the exact likelihood, x0 integrated in closed form, over 1500 x 1500 values of the priors.)
-    """
-    y = a_record("random_walk", 1000, 12)[0]
-    tables = tables_of(MODEL)
-    (axis,) = tables.axes
+def walk_by_integration(y: Floats, axis: AxisTable) -> tuple[float, dict[str, tuple[float, float]]]:
+    """ln evidence of a random walk, mean and sd of its parameters: the exact likelihood, x0 integrated in closed form,
+    over 1500 x 1500 values of the priors. No grid of the library's judges what lies beyond its nodes."""
     ln_n, ln_k = (
         np.linspace(axis.ln_min[PLACES[name]], axis.ln_max[PLACES[name]], 1500) for name in ("N", "K")
     )  # at an interval of 1 s: sigma_v and sigma_w
@@ -82,30 +77,62 @@ def test_beyond_the_nodes() -> None:
         nu, u = reading - drift, 1.0 - lost
         a, b, c, d = a + u**2 / (1.0 + p), b + u * nu / (1.0 + p), c + nu**2 / (1.0 + p), d + np.log1p(p)
         drift, lost, p = drift + p / (1.0 + p) * nu, lost + p / (1.0 + p) * u, p / (1.0 + p)
-    ln_sigma, (a, b, c, d, ln_w) = ln_n, (x[:, None] for x in (a, b, c, d, ln_rho))
-    var = np.exp(2.0 * ln_sigma)
+    a, b, c, d, ln_w = (x[:, None] for x in (a, b, c, d, ln_rho))
+    var = np.exp(2.0 * ln_n)
     ln_p = -0.5 * (
-        len(y) * (math.log(2.0 * math.pi) + 2.0 * ln_sigma)
+        len(y) * (math.log(2.0 * math.pi) + 2.0 * ln_n)
         + d
         + (c - b**2 / a) / var
         + np.log1p(axis.bias_sd**2 * a / var)
         + (b / a) ** 2 / (var / a + axis.bias_sd**2)
     )
-    walk = ln_w + ln_sigma
+    walk = ln_w + ln_n
     ln_p = np.where((walk >= ln_k[0]) & (walk <= ln_k[-1]), ln_p, -np.inf)
     weight = np.exp(ln_p - ln_p.max())
     cell = (ln_rho[1] - ln_rho[0]) * (ln_n[1] - ln_n[0]) / ((ln_n[-1] - ln_n[0]) * (ln_k[-1] - ln_k[0]))
+    moments = {}
+    for name, value in (("N", np.exp(np.broadcast_to(ln_n, weight.shape))), ("K", np.exp(walk))):
+        mean = float(np.average(value, weights=weight))
+        moments[name] = mean, math.sqrt(np.average((value - mean) ** 2, weights=weight))
+    return float(math.log(weight.sum() * cell) + ln_p.max()), moments
+
+
+@pytest.mark.parametrize(("n", "seed", "only"), [(1000, 12, None), (10_000, 1, "random_walk")])
+def test_a_walk_by_integration(n: int, seed: int, only: str | None) -> None:
+    """A white noise so small that the most likely rho, 3.1, lies above the highest node, where the expectation goes on
+    alone; and a model of a random walk alone, whose nodes are too few for a fit."""
+    y = a_record("random_walk", n, seed)[0]
+    tables = tables_of(MODEL, only=only)
+    evidence, moments = walk_by_integration(y, tables.axes[0])
     bank = Bank(tables)
     push(bank, y)
     report = bank.report(0)
-    posterior = report.parameters["random_walk"]
-    assert off_grid(bank, 0, report)
-    assert abs(report.log_evidence["random_walk"] - math.log(weight.sum() * cell) - ln_p.max()) <= REPORT_LIMIT[0]
-    for name, ln_value in (("N", np.broadcast_to(ln_sigma, weight.shape)), ("K", walk)):
-        mean = np.average(np.exp(ln_value), weights=weight)
-        sd = math.sqrt(np.average((np.exp(ln_value) - mean) ** 2, weights=weight))
-        assert abs(posterior[name].mean - mean) <= REPORT_LIMIT[1] * sd
-        assert abs(posterior[name].sd / sd - 1.0) <= REPORT_LIMIT[2]
+    assert only is not None or off_grid(bank, 0, report)
+    assert abs(report.log_evidence["random_walk"] - evidence) <= REPORT_LIMIT[0]
+    for name, (mean, sd) in moments.items():
+        found = report.parameters["random_walk"][name]
+        assert abs(found.mean - mean) <= REPORT_LIMIT[1] * sd
+        assert abs(found.sd / sd - 1.0) <= REPORT_LIMIT[2]
+
+
+@pytest.mark.parametrize("what", ["stretches", "scattered", "regressors"])
+def test_report_of_what_no_one_spectrum_tells(what: str) -> None:
+    """Missing stretches, one sample in twenty missing anywhere, or six regressors: laws and nodes then see the data
+    each in their own way, and what the fit over all of them takes for the spectrum must not be forced on them."""
+    columns = 6 if what == "regressors" else 0
+    tables = tables_of(MODEL, columns=columns)
+    for law in ("random_walk", "gauss_markov"):
+        for seed in range(DRAWS):
+            y, z = a_record(law, 10_000, seed, gaps=what == "stretches", columns=columns)
+            if what == "scattered":
+                y[1:][np.random.default_rng(seed).random(len(y) - 1) < 0.05] = np.nan
+            judge, bank = Bank(dense(tables), dense=True), Bank(tables)
+            for each in (judge, bank):
+                push(each, y, z)
+            mask = (1 << columns) - 1
+            evidence, _, mean, sd = worst_difference(bank.report(0, mask), judge.report(0, mask))
+            print(f"{what} {law} {seed}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
+            assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
