@@ -25,6 +25,7 @@ from selfcal.verbs.simulate import simulate
 from agreement import (
     MODEL,
     REPORT_LIMIT,
+    Floats,
     a_record,
     dense,
     exact_report,
