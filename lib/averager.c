@@ -192,15 +192,14 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
         !(fabsf(self->shifted[axis] + amount) < SELFCAL_SAMPLE_MAX)) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    self->shifted[axis] += amount;
     if (selfcal_retired(self, axis)) {
-        self->shifted[axis] += amount;
         return SELFCAL_OK;
     }
     if (self->position > 0U && !self->dropped) {
         open_gap(self);
         drop_block(self);
     }
-    self->shifted[axis] += amount;
     if (self->started) {
         const float before = self->origin[axis], sum = before + amount;
         const float part = sum - before;

@@ -17,8 +17,7 @@
 #include "internal.h"
 
 /* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
-enum { GATHER, TRUTH, FIT, SOLVE, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE,
-       WHOLE };
+enum { GATHER, TRUTH, FIT, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_SCANNED_CELLS 24U
 #define STEP_SUMMED_CELLS 5U
@@ -387,12 +386,12 @@ static void step_values(selfcal_work_t *work) {
  * gap, or of what the coefficients take up, depends on more than psi, and by some part in a hundred of those nats. */
 #define FAR R(0.033)
 
-/* Of ln omega, from 1/n to 6, which stands for pi (begin_fit() below). */
+/* Of ln omega, from 1/n to 6, which stands for pi (set_lines() below). */
 static selfcal_real_t line_step(selfcal_real_t weight) {
     return (R(1.7917595) + r_log(weight)) / (selfcal_real_t)(SELFCAL_LINES - 1);
 }
 
-static void begin_fit(selfcal_work_t *work) {
+static void set_lines(selfcal_work_t *work) {
     selfcal_fit_t *fit = &work->scratch.fit;
     selfcal_truth_t *truth = &work->truth;
     memset(fit, 0, sizeof *fit);
@@ -479,36 +478,7 @@ static void add_row(selfcal_work_t *work, const expectation_t *e) {
     rotate_in(&work->scratch.fit, row);
 }
 
-static void go_to(selfcal_work_t *work, int stage) {
-    work->stage = (uint8_t)stage;
-    work->at = 0;
-}
-
-/* First what made the data, then a node a step: its row is its variance over that expected, less that of the best node, by lines and edges
- * of their prior deviations. True after the last. */
-static bool step_fit(selfcal_work_t *work) {
-    const uint16_t at = work->at++;
-    expectation_t e;
-    if (at == 0U) {
-        set_truth(work);
-        if (!work->truth.pair) {
-            work->hypothesis = 0;
-            go_to(work, PEAK); /* the nodes of a random walk alone tell too little */
-            return false;
-        }
-        off_expectation(work, work->best_node, &e);
-        work->ln_sigma_off = e.ln_sigma;
-        begin_fit(work);
-        return false;
-    }
-    off_expectation(work, (uint16_t)(at - 1U), &e);
-    if (has_expectation(work)) {
-        add_row(work, &e);
-    }
-    return at == work->bank->model->nodes;
-}
-
-static void step_solve(selfcal_work_t *work) {
+static void solve(selfcal_work_t *work) {
     selfcal_truth_t *truth = &work->truth;
     selfcal_real_t *mine = work->scratch.fit.triangle + SELFCAL_TRIANGLE, found[SELFCAL_FITTED];
     for (unsigned m = SELFCAL_FITTED; m-- > 0U;) {
@@ -520,6 +490,31 @@ static void step_solve(selfcal_work_t *work) {
         truth->power[m] *= found[m];
     }
     truth->fitted = true;
+}
+
+/* What made the data; then a node a step: its row is its variance over that expected, less that of the best node, by lines and edges of
+ * their prior deviations. False if there is nothing to fit; the nodes of a random walk alone tell too little. */
+static bool begin_fit(selfcal_work_t *work) {
+    if (!(work->peak > (selfcal_wide_t)-INFINITY)) {
+        return false;
+    }
+    set_truth(work);
+    if (!work->truth.pair) {
+        return false;
+    }
+    expectation_t e;
+    off_expectation(work, work->best_node, &e);
+    work->ln_sigma_off = e.ln_sigma;
+    set_lines(work);
+    return true;
+}
+
+static void step_fit(selfcal_work_t *work) {
+    expectation_t e;
+    off_expectation(work, work->at++, &e);
+    if (has_expectation(work)) {
+        add_row(work, &e);
+    }
 }
 
 /* ------------------------------------------------------------------------------------------------------------- cells */
@@ -1291,6 +1286,11 @@ static void step_box(selfcal_work_t *work) {
     }
 }
 
+static void go_to(selfcal_work_t *work, int stage) {
+    work->stage = (uint8_t)stage;
+    work->at = 0;
+}
+
 /* After a row of a pass: the next one, the next pass, or what follows the search. */
 static void next_scan(selfcal_work_t *work) {
     work->at = 0;
@@ -1336,21 +1336,20 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case TRUTH:
-        step_peak(work, work->bank->model->nodes);
-        if (work->at == work->bank->model->nodes) {
+        if (work->at < work->bank->model->nodes) {
+            step_peak(work, work->bank->model->nodes);
+        } else {
+            go_to(work, begin_fit(work) ? FIT : PEAK);
             work->hypothesis = 0;
-            go_to(work, work->peak > (selfcal_wide_t)-INFINITY ? FIT : PEAK);
         }
         break;
     case FIT:
-        if (step_fit(work)) {
+        step_fit(work);
+        if (work->at == work->bank->model->nodes) {
+            solve(work);
+            go_to(work, PEAK);
             work->hypothesis = 0;
-            work->stage = SOLVE;
         }
-        break;
-    case SOLVE:
-        step_solve(work);
-        go_to(work, PEAK);
         break;
     case PEAK:
         step_peak(work, nodes);

@@ -179,7 +179,6 @@ static void measure_report(void) {
         {"report.gather", "report.gather.worst_step", "report.gather.steps"},
         {"report.truth", "report.truth.worst_step", "report.truth.steps"},
         {"report.fit", "report.fit.worst_step", "report.fit.steps"},
-        {"report.solve", "report.solve.worst_step", "report.solve.steps"},
         {"report.peak", "report.peak.worst_step", "report.peak.steps"},
         {"report.sigma", "report.sigma.worst_step", "report.sigma.steps"},
         {"report.values", "report.values.worst_step", "report.values.steps"},

@@ -292,7 +292,6 @@ def table(bench: Bench) -> str:
         ("gather", "nodes over the last samples"),
         ("truth", "best node of all"),
         ("fit", "lines and edges, a row a node"),
-        ("solve", "… solved"),
         ("peak", "best node"),
         ("sigma", "cells of σv"),
         ("values", "node values"),

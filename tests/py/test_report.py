@@ -2,7 +2,8 @@
 
 The judge is the same code in double on 48 and 40 x 40 nodes with 192 cells, where neither counts any more: 64 and
 56 x 56 nodes give the same to 1e-4. That its sums are right is test_bank.py's business, that its posterior is,
-test_identify.py's. SELFCAL_DRAWS sets the records per law and length (default 4), SELFCAL_LENGTHS the lengths.
+test_identify.py's. SELFCAL_DRAWS sets the records per law and length (default 4), SELFCAL_LENGTHS the lengths,
+SELFCAL_MISSING the part of the samples that is missing where some are missing anywhere.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = "cortex-m0-small"
 DRAWS = int(os.environ.get("SELFCAL_DRAWS", "4"))
 LENGTHS = [int(float(n)) for n in os.environ.get("SELFCAL_LENGTHS", "10,100,1000,10000,100000").split(",")]
+MISSING = float(os.environ.get("SELFCAL_MISSING", "0.05"))
 
 
 @pytest.mark.parametrize("n", LENGTHS)
@@ -119,26 +121,29 @@ def test_a_walk_by_integration(n: int, seed: int, only: str | None) -> None:
 @pytest.mark.parametrize("what", ["stretches", "scattered", "regressors"])
 def test_report_of_what_no_one_spectrum_tells(what: str) -> None:
     """Missing stretches, one sample in twenty missing anywhere, or six regressors: laws and nodes then see the data
-    each in their own way, and what the fit over all of them takes for the spectrum must not be forced on them."""
+    each in their own way, and what the fit over all of them takes for the spectrum must not be forced on them. (Where
+    one in five is missing, it is: 3 records of 10 are then off, by 0.1 to 0.14 nat.)"""
     columns = 6 if what == "regressors" else 0
     tables = tables_of(MODEL, columns=columns)
+    found = []
     for law in ("random_walk", "gauss_markov"):
         for seed in range(DRAWS):
             y, z = a_record(law, 10_000, seed, gaps=what == "stretches", columns=columns)
             if what == "scattered":
-                y[1:][np.random.default_rng(seed).random(len(y) - 1) < 0.05] = np.nan
+                y[1:][np.random.default_rng(seed).random(len(y) - 1) < MISSING] = np.nan
             judge, bank = Bank(dense(tables), dense=True), Bank(tables)
             for each in (judge, bank):
                 push(each, y, z)
             mask = (1 << columns) - 1
             evidence, _, mean, sd = worst_difference(bank.report(0, mask), judge.report(0, mask))
             print(f"{what} {law} {seed}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
-            assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
+            found.append((evidence, mean, sd))
+    assert (np.array(found) <= REPORT_LIMIT).all()
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
     """As measured in lib/posterior.c: 14 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too few from
-    the start, the others hold to 3e5. Parameters in the middle of the priors, none off the grid."""
+    the start, the others hold to 1e5. Parameters in the middle of the priors, none off the grid."""
     truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 100_000, 5)[0][:, None]
     found = {}
