@@ -20,3 +20,6 @@ arm_fast = $(filter $(if $(findstring KERNEL_M4F,$(1)),$(filter-out %/kernel_flo
 # arm_objects FLAGS,SOURCES: objects of the sources (absolute paths) in the working directory.
 arm_objects = arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1) -c $(call arm_fast,$(1),$(2)) && \
 	arm-none-eabi-gcc -Os $(ARM_COMPILE) $(1) -c $(filter-out $(call arm_fast,$(1),$(2)),$(2))
+
+# What a replayed recording needs of the application: the board's sensor, with rates of its own, is left out.
+APP_WITHOUT_SENSOR := $(filter-out port/app/module.c port/app/sensor.c,$(wildcard port/app/*.c))

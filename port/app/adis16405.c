@@ -229,12 +229,10 @@ bool adis16405_init(adis16405_t *self, const adis16405_bus_t *bus, const adis164
 {
     memset(self, 0, sizeof *self);
     self->bus = bus;
-    const float divider = 1638.4F / config->rate_hz;
-    const uint32_t n = divider >= 1.0F && divider < 129.0F ? (uint32_t)(divider + 0.5F) : 0U;
-    const float error = divider - (float)n;
-    if (n < 1U || n > 128U || error > 1e-3F * divider || error < -1e-3F * divider || config->filter_taps_ln2 > 4U) {
+    if (!ADIS16405_HAS_RATE(config->rate_hz) || config->filter_taps_ln2 > 4U) {
         return false;
     }
+    const uint32_t n = ADIS16405_DIVIDER(config->rate_hz);
     self->sample_period = (uint16_t)(n - 1U);
     self->nominal_q8 = (uint32_t)(256.0F * 1e6F / 1638.4F * (float)n + 0.5F);
     self->period_q8 = self->nominal_q8;

@@ -25,6 +25,14 @@
 #define ADIS16405_AXES 6U         /* gx gy gz ax ay az */
 #define ADIS16405_BURST_WORDS 12U /* supply, 3 gyro, 3 accel, 3 magn, temperature, aux */
 
+/* The sensor makes 1638.4 / n Hz, n = 1 .. 128: the nearest n of a rate up to 1638.4 Hz, and whether that makes it to 0.1 %. Constant
+ * expressions where the rate is one. */
+#define ADIS16405_DIVIDER(rate_hz) ((uint32_t)(1638.4F / (rate_hz) + 0.5F))
+#define ADIS16405_OFF(rate_hz) (1638.4F / (rate_hz) - (float)ADIS16405_DIVIDER(rate_hz))
+#define ADIS16405_HAS_RATE(rate_hz) \
+    (1638.4F / (rate_hz) >= 1.0F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) && \
+     ADIS16405_OFF(rate_hz) >= -1.6384F / (rate_hz))
+
 /* Samples that wait for the main loop: 1.25 s at 819.2 Hz. A power of two; 16 bytes each. */
 #ifndef ADIS16405_QUEUE
 #define ADIS16405_QUEUE 1024U
@@ -78,7 +86,7 @@ typedef struct {
 } adis16405_counters_t;
 
 typedef struct {
-    float rate_hz;           /* 1638.4 / n, n = 1 .. 128 */
+    float rate_hz;           /* one that ADIS16405_HAS_RATE */
     uint16_t range_deg_s;    /* 300, 150 or 75 */
     uint8_t filter_taps_ln2; /* Bartlett filter of 2^m taps, 0 to 4 */
 } adis16405_config_t;

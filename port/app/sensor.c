@@ -2,6 +2,8 @@
 
 /* Two bursts, 634 us, must fit a sample period. */
 typedef char the_rate_can_be_read[(int)SELFCAL_MODEL_RATE_HZ < 1000 ? 1 : -1];
+/* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no quotient of floats.) */
+static const int the_sensor_makes_the_rate = 1 / ADIS16405_HAS_RATE(SELFCAL_MODEL_RATE_HZ);
 
 static adis16405_t sensor;
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
@@ -16,7 +18,7 @@ bool sensor_init(const adis16405_bus_t *bus)
         channel[axis] = (uint8_t)at;
     }
     const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
-    return adis16405_init(&sensor, bus, &config);
+    return the_sensor_makes_the_rate != 0 && adis16405_init(&sensor, bus, &config);
 }
 
 void sensor_ready(void)

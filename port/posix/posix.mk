@@ -3,7 +3,7 @@
 include port/arm.mk
 
 POSIX_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion
-POSIX_SOURCES := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/posix/*.c)
+POSIX_SOURCES := $(wildcard lib/*.c port/replay/*.c port/posix/*.c) $(APP_WITHOUT_SENSOR)
 POSIX_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/posix/*.h)
 
 .PHONY: posix

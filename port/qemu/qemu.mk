@@ -3,7 +3,7 @@
 
 include port/arm.mk
 
-QEMU_SOURCES := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/qemu/*.c) $(MODEL_DIR)/selfcal_model.c
+QEMU_SOURCES := $(wildcard lib/*.c port/replay/*.c port/qemu/*.c) $(APP_WITHOUT_SENSOR) $(MODEL_DIR)/selfcal_model.c
 QEMU_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/qemu/*.h) $(MODEL_DIR)/selfcal_model.h
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT

@@ -19,6 +19,7 @@ from firmware import ROOT, image
 from selfcal import recording as recording_module
 from selfcal.model import Model
 from selfcal.recording import load
+from selfcal.verbs.codegen import codegen
 from selfcal.verbs.command import build_flag
 from selfcal.verbs.replay import TARGETS, build, emulator, write_rows
 from selfcal.wire import load_dbc
@@ -190,12 +191,42 @@ def test_images_of_the_guide_keep_the_budgets(target: str, flags: str) -> None:
 )
 def test_options_that_cannot_work_do_not_compile(source: str, flag: str, complaint: str) -> None:
     target, core = ("cortex-m0", "cortex-m0") if "cortex-m0" in source else ("stm32f405", "cortex-m4f")
-    folders = [f"-I{folder}" for folder in ("lib", "port", "port/app", f"build/{target}/model")]
-    compiler = ["arm-none-eabi-gcc", "-std=c99", "-mthumb", *CORES[core], *folders, "-fsyntax-only", f"port/{source}"]
-    subprocess.run(compiler, cwd=ROOT, check=True)
-    done = subprocess.run([*compiler, flag], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert complaint in done.stderr
+    model = ROOT / "build" / target / "model"
+    assert said_of(source, model, core) == ""
+    assert complaint in said_of(source, model, core, flag)
+
+
+def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str) -> str:
+    """What the compiler has against a source with the model of a folder; it fails if that is anything."""
+    folders = [f"-I{folder}" for folder in ("lib", "port", "port/app", model)]
+    compiler = ["arm-none-eabi-gcc", "-std=c99", "-mthumb", "-Wall", "-Wextra", "-Wpedantic", *CORES[core], *folders]
+    command = [*compiler, "-fsyntax-only", f"port/{source}", *flags]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode != 0) == (done.stderr != "")
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("source", "old", "new", "complaint"),
+    [
+        ("app/app.c", "", "", ""),
+        # by 1638.4 / n Hz, n = 1 .. 128, of the data sheet, to 0.1 %
+        ("app/sensor.c", "819.2", "546.1", ""),
+        ("app/sensor.c", "819.2", "12.8", ""),
+        ("app/sensor.c", "819.2", "12.7", "the_sensor_makes_the_rate"),
+        ("app/sensor.c", "819.2", "821.0", "the_sensor_makes_the_rate"),
+        ("app/sensor.c", "819.2", "100.0", "the_sensor_makes_the_rate"),
+        ("app/sensor.c", "819.2", "1638.4", "the_rate_can_be_read"),
+    ],
+)
+def test_models_that_the_board_cannot_keep_do_not_compile(
+    source: str, old: str, new: str, complaint: str, tmp_path: Path
+) -> None:
+    (tmp_path / "model.yaml").write_text(Model.load().path.read_text().replace(old, new))
+    codegen(tmp_path / "model.yaml", tmp_path, target="cortex-m4f")
+    said = said_of(source, tmp_path)
+    assert complaint in said
+    assert (said == "") == (complaint == "")
 
 
 @pytest.mark.usefixtures("images")

@@ -281,6 +281,14 @@ def test_model_in_other_units_than_the_wire(tmp_path: Path) -> None:
     assert_one_line(command(SHIPPED, "--model", tmp_path / "model.yaml"), "telemetry carries it in deg/s")
 
 
+def test_a_rate_that_no_board_has(tmp_path: Path) -> None:
+    """Faster than the board's sensor can be read: a recording has no sensor."""
+    gx = 0.1 * np.random.default_rng(3).normal(size=20_000)
+    recording_module.save(tmp_path / "fast.npz", {"gx": ("deg/s", gx)}, 2000.0, {})
+    document = replay(tmp_path / "fast.npz", report_every=10.0)
+    assert document["axes"]["gx"]["bias_now"]["mean"] == pytest.approx(gx.mean(), abs=0.01)
+
+
 def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     log = part_of_shipped(tmp_path / "part.npz", 60.0)
     for option in ("--plot", "--json"):
