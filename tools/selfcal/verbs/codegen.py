@@ -30,14 +30,18 @@ def codegen(
     """
     loaded = Model.load(model)
     tables = make_tables(loaded, rate or loaded.sensor_rate_hz, tuple(axes) if axes else None, target)
-    folder = Path(output)
+    write_tables(loaded, tables, Path(output))
+    return tables
+
+
+def write_tables(model: Model, tables: Tables, folder: Path) -> None:
+    """Write both files into `folder`. Raises UserError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "selfcal_model.h").write_text(_header(loaded, tables))
-        (folder / "selfcal_model.c").write_text(_source(loaded, tables))
+        (folder / "selfcal_model.h").write_text(_header(model, tables))
+        (folder / "selfcal_model.c").write_text(_source(model, tables))
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
-    return tables
 
 
 def _header(model: Model, tables: Tables) -> str:

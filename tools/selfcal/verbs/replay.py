@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import math
+import re
 import shutil
 import socket
 import subprocess
@@ -24,7 +25,7 @@ from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.tables import bank_block, gate_table, make_tables
-from selfcal.verbs.codegen import codegen
+from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import (
     Identified,
     chosen_axes,
@@ -142,7 +143,7 @@ def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         made = Path(name)
-        codegen(model.path, made, target=core, rate=rate_hz, axes=axes)
+        write_tables(model, make_tables(model, rate_hz, tuple(axes), core), made)
         digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(made.iterdir()))).hexdigest()[:12]
         folder = ROOT / "build" / made_by.make / (digest if target == "host" else f"{target}-{digest}")
         folder.mkdir(parents=True, exist_ok=True)
@@ -160,9 +161,14 @@ def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host
             except OSError as error:
                 raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
             if done.returncode != 0:
-                first = next((line for line in done.stderr.splitlines() if line.strip()), "make failed")
-                raise UserError(f"cannot build the firmware: {first}")
+                raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
     return folder / made_by.image
+
+
+def _complaint(said: str) -> str:
+    """The compiler's first error in what `make` said, else the first line: a linker's, or make's own."""
+    error = re.search(r":\d+: (?:fatal )?error: (.+)", said)
+    return error[1] if error else next((line for line in said.splitlines() if line.strip()), "make failed")
 
 
 def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
