@@ -16,6 +16,9 @@
 #if SELFCAL_MODEL_REGRESSORS > 0 || SELFCAL_MODEL_TERM_NODES > 0
 #error "this application gives its bank no regressors, and its telemetry has no items for laws that are sums"
 #endif
+#if !SELFCAL_MODEL_UNITS_SENT
+#error "each axis of the model must be one that telemetry has a message for, in the unit that it has there (lib/selfcal.dbc)"
+#endif
 
 /* Milliseconds between corrected samples on the wire (message CORRECTED); 0: none, and none of their memory, a report an axis. */
 #ifndef APP_CORRECTED_MS

@@ -210,6 +210,9 @@ def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str) -> 
     ("source", "old", "new", "complaint"),
     [
         ("app/app.c", "", "", ""),
+        ("app/app.c", "unit: deg/s", "unit: rad/s", "each axis of the model must be one that telemetry has"),
+        ("app/app.c", "unit: m/s^2", "unit: mg", "each axis of the model must be one that telemetry has"),
+        ("app/app.c", "[gx, gy, gz]", "[gx, gy, w]", "each axis of the model must be one that telemetry has"),
         # by 1638.4 / n Hz, n = 1 .. 128, of the data sheet, to 0.1 %
         ("app/sensor.c", "819.2", "546.1", ""),
         ("app/sensor.c", "819.2", "12.8", ""),

@@ -55,6 +55,11 @@ def axis_unit(axis: str) -> str:
     return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name("bias_mean").unit or ""
 
 
+def carries(axis: str, unit: str) -> bool:
+    """Whether telemetry has a message for the axis, in this unit."""
+    return axis in AXES and axis_unit(axis) == unit
+
+
 def signal_unit(axis: str, signal: str) -> str:
     """Unit of one signal of an axis message."""
     return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name(signal).unit or ""

@@ -9,6 +9,7 @@ from pathlib import Path
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
 from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
+from selfcal.wire import carries
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
@@ -71,6 +72,8 @@ def _header(model: Model, tables: Tables) -> str:
      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+/* 1: every axis is one of lib/selfcal.dbc, in the unit that it has there. The library alone takes any. */
+#define SELFCAL_MODEL_UNITS_SENT {int(all(carries(axis.name, axis.unit) for axis in tables.axes))}
 /* 1: selfcal_model_gate is there. */
 #define SELFCAL_MODEL_GATE {int(gate_table(model, tables) is not None)}
 
