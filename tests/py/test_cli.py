@@ -85,6 +85,19 @@ def test_faults_are_one_line(tmp_path: Path, arguments: list[str], expected: str
     assert one_error(*arguments, cwd=tmp_path).startswith(expected)
 
 
+def test_a_gate_that_codegen_leaves_out_is_named(tmp_path: Path) -> None:
+    """It works on windows of two samples or more within a bank interval."""
+    text = (ROOT / "tools" / "selfcal" / "models" / "default.yaml").read_text()
+    complaint = "model.yaml: `gate` is left out: a bank interval is one sample"
+    for bank_hz, said, gate in ((819.2, complaint, 0), (409.6, "", 1)):
+        (tmp_path / "model.yaml").write_text(text.replace("bank_rate_hz: 1.0", f"bank_rate_hz: {bank_hz}"))
+        done = run("codegen", "model.yaml", "-o", "made", cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (0, "")
+        assert done.stderr.startswith(said)
+        assert done.stderr.count("\n") == 1 - gate
+        assert f"#define SELFCAL_MODEL_GATE {gate}\n" in (tmp_path / "made" / "selfcal_model.h").read_text()
+
+
 BAD = {
     "empty": ("", "bad.csv: the file is empty"),
     "header only": ("t[s],gx[deg/s]\n", "bad.csv: line 1: there is a header but no rows"),

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from rich.console import Console
+
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
 from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
@@ -26,12 +28,15 @@ def codegen(
     """Write `selfcal_model.h` and `selfcal_model.c` into the folder `output` and return what they hold.
 
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
-    is a subset of the model's.
+    is a subset of the model's. Says so on stderr if the model's gate is left out.
     Raises UserError for a bad model file or a folder that cannot be written.
     """
     loaded = Model.load(model)
     tables = make_tables(loaded, rate or loaded.sensor_rate_hz, tuple(axes) if axes else None, target)
     write_tables(loaded, tables, Path(output))
+    if loaded.gate is not None and gate_table(loaded, tables) is None:
+        said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
+        Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables
 
 
