@@ -532,7 +532,7 @@ static bool compute(app_t *app)
 #if APP_CORRECTED_MS
     if (app->worked_out) {
         app->last_report[app->report.axis] = app->report;
-        app->has_report[app->report.axis] = true;
+        app->has_report[app->report.axis] = isfinite(app->report.bias_mean); /* it is NaN if the record lies outside the priors */
         app->rests_on[app->report.axis] = app->gathered_at;
     }
 #endif

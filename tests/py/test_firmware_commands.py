@@ -413,6 +413,28 @@ def test_corrected_samples_are_of_sound_samples() -> None:
     assert corrected(board, since) != []
 
 
+def test_an_axis_outside_the_priors_has_no_bias() -> None:
+    """ax shakes with 65 m/s^2, 130 times the largest N, and without the gate: its report has no number, so there is no
+    corrected sample of it and nothing to write to the sensor; the other axes go on."""
+    board = Board(image(**ORDERS | {"name": "loud", "flags": f"{FLAGS} -DBOARD_GATE=0"}), seed=36)
+    rest, noise = board.sensor.source, random.Random(37)
+    board.sensor.source = lambda k: (*rest(k)[:3], noise.gauss(0.0, 2000.0), *rest(k)[4:])
+    board.run(7.0)
+    found = {report.axis: report for report in reports(messages(board))[1] if report.complete}
+    assert sorted(found) == sorted(AXES)
+    numbers = ("bias_mean", "bias_sd", "constant_probability", "random_walk_probability")
+    assert all(math.isnan(found["ax"].value(name)) for name in numbers)
+    since = len(board.frames)
+    assert obey(board, "write_offsets", 1 << AXES.index("ax"), seconds=1.0) == [RESULT["not_now"]]
+    assert obey(board, "write_offsets", 1 << AXES.index("gx"), seconds=1.0) == [RESULT["done"]]
+    samples = corrected(board, since)
+    assert len(samples) > 5
+    for sample in samples:
+        assert "corrected_ax" not in sample
+        assert "sd_ax" not in sample
+        assert all(math.isfinite(sample[f"corrected_{axis}"]) for axis in AXES if axis != "ax")
+
+
 def test_offsets_are_written_and_taken_out_of_the_estimate() -> None:
     """The bias goes to the sensor's registers, nearest step: its readings go down by that, the next report's bias too,
     with all that was learnt; the corrected output goes on, and the gate sees no motion. Kept through a restart of the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -18,9 +19,12 @@ from test_wire import spoil
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import Decoder, Link
+from selfcal.wire import AxisReport, Decoder, Link
 
 from wire_stream import lines, message, serial_line, stream
+
+#: What an axis's report has no number for where the record lies outside the priors.
+NO_NUMBER = ("bias_mean", "bias_sd", "constant_probability", "random_walk_probability", "gauss_markov_probability")
 
 
 def text_of(sent_lines: list[str]) -> bytes:
@@ -147,6 +151,21 @@ def test_view_shows_what_did_not_arrive_as_missing(monkeypatch: pytest.MonkeyPat
     assert "? ± ? deg/s" in picture
     law = max(("constant", "random_walk", "gauss_markov"), key=lambda name: second.truth[f"{name}_probability"])
     assert f"N {second.truth[f'{law}_N_median']:.3g} [" in picture
+
+
+def test_view_of_a_record_outside_the_priors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module has no number for what it was to find: neither missing nor some law's."""
+    monkeypatch.setenv("COLUMNS", "200")
+    report = AxisReport("gx", 1.0, True, {"count": 600.0} | dict.fromkeys(NO_NUMBER, math.nan))
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(Decoder(), Link(bus), "test")
+        view.show([report])
+        picture = shown(view)
+    assert "- ± - deg/s" in picture
+    assert "outside the priors" in picture
+    assert "600" in picture
+    assert "?" not in picture
+    assert "nan" not in picture
 
 
 def test_monitor_function_raises_user_errors() -> None:

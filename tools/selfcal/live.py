@@ -32,7 +32,8 @@ NEW_LINE = "\n"
 class View:
     """The last report of each axis, with its bank samples under its name, the module's state and the frame counts.
 
-    A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value.
+    A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value, and
+    what the module has no number for as `-`.
     """
 
     def __init__(self, decoder: Decoder, link: Link, title: str, total_s: float | None = None) -> None:
@@ -81,11 +82,11 @@ class View:
         table.add_column("bias now")
         for axis, report in self._last.items():
             health = " ".join(name for name in HEALTH if report.values.get(name))
-            mean, sd = _number(report.value("bias_mean"), "%.5g"), _number(report.value("bias_sd"), "%.2g")
+            mean, sd = _number(report, "bias_mean", "%.5g"), _number(report, "bias_sd", "%.2g")
             bias = f"{mean}{' ' if wide else NEW_LINE}± {sd} {signal_unit(axis, 'bias_mean')}"
             table.add_row(
-                f"{axis}{NEW_LINE}{_number(report.value('count'), '%.0f')}",
-                *(_bar(report.value(f"{law}_probability"), wide) for law in laws),
+                f"{axis}{NEW_LINE}{_number(report, 'count', '%.0f')}",
+                *(_bar(report, f"{law}_probability", wide) for law in laws),
                 _parameters(report),
                 Text.assemble(bias, (f"{NEW_LINE}{health}" if health else "", "red")),
             )
@@ -107,13 +108,15 @@ def most_probable(report: AxisReport) -> str | None:
     return max(known, key=lambda law: known[law]) if known else None
 
 
-def _number(value: float, form: str) -> str:
-    return "?" if math.isnan(value) else form % value
+def _number(report: AxisReport, signal: str, form: str) -> str:
+    value = report.values.get(signal)
+    return "?" if value is None else "-" if math.isnan(value) else form % value
 
 
-def _bar(probability: float, wide: bool) -> Text:
+def _bar(report: AxisReport, signal: str, wide: bool) -> Text:
+    probability = report.value(signal)
     if math.isnan(probability):
-        return Text("?")
+        return Text(_number(report, signal, ""))
     filled = round(probability * BAR)
     bar = f" {'█' * filled}{'·' * (BAR - filled)}" if wide else ""
     return Text(f"{probability:.3f}{bar}", "bold" if probability >= 0.5 else "")
@@ -123,10 +126,12 @@ def _parameters(report: AxisReport) -> str:
     law = most_probable(report)
     if law is None:
         return "?"
+    if math.isnan(report.values[f"{law}_probability"]):
+        return "outside the priors"
     rows = []
     for parameter in LAWS[law]:
         name = f"{law}_{parameter}"
-        middle, low, high = (_number(report.value(f"{name}_{key}"), "%.3g") for key in ("median", "q05", "q95"))
+        middle, low, high = (_number(report, f"{name}_{key}", "%.3g") for key in ("median", "q05", "q95"))
         unit = signal_unit(report.axis, f"{name}_median").replace("sqrt(Hz)", "√Hz")
         rows.append(f"{parameter} {middle} \\[{low}, {high}] {unit}")
     return "\n".join(rows)
