@@ -47,7 +47,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
     selfcal_real_t mean = R(0.0), var = R(0.0);
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_real_t p = (selfcal_real_t)report->hypothesis[h].probability;
-        if (p > R(0.0)) { /* else its moments may be NaN */
+        if (p != R(0.0)) { /* else its moments may be NaN */
             law[h] = predict_law(model->hypothesis[h].law, &report->hypothesis[h], (selfcal_real_t)elapsed_s);
             law[h].mean -= now;
             mean = r_fma(p, law[h].mean, mean);
@@ -55,7 +55,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_real_t p = (selfcal_real_t)report->hypothesis[h].probability;
-        if (p > R(0.0)) {
+        if (p != R(0.0)) {
             const selfcal_real_t off = law[h].mean - mean;
             var = r_fma(p, r_fma(off, off, law[h].var), var);
         }

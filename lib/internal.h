@@ -193,6 +193,12 @@ typedef struct {
     selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
 
+/* What a report takes of one node: ln of sigma_v's mode, profile ln-likelihood, the share of samples that went into the bias (and the
+ * coefficients), and the sum of ln s. */
+typedef struct {
+    selfcal_wide_t ln_sigma, profile, share, ln_s;
+} selfcal_field_t;
+
 /* forgetting.c, for a model that forgets. */
 struct selfcal_forgetting_code {
     /* Of the sums, as the batch that waits comes after what they hold. */
@@ -227,10 +233,8 @@ struct selfcal_regressors_code {
     void (*gap)(selfcal_t *self, size_t j, selfcal_wide_t less);
     /* Forgetting, of its own sums: the readings times `part`, the column "1" times `part_of_one`. */
     void (*fade)(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one);
-    /* With the regressors of a report in use: ln of sigma_v's mode, profile ln-likelihood and the share of samples that went into the
-     * bias and the coefficients, of one node; the residual is `least` at least. */
-    void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_wide_t *ln_sigma,
-                  selfcal_wide_t *profile, selfcal_wide_t *share);
+    /* Of one node, with the regressors of a report in use; the residual is `least` at least. */
+    void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_field_t *field);
     /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);

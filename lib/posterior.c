@@ -187,6 +187,7 @@ static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfc
     const selfcal_real_t beta = beta_at(work, ln_alpha), n = (selfcal_real_t)work->bank->weight;
     selfcal_real_t gain, p;
     selfcal_wide_t ln_v, ln_s;
+    ln_rho -= truth->ln_noise;
     if (truth->wide) {
         const expected_t_wide wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
         gain = (selfcal_real_t)wide.gain;
@@ -212,18 +213,14 @@ static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfc
     if (truth->fitted) {
         ln_v += (selfcal_wide_t)r_log1p(r_fmax(fitted(truth, e) * e->per_v, R(-0.99)));
     }
-    e->profile = (selfcal_real_t)(-0.5 * work->bank->weight * (ln_v - truth->ln_v));
+    e->profile = (selfcal_real_t)(-0.5 * work->bank->weight * (ln_v - (selfcal_wide_t)truth->ln_v));
     e->ln_sigma = (selfcal_real_t)(0.5 * (ln_v - ln_s));
 }
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
 
-typedef struct {
-    selfcal_wide_t ln_sigma, profile;
-} field_t;
-
-/* Profile ln-likelihood of the hypothesis's node k and ln of the conditional mode of sigma_v, for the given n_eff. */
-static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_wide_t *bias_share) {
+/* Of the hypothesis's node k, for the given n_eff. */
+static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_field_t *field) {
     const selfcal_t *bank = work->bank;
     const uint16_t index = (uint16_t)(work->first_node + k);
     const selfcal_wide_t n = bank->weight;
@@ -232,21 +229,19 @@ static field_t node_field(selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff
     /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior. */
     const selfcal_wide_t floor_sd = 1e-9 * sd, least = n_eff * floor_sd * floor_sd;
     if (work->mask != 0U) {
-        field_t field;
-        bank->model->regressors->code->field(work, index, n_eff, least, &field.ln_sigma, &field.profile, bias_share);
-        return field;
+        bank->model->regressors->code->field(work, index, n_eff, least, field);
+        return;
     }
     selfcal_node_view_t v;
     selfcal_bank_view(bank, work->axis, index, &v);
     const selfcal_wide_t residual = fmax(v.c - v.b * v.b / v.a, least);
     const selfcal_wide_t var = residual / n_eff;
     const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis);
-    field_t field;
-    field.ln_sigma = 0.5 * log(var);
-    field.profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field.ln_sigma) + v.ln_s + n_eff +
-                            bank->beginning * (log1p(p0 * v.a / var) + miss * miss / (var / v.a + p0)));
-    *bias_share = p0 * v.a / (p0 * v.a + var);
-    return field;
+    field->ln_sigma = 0.5 * log(var);
+    field->ln_s = v.ln_s;
+    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field->ln_sigma) + v.ln_s + n_eff +
+                             bank->beginning * (log1p(p0 * v.a / var) + miss * miss / (var / v.a + p0)));
+    field->share = p0 * v.a / (p0 * v.a + var);
 }
 
 /* delta + e^(-2 delta)/2 - 1/2; by its series where that would cancel. */
@@ -332,20 +327,20 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
         work->n_eff = n - (selfcal_wide_t)work->unknowns;
     }
     for (uint16_t k = part(work, step_nodes(work), nodes); k < work->at; k++) {
-        if (work->stage == TRUTH) {
-            work->hypothesis = place_of(work, k).hypothesis;
-            if (!has_expectation(work)) {
-                continue;
-            }
-            if (hypothesis_of(work)->alpha != NULL) {
-                work->truth.pair = true;
-            }
+        work->hypothesis = place_of(work, k).hypothesis;
+        selfcal_field_t field;
+        node_field(work, k, n - (selfcal_wide_t)work->unknowns, &field);
+        if (hypothesis_of(work)->rho == NULL) {
+            work->truth.ln_noise = (selfcal_real_t)(0.5 * field.ln_s / n);
         }
-        selfcal_wide_t share;
-        const field_t field = node_field(work, k, n - (selfcal_wide_t)work->unknowns, &share);
+        if (has_expectation(work)) {
+            work->truth.pair = work->truth.pair || hypothesis_of(work)->alpha != NULL;
+        } else if (work->stage == TRUTH) {
+            continue;
+        }
         if (field.profile > work->peak) {
             work->peak = field.profile;
-            work->n_eff = n - share;
+            work->n_eff = n - field.share;
             work->best_node = k;
         }
     }
@@ -356,8 +351,8 @@ static void step_values(selfcal_work_t *work) {
     for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         const selfcal_place_t place = place_of(work, k);
         expectation_t e;
-        selfcal_wide_t unused;
-        const field_t exact = node_field(work, k, work->n_eff, &unused);
+        selfcal_field_t exact;
+        node_field(work, k, work->n_eff, &exact);
         expectation(work, place.ln_rho, place.ln_alpha, &e);
         work->scratch.grid.field[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)e.profile);
         work->scratch.grid.field[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)e.ln_sigma);
@@ -382,8 +377,9 @@ static void step_values(selfcal_work_t *work) {
 #define FIT_MOST R(1e6)
 /* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
 #define UNSETTLED R(200.0)
-/* Less, by nats below the best node, where intervals are missing or regressors in use: what a node makes of the level on both sides of a
- * gap, or of what the coefficients take up, depends on more than psi, and by some part in a hundred of those nats. */
+/* Less, by nats below the best node, where intervals or samples are missing, the rate has changed, or regressors are in use: what a node makes
+ * of the level on both sides of a gap, of noise that varies, or of what the coefficients take up, depends on more than psi, and by some
+ * part in a hundred of those nats. */
 #define FAR R(0.033)
 
 /* Of ln omega, from 1/n to 6, which stands for pi (set_lines() below). */
@@ -431,39 +427,22 @@ static void rotate_in(selfcal_fit_t *fit, selfcal_real_t row[SELFCAL_FITTED + 1]
 
 /* Takes the best node as what made the data. A drift slower than the record looks like a random walk within it, and its level
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
-static void set_truth(selfcal_work_t *work) {
-    const selfcal_place_t place = place_of(work, work->best_node);
-    work->hypothesis = place.hypothesis;
+static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
-    const selfcal_real_t variance = r_exp(R(2.0) * place.ln_rho);
+    const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - work->truth.ln_noise));
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
     selfcal_truth_t *truth = &work->truth;
     truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
     truth->rate = -r_expm1(-slow);
-    expectation_t e;
-    expectation(work, place.ln_rho, place.ln_alpha, &e);
-    truth->ln_v = (selfcal_wide_t)e.ln_v; /* any that is near will do */
-    truth->wide = (selfcal_real_t)work->bank->weight * e.ln_v > WIDE_BEYOND;
 }
 
-/* Of a node of the bank, of any law: ln of sigma_v's mode is less its expectation then, and the profile what it lacks to the best node's.
- * What all nodes that have an expectation see in the data is one thing. */
-static void off_expectation(selfcal_work_t *work, uint16_t k, expectation_t *e) {
-    const selfcal_place_t place = place_of(work, k);
-    selfcal_wide_t unused;
-    work->hypothesis = place.hypothesis;
-    expectation(work, place.ln_rho, place.ln_alpha, e);
-    const field_t field = node_field(work, k, work->n_eff, &unused);
-    e->ln_sigma = (selfcal_real_t)(field.ln_sigma - (selfcal_wide_t)e->ln_sigma);
-    e->profile = (selfcal_real_t)(work->peak - field.profile);
-}
-
-static void add_row(selfcal_work_t *work, const expectation_t *e) {
+static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t off, selfcal_real_t deficit) {
     const selfcal_truth_t *truth = &work->truth;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t far = work->bank->counters.blocks_lost == 0U && work->mask == 0U ? R(0.0) : FAR * e->profile;
+    const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->ln_noise == R(0.0);
+    const selfcal_real_t far = even ? R(0.0) : FAR * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
     selfcal_real_t row[SELFCAL_FITTED + 1];
     memset(row, 0, sizeof row);
@@ -474,7 +453,7 @@ static void add_row(selfcal_work_t *work, const expectation_t *e) {
         row[ends] += share * e->edge * truth->power[ends];
         row[ends + 1U] += share * e->level * truth->power[ends + 1U];
     }
-    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * (e->ln_sigma - work->ln_sigma_off)), FIT_MOST);
+    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * off), FIT_MOST);
     rotate_in(&work->scratch.fit, row);
 }
 
@@ -492,28 +471,33 @@ static void solve(selfcal_work_t *work) {
     truth->fitted = true;
 }
 
-/* What made the data; then a node a step: its row is its variance over that expected, less that of the best node, by lines and edges of
- * their prior deviations. False if there is nothing to fit; the nodes of a random walk alone tell too little. */
-static bool begin_fit(selfcal_work_t *work) {
-    if (!(work->peak > (selfcal_wide_t)-INFINITY)) {
-        return false;
-    }
-    set_truth(work);
-    if (!work->truth.pair) {
-        return false;
-    }
-    expectation_t e;
-    off_expectation(work, work->best_node, &e);
-    work->ln_sigma_off = e.ln_sigma;
-    set_lines(work);
-    return true;
-}
-
+/* First the best node of all, for what made the data; then one after the other: its row is its variance over that expected, less that of
+ * the best, by lines and edges of their prior deviations. */
 static void step_fit(selfcal_work_t *work) {
+    selfcal_truth_t *truth = &work->truth;
+    const uint16_t at = work->at++, k = at == 0U ? work->best_node : (uint16_t)(at - 1U);
+    const selfcal_place_t place = place_of(work, k);
+    work->hypothesis = place.hypothesis;
+    if (!has_expectation(work)) {
+        return;
+    }
+    if (at == 0U) {
+        set_truth(work, place);
+    }
     expectation_t e;
-    off_expectation(work, work->at++, &e);
-    if (has_expectation(work)) {
-        add_row(work, &e);
+    selfcal_field_t field;
+    expectation(work, place.ln_rho, place.ln_alpha, &e);
+    node_field(work, k, work->n_eff, &field);
+    const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - e.ln_sigma) + e.ln_v;
+    const selfcal_real_t off = (selfcal_real_t)(field.ln_sigma - (selfcal_wide_t)e.ln_sigma);
+    truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
+    if (at == 0U) {
+        work->ln_sigma_off = off;
+        truth->ln_v = e.ln_v; /* any that is near will do */
+        truth->wide = (selfcal_real_t)work->bank->weight * e.ln_v > WIDE_BEYOND;
+        set_lines(work);
+    } else {
+        add_row(work, &e, off - work->ln_sigma_off, (selfcal_real_t)(work->peak - field.profile));
     }
 }
 
@@ -754,7 +738,8 @@ static bool end_scan(selfcal_work_t *work) {
  * e^(-pi^2/2h). It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
  * of a random walk beside it, so that lines leave little of it; on such a grid no more comes after some 10^4 samples. Of a law without
  * an expectation all of the ln-likelihood is left to the splines, which grows as n. The limits are measured, on records over the
- * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances. */
+ * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances. What uneven noise or time adds to the
+ * ln-likelihood is as smooth and left to the splines whole, with lines that are forced to explain it besides: a nat of it weighs as 100. */
 static bool too_coarse(const selfcal_work_t *work) {
     /* 0, so that e^-inf is the rest, where there is none. */
     const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]};
@@ -764,7 +749,7 @@ static bool too_coarse(const selfcal_work_t *work) {
         return rest * weight > R(0.08);
     }
     const bool pair = hypothesis_of(work)->alpha != NULL;
-    return rest * r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) > (work->truth.pair ? R(0.4) : R(0.02)) ||
+    return rest * (r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) + R(100.0) * work->truth.missed) > (work->truth.pair ? R(0.4) : R(0.02)) ||
            line_step(weight) > R(0.5);
 }
 
@@ -1194,12 +1179,12 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
         selfcal_posterior_t *posterior = &report->hypothesis[h];
         const selfcal_wide_t weight = exp(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best) / sum;
         posterior->probability = (float)weight;
-        mean += weight > 0.0 ? weight * (selfcal_wide_t)posterior->bias_mean : 0.0;
+        mean += weight != 0.0 ? weight * (selfcal_wide_t)posterior->bias_mean : 0.0;
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_posterior_t *posterior = &report->hypothesis[h];
         const selfcal_wide_t off = (selfcal_wide_t)posterior->bias_mean - mean, sd = (selfcal_wide_t)posterior->bias_sd;
-        square += posterior->probability > 0.0F ? (selfcal_wide_t)posterior->probability * (off * off + sd * sd) : 0.0;
+        square += posterior->probability != 0.0F ? (selfcal_wide_t)posterior->probability * (off * off + sd * sd) : 0.0;
     }
     report->bias_mean = (float)mean;
     report->bias_sd = (float)sqrt(square);
@@ -1336,17 +1321,16 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case TRUTH:
-        if (work->at < work->bank->model->nodes) {
-            step_peak(work, work->bank->model->nodes);
-        } else {
-            go_to(work, begin_fit(work) ? FIT : PEAK);
+        step_peak(work, work->bank->model->nodes);
+        if (work->at == work->bank->model->nodes) {
+            go_to(work, work->peak > (selfcal_wide_t)-INFINITY ? FIT : PEAK);
             work->hypothesis = 0;
         }
         break;
     case FIT:
         step_fit(work);
-        if (work->at == work->bank->model->nodes) {
-            solve(work);
+        if (work->at > work->bank->model->nodes || !work->truth.pair) {
+            solve(work); /* all 0 without a pair: the nodes of a random walk alone tell too little */
             go_to(work, PEAK);
             work->hypothesis = 0;
         }

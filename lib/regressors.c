@@ -489,17 +489,17 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
 
 /* ---------------------------------------------------------------------------------------------------------- report */
 
-static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_wide_t *ln_sigma,
-                  selfcal_wide_t *profile, selfcal_wide_t *share) {
+static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_field_t *result) {
     normal_t normal;
     fit_t fit;
     make_normal(work->bank, work->axis, index, work->mask, &normal);
     const selfcal_wide_t variance = fmax(normal.residual, least) / n_eff;
     make_fit(&normal, variance, &fit);
-    *ln_sigma = 0.5 * log(variance);
-    *profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * *ln_sigma) + normal.node.ln_s + n_eff +
-                       work->bank->beginning * (fit.ln_det + fit.miss));
-    *share = fit.share;
+    result->ln_sigma = 0.5 * log(variance);
+    result->ln_s = normal.node.ln_s;
+    result->profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * result->ln_sigma) + normal.node.ln_s + n_eff +
+                              work->bank->beginning * (fit.ln_det + fit.miss));
+    result->share = fit.share;
 }
 
 /* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances over

@@ -698,7 +698,8 @@ enum {
     SELFCAL_AT_MIN = 2,       /* more than 5 % of the posterior lies in the lowest 2 % of the prior's ln range */
     SELFCAL_AT_MAX = 4,       /* likewise at the top */
     SELFCAL_OFF_GRID = 8      /* the grid does not bear it: more than 1 % of the posterior lies beyond the last node, or the nodes are so far apart
-                                 that with a record of this length the interpolation may be off by more than 0.05 nat, 0.05 sd, 3 % of sd */
+                                 that with a record so long, or with so much missing in so many places, or with rates so different, the
+                                 interpolation may be off by more than 0.05 nat, 0.05 sd, 3 % of sd */
 };
 
 typedef struct {
@@ -728,7 +729,8 @@ typedef struct {
 typedef struct {
     uint8_t axis;
     uint32_t n;                /* bank samples it rests on, forgotten ones among them */
-    float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit */
+    float bias_mean, bias_sd;  /* x0 + drift at the last interval, over all hypotheses, unit. NaN, as all
+                                  probabilities, where the record lies outside the priors */
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
 
@@ -741,14 +743,16 @@ typedef struct {
 #define SELFCAL_FITTED (SELFCAL_LINES + SELFCAL_LINES)
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {
-    selfcal_real_t variance, rate; /* of a first-order drift over sigma_v^2; 1 - its pole */
-    selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
+    selfcal_real_t ln_noise;       /* ln of the samples' noise, their geometric mean, over that of whole blocks at the model's rate */
+    selfcal_real_t missed;         /* nats of a node's ln-likelihood, the most of all, that come of what is uneven in noise or time */
+    selfcal_real_t variance, rate; /* of a first-order drift over that noise's variance; 1 - its pole */
+    selfcal_real_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
-    /* What the nodes show besides, of either sign: lines at frequencies omega, and behind them two of each two lines' band, edges and
+    bool fitted, pair;             /* what the nodes show besides is known; there are nodes in two dimensions */
+    /* That, of either sign: lines at frequencies omega, and behind them two of each two lines' band, edges and
      * level (see posterior.c). */
     selfcal_real_t distance[SELFCAL_LINES]; /* |1 - e^(i omega)|^2 */
     selfcal_real_t power[SELFCAL_FITTED];
-    bool fitted, pair;                      /* ... is known, from nodes in two dimensions among others */
 } selfcal_truth_t;
 
 /* Least squares for them by rotations: a triangle, row by row, its right side behind each. Private. */
@@ -827,8 +831,7 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
  * report rests on, and its standard deviation, mixed over the hypotheses; both in the axis's unit. A reading less `bias` is the
  * corrected reading, at rest or moving. Under the constant law the bias stays; under the random walk its variance grows by
  * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2, under flicker that of each term:
- * exact moments of the
- * mixture over the nodes and sigma_v, as far as the report's own are. `model` is the bank's.
+ * exact moments of the mixture over the nodes and sigma_v, as far as the report's own are. NaN where those are. `model` is the bank's.
  * SELFCAL_BAD_ARGUMENT: null pointer, elapsed_s negative or not finite. O(alpha nodes). */
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd);
 

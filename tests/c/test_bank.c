@@ -60,6 +60,23 @@ static void bad_arguments_change_nothing(void) {
     TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
 }
 
+/* Readings a million times as noisy as the priors allow: no number may stand for a bias that nothing is known of. */
+static void a_record_outside_the_priors_has_no_bias(void) {
+    for (unsigned i = 0; i < 2000U; i++) {
+        push(0.0F, 1e6F);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, 0, &report));
+    TEST_ASSERT_TRUE(isnan(report.bias_mean));
+    TEST_ASSERT_TRUE(isnan(report.bias_sd));
+    for (uint8_t h = 0; h < model.hypotheses; h++) {
+        TEST_ASSERT_TRUE(isnan(report.hypothesis[h].probability));
+    }
+    float bias, sd;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_predict(&report, &model, 1.0F, &bias, &sd));
+    TEST_ASSERT_TRUE(isnan(bias));
+    TEST_ASSERT_TRUE(isnan(sd));
+}
+
 static void models_that_contradict_themselves_are_refused(void) {
     selfcal_t other;
     selfcal_model_t bad = model;
@@ -338,6 +355,7 @@ static void a_report_that_samples_overtake_is_given_up(void) {
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(bad_arguments_change_nothing);
+    RUN_TEST(a_record_outside_the_priors_has_no_bias);
     RUN_TEST(models_that_contradict_themselves_are_refused);
     RUN_TEST(the_widest_priors_keep_every_sum_finite);
     RUN_TEST(the_constant_law_sums_the_data);

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from agreement import (
     dense,
     exact_report,
     off_grid,
+    on_nodes,
     push,
     report_differences,
     tables_of,
@@ -139,6 +141,49 @@ def test_report_of_what_no_one_spectrum_tells(what: str) -> None:
             print(f"{what} {law} {seed}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
             found.append((evidence, mean, sd))
     assert (np.array(found) <= REPORT_LIMIT).all()
+
+
+@pytest.mark.parametrize(
+    "what", ["equal parts", "a twentieth missing", "a fifth missing", "rates of 1 to 4", "rates of 1 to 64"]
+)
+def test_report_of_noise_that_varies(what: str) -> None:
+    """Blocks averaged from part of their samples, or from others after a change of rate: within the tolerances, or
+    flagged. Not flagged if all blocks lack as many samples, or one in twenty is missing, and on 24 and 24 x 16 nodes,
+    which leave little between them, one in five."""
+    n, block = 10_000, 10
+    parts = {"equal parts": 0.3, "a twentieth missing": 0.05, "a fifth missing": 0.2}.get(what)
+    made = make_tables(MODEL, float(block), ("gx",))
+    coarse = replace(made, axes=(replace(made.axes[0], range=0.0),)) if parts else tables_of(MODEL)
+    fine = on_nodes(coarse, 24, (24, 16))
+    for seed, step in enumerate((0.01, 0.001, 0.05)):
+        rng = np.random.default_rng([n, seed])
+        drift = np.cumsum(step * rng.normal(size=n))
+        banks = judge, *others = Bank(dense(coarse), dense=True), Bank(coarse), Bank(fine)
+        if parts:
+            y = np.repeat(drift, block) + 0.05 * math.sqrt(block) * rng.normal(size=block * n)
+            gone = rng.random((n, block)) < parts
+            gone[gone.sum(axis=1) > block // 2] = False
+            if what == "equal parts":
+                gone[:] = np.arange(block) % 3 == 2
+            gone[0, 0] = gone[-1, -1] = False
+            y[gone.ravel()] = np.nan
+            for bank in banks:
+                push(bank, y)
+        else:
+            ratio = float(what.rsplit(" ", 1)[1])
+            y = drift + 0.05 * np.sqrt(np.repeat((1.0, ratio), n // 2)) * rng.normal(size=n)
+            for bank in banks:
+                bank.push(y[: n // 2, None])
+                bank.raw.rate(1, ratio)
+                bank.push(y[n // 2 :, None])
+        exact = judge.report(0)
+        for bank, name in zip(others, ("16, 16 x 12", "24, 24 x 16"), strict=True):
+            report = bank.report(0)
+            evidence, _, mean, sd = worst_difference(report, exact)
+            flagged = off_grid(bank, 0, exact)
+            print(f"{what} {seed} {name}: {evidence:.3f} nat, {mean:.3f} sd, sd {100 * sd:.1f} %{' flagged' * flagged}")
+            assert flagged or (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
+            assert not (flagged and parts and (bank is others[1] or parts <= 0.05))
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
