@@ -17,7 +17,7 @@ from selfcal.errors import UserError
 from selfcal.model import NODES, PLAIN, Model, Prior
 from selfcal.recording import save
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import REPORT_MIN, block_means, identify
+from selfcal.verbs.identify import REPORT_MIN, block_means, identify, show
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import shared_recording, worst_difference
@@ -221,6 +221,27 @@ def test_a_model_key_given_twice_is_refused(tmp_path: Path) -> None:
     model.write_text(Path(MODEL.path).read_text() + "bank_rate_hz: 2.0\n")
     with pytest.raises(UserError, match="'bank_rate_hz' appears twice"):
         Model.load(model)
+
+
+@pytest.mark.parametrize("name", ["a */ b", "a\nb"])
+def test_a_model_name_that_ends_a_comment_is_refused(tmp_path: Path, name: str) -> None:
+    model = tmp_path / "model.yaml"
+    text = Path(MODEL.path).read_text()
+    model.write_text("\n".join(f"name: {json.dumps(name)}" if x.startswith("name:") else x for x in text.splitlines()))
+    with pytest.raises(UserError, match="name: must be one line"):
+        Model.load(model)
+
+
+def test_what_the_grid_does_not_bear_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Steps fifteen times the white noise: rho lies beyond the last node."""
+    rng = np.random.default_rng(1)
+    log = tmp_path / "log.csv"
+    save(log, {"gx": ("deg/s", np.cumsum(0.015 * rng.normal(size=1000)) + 0.001 * rng.normal(size=1000))}, 1.0, {})
+    document = identify(log)
+    assert document["axes"]["gx"]["parameters"]["random_walk"]["K"]["off_grid"] is True
+    assert document["axes"]["gx"]["parameters"]["constant"]["N"]["off_grid"] is False
+    show(document)
+    assert "not borne by the grid of nodes: gx: random_walk" in capsys.readouterr().out
 
 
 def test_noise_beyond_the_prior_is_said(tmp_path: Path) -> None:

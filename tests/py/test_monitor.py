@@ -168,6 +168,16 @@ def test_view_of_a_record_outside_the_priors(monkeypatch: pytest.MonkeyPatch) ->
     assert "nan" not in picture
 
 
+def test_view_of_what_the_grid_does_not_bear(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        for flags, said in ((1.0, False), (9.0, True)):
+            values = {"constant_probability": 1.0, "random_walk_probability": 0.0, "gauss_markov_probability": 0.0}
+            view = View(Decoder(), Link(bus), "test")
+            view.show([AxisReport("gx", 1.0, True, values | {"constant_N_flags": flags, "random_walk_N_flags": 8.0})])
+            assert ("not borne by the grid" in shown(view)) == said
+
+
 def test_monitor_function_raises_user_errors() -> None:
     with pytest.raises(UserError, match="cannot open"):
         monitor(channel="/dev/no-such-device")

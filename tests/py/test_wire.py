@@ -198,8 +198,16 @@ def test_result_is_what_went_in() -> None:
         for name in parameters:
             estimate = result.parameters[law][name]
             assert estimate.identified == bool(int(truth[f"{law}_{name}_flags"]) & 1)
+            assert estimate.off_grid == bool(int(truth[f"{law}_{name}_flags"]) & 8)
             for statistic in ("mean", "median", "sd", "q05", "q95"):
                 assert getattr(estimate, statistic) == truth[f"{law}_{name}_{statistic}"]
+
+
+def test_an_evidence_at_the_end_of_its_item_is_no_number() -> None:
+    """32 bits of 0.001 nat end at -2 147 483.648, as C packs -infinity."""
+    (report, *_) = feed(Decoder(), lines(stream(5, 1)))
+    report.values["constant_ln_evidence_diff"] = -2147483.648
+    assert report.result().log_evidence["constant"] == -math.inf
 
 
 # --------------------------------------------------------------------------------------------- decoder, damaged input

@@ -367,6 +367,9 @@ class _Reader:
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
+        name = str(self.entry(tree, "name", ""))
+        if not name.isprintable() or "*/" in name:
+            raise self.fail("name", "must be one line, without '*/': it goes into a comment of the tables")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
@@ -388,7 +391,7 @@ class _Reader:
             raise self.fail("nodes", "must be a mapping of targets, 'host' among them")
         simulate = tree.get("simulate") or {}
         return Model(
-            name=str(self.entry(tree, "name", "")),
+            name=name,
             path=self.path,
             bank_rate_hz=self.number(self.entry(tree, "bank_rate_hz", ""), "bank_rate_hz"),
             sensor_name=str(sensor.get("name", "")),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posterior of one parameter under one hypothesis."""
+    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes does not bear it (selfcal.h)."""
 
     mean: float
     median: float
@@ -16,6 +16,7 @@ class Estimate:
     q05: float
     q95: float
     identified: bool
+    off_grid: bool = False
 
     def scaled(self, factor: float) -> Estimate:
         """The same estimate with its unit changed by `factor`."""
@@ -26,6 +27,7 @@ class Estimate:
             self.q05 * factor,
             self.q95 * factor,
             self.identified,
+            self.off_grid,
         )
 
 

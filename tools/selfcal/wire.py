@@ -129,11 +129,17 @@ class AxisReport:
 
         def estimate(name: str) -> Estimate:
             numbers = {statistic: v[f"{name}_{statistic}"] for statistic in STATISTICS}
-            return Estimate(**numbers, identified=bool(int(v[f"{name}_flags"]) & 1))
+            flags = int(v[f"{name}_flags"])
+            return Estimate(**numbers, identified=bool(flags & 1), off_grid=bool(flags & 8))
+
+        def evidence(law: str) -> float:
+            signal = load_dbc().get_message_by_name(self.axis.upper()).get_signal_by_name(f"{law}_ln_evidence_diff")
+            least = -(1 << signal.length - 1) * signal.scale  # the item ends there: so much less, or none at all
+            return v["ln_evidence"] + (v[signal.name] if v[signal.name] > least else -math.inf)
 
         return AxisResult(
             n=int(v["count"]),
-            log_evidence={law: v["ln_evidence"] + v[f"{law}_ln_evidence_diff"] for law in laws},
+            log_evidence={law: evidence(law) for law in laws},
             probability={law: v[f"{law}_probability"] for law in laws},
             parameters={law: {p: estimate(f"{law}_{p}") for p in LAWS[law]} for law in laws},
             bias_mean=v["bias_mean"],

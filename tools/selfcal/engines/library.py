@@ -138,4 +138,4 @@ def _too_short(tables: Tables, count: int, weight: float) -> str:
 
 def _estimate(entry: tuple[float, float, float, float, float, int]) -> Estimate:
     mean, median, sd, q05, q95, flags = entry
-    return Estimate(mean, median, sd, q05, q95, bool(flags & _library32.IDENTIFIED))
+    return Estimate(mean, median, sd, q05, q95, bool(flags & _library32.IDENTIFIED), bool(flags & _library32.OFF_GRID))

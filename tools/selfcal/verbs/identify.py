@@ -34,6 +34,8 @@ TABLE_WIDTH = 140
 REPORT_MIN = 3
 #: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
 MOST_DENSE = 10_000_000
+#: Laws of smaller probability are not spoken of where the grid does not bear them.
+TOLD_OF = 0.01
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
 
@@ -369,6 +371,7 @@ def to_document(recording: Recording, found: Mapping[str, Identified]) -> dict[s
                             "q95": e.q95,
                             "unit": unit_module.parameter_unit(parameter, axis.unit),
                             "identified": e.identified,
+                            "off_grid": e.off_grid,
                         }
                         for parameter, e in estimates.items()
                     }
@@ -462,6 +465,13 @@ def show(document: Mapping[str, Any]) -> None:
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
+        coarse = [
+            law
+            for law, parameters in axis["parameters"].items()
+            if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
+        ]
+        if coarse:
+            failed.append(f"not borne by the grid of nodes: {name}: {', '.join(coarse)}")
         counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
         if counts:
             kept.append(f"kept out: {name}: {', '.join(counts)}")
