@@ -125,7 +125,7 @@ def disassembly(elf: Path) -> dict[int, Function]:
             # A branch within the function may be a bl: a Cortex-M0 has no other that reaches far.
             if found[start] is not here or (mnemonic == "bl" and to == start):
                 here.goes_to.add(start)
-        if mnemonic not in ("nop", "nop.w"):
+        if mnemonic not in ("nop", "nop.w") and (mnemonic, operands) != ("movs", "r0, r0"):  # zeros between sections
             last = "bx" if re.match(r"(pop|ldm).*", mnemonic) and "pc" in operands else mnemonic
             last = "bx" if mnemonic.startswith("ldr") and operands.startswith("pc") else last
     return found
