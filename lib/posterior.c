@@ -488,6 +488,7 @@ static void step_fit(selfcal_work_t *work) {
     selfcal_field_t field;
     expectation(work, place.ln_rho, place.ln_alpha, &e);
     node_field(work, k, work->n_eff, &field);
+    /* As its filters settle an even record comes to 8 nats, and to 16 with some gaps; that much does not count as missed. */
     const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - e.ln_sigma) + e.ln_v;
     const selfcal_real_t off = (selfcal_real_t)(field.ln_sigma - (selfcal_wide_t)e.ln_sigma);
     truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
@@ -1179,6 +1180,7 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
         selfcal_posterior_t *posterior = &report->hypothesis[h];
         const selfcal_wide_t weight = exp(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best) / sum;
         posterior->probability = (float)weight;
+        /* a law without evidence has no bias, and counts for nothing; if none has any, the weights are NaN, and so is the mean */
         mean += weight != 0.0 ? weight * (selfcal_wide_t)posterior->bias_mean : 0.0;
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {

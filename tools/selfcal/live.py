@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from selfcal.model import LAWS, SUMS
-from selfcal.wire import AxisReport, Decoder, Link, signal_unit
+from selfcal.wire import OFF_GRID, AxisReport, Decoder, Link, signal_unit
 
 SHORT = {
     "constant": "const",
@@ -134,6 +134,6 @@ def _parameters(report: AxisReport) -> str:
         middle, low, high = (_number(report, f"{name}_{key}", "%.3g") for key in ("median", "q05", "q95"))
         unit = signal_unit(report.axis, f"{name}_median").replace("sqrt(Hz)", "√Hz")
         rows.append(f"{parameter} {middle} \\[{low}, {high}] {unit}")
-    if any(int(report.values.get(f"{law}_{parameter}_flags", 0)) & 8 for parameter in LAWS[law]):
+    if any(int(report.values.get(f"{law}_{parameter}_flags", 0)) & OFF_GRID for parameter in LAWS[law]):
         rows.append("not borne by the grid of nodes")
     return "\n".join(rows)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
+IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
@@ -130,7 +131,7 @@ class AxisReport:
         def estimate(name: str) -> Estimate:
             numbers = {statistic: v[f"{name}_{statistic}"] for statistic in STATISTICS}
             flags = int(v[f"{name}_flags"])
-            return Estimate(**numbers, identified=bool(flags & 1), off_grid=bool(flags & 8))
+            return Estimate(**numbers, identified=bool(flags & IDENTIFIED), off_grid=bool(flags & OFF_GRID))
 
         def evidence(law: str) -> float:
             signal = load_dbc().get_message_by_name(self.axis.upper()).get_signal_by_name(f"{law}_ln_evidence_diff")
