@@ -153,10 +153,16 @@ class Adis16405:
 
     def select(self, low: bool) -> None:
         """Chip select. Its rise ends a burst."""
-        if low and not self.selected and self.machine.time_us - self.frame_end < 9.0 and self.listening:
-            self.machine.violations.append("ADIS16405: less than 9 us between frames")
+        stall_us = 75.0 if self.slow else 9.0
+        if low and not self.selected and self.machine.time_us - self.frame_end < stall_us and self.listening:
+            self.machine.violations.append(f"ADIS16405: less than {stall_us:g} us between frames")
         self.selected = low
         self.burst_at = None
+
+    @property
+    def slow(self) -> bool:
+        """Timing specifications: other limits of SPI with SMPL_PRD of 0x0A and more."""
+        return self.registers[0x36] & 0xFF >= 0x0A
 
     @property
     def listening(self) -> bool:
@@ -172,7 +178,7 @@ class Adis16405:
         if mode != 3:
             self.machine.violations.append(f"ADIS16405: SPI mode {mode}")
             return self.machine.random.getrandbits(16)
-        if sck_hz > 2e6:
+        if sck_hz > (3e5 if self.slow else 2e6):
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz")
         if self.burst_at is not None:
             return self._burst_word(sck_hz)

@@ -17,7 +17,14 @@ import unicorn.arm_const as arm
 from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
 from unicorn import Uc, UcError  # type: ignore[attr-defined]  # the package re-exports them without saying so
-from unicorn.unicorn_const import UC_ARCH_ARM, UC_HOOK_CODE, UC_HOOK_INTR, UC_MODE_MCLASS, UC_MODE_THUMB
+from unicorn.unicorn_const import (
+    UC_ARCH_ARM,
+    UC_HOOK_BLOCK,
+    UC_HOOK_CODE,
+    UC_HOOK_INTR,
+    UC_MODE_MCLASS,
+    UC_MODE_THUMB,
+)
 
 SRAM = 0x20000000
 
@@ -28,7 +35,8 @@ class Core:
 
     `slice`, `long_slice`: instructions at a stretch, within one of which only accesses and known delays let time go by:
     short (9 us) while the firmware is busy with peripherals, longer while it computes. `fine`: the same in handlers, so
-    that their delays are measured.
+    that their delays are measured. `turn`: cycles that a turn of clock_spin_us() takes at least, beyond one for each of
+    its two instructions (Cortex-M0 TRM 3.3: a branch that is taken, three).
     """
 
     cpu: int
@@ -39,10 +47,11 @@ class Core:
     slice: int
     long_slice: int
     fine: int
+    turn: int
 
 
-STM32F405 = Core(arm.UC_CPU_ARM_CORTEX_M4, 0x08000000, 0x100000, 0x20000, 16.0, 1500, 24_000, 100)
-NRF51822 = Core(arm.UC_CPU_ARM_CORTEX_M0, 0, 0x40000, 0x8000, 16.0, 150, 2400, 20)
+STM32F405 = Core(arm.UC_CPU_ARM_CORTEX_M4, 0x08000000, 0x100000, 0x20000, 16.0, 1500, 24_000, 100, 0)
+NRF51822 = Core(arm.UC_CPU_ARM_CORTEX_M0, 0, 0x40000, 0x8000, 16.0, 150, 2400, 20, 2)
 HANDLER_MOST = 400_000  # instructions a handler may take
 ACCESS_US = 0.03  # a peripheral access, about 5 cycles
 WFI = b"\x30\xbf"
@@ -119,6 +128,8 @@ class Machine:
         self.uc.hook_add(UC_HOOK_INTR, self._interrupt_hook)
         spin = self.symbols["clock_spin_us"] & ~1
         self.uc.hook_add(UC_HOOK_CODE, self._spin_hook, None, spin, spin)
+        if core.turn:
+            self.uc.hook_add(UC_HOOK_BLOCK, self._turn_hook, None, spin, spin + 2)
         self._pages: dict[int, list[Part]] = {}
 
     def _load(self, path: Path) -> None:
@@ -223,6 +234,11 @@ class Machine:
         """Outside handlers, time within a slice is not known: there the firmware's delay is taken at its word."""
         if not self._in_handler:
             self._spent += uc.reg_read(arm.UC_ARM_REG_R0)
+
+    def _turn_hook(self, uc: Uc, address: int, size: int, data: object) -> None:
+        """A turn of the delay."""
+        if self._in_handler:
+            self._spent += self.core.turn / self.hclk_mhz
 
     def _vector(self, exception: int) -> int:
         return int.from_bytes(self.uc.mem_read(self.core.flash + 4 * exception, 4), "little")

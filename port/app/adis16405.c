@@ -53,7 +53,8 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
  * and leaves a rate of its own. What follows is taken once the settings have been found to stand. */
 #define DOUBT_US 100000U
 /* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does to the settings what
- * is looked for. They take 5 words, and wait for room between two bursts; five times so long at most, then at the cost of a sample. */
+ * is looked for. They take 5 words, 0.2 ms (0.9 ms in slow mode, which a quarter of its period holds), and wait for room between two
+ * bursts; five times so long at most, then at the cost of a sample. */
 #define CHECK_US 10000000U
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
@@ -343,12 +344,12 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 
 /* --------------------------------------------------------------------------------------------------------- main loop */
 
-/* Stops listening and waits for a reading under way, two bursts of 317 us at most; a burst that has died is left. */
+/* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died is left. */
 static void hold(adis16405_t *self)
 {
     const uint32_t start = self->bus->time_us32(self->bus->context);
     self->listening = false;
-    while (self->reading && self->bus->time_us32(self->bus->context) - start < 2000U) {
+    while (self->reading && self->bus->time_us32(self->bus->context) - start < 4000U) {
     }
     self->reading = false;
 }

@@ -13,7 +13,8 @@
  *
  * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the
  * driver resets the sensor and tries again, at first after 0.1 s, then with doubled delays up to 10 s. Nothing blocks for
- * longer than a register access, about 50 us each, some ten of them in a row; a hundred when the sensor is started.
+ * longer than a register access, about 70 us each (350 us in the sensor's slow mode), some ten of them in a row; a hundred when the
+ * sensor is started.
  *
  * Registers and bits: ADIS16400/ADIS16405 data sheet, table 8 and the register tables after it. */
 #ifndef ADIS16405_H
@@ -33,6 +34,12 @@
     (1638.4F / (rate_hz) >= 1.0F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) && \
      ADIS16405_OFF(rate_hz) >= -1.6384F / (rate_hz))
 
+/* Data sheet, timing specifications: with SMPL_PRD of 0x0A and more (n > 10) SCK is 300 kHz at most and frames lie 75 us apart. Below
+ * that 2 MHz, 1 MHz in a burst, and 9 us. */
+#define ADIS16405_SLOW(rate_hz) (ADIS16405_DIVIDER(rate_hz) > 10U)
+#define ADIS16405_SCK_MAX_HZ(rate_hz) (ADIS16405_SLOW(rate_hz) ? 300000U : 1000000U)
+#define ADIS16405_STALL_US(rate_hz) (ADIS16405_SLOW(rate_hz) ? 80U : 10U)
+
 /* Samples that wait for the main loop: 1.25 s at 819.2 Hz. A power of two; 16 bytes each. */
 #ifndef ADIS16405_QUEUE
 #define ADIS16405_QUEUE 1024U
@@ -46,8 +53,8 @@ typedef struct adis16405_bus {
     /* Time since start, us: from the main loop, and modulo 2^32 from anywhere. */
     uint64_t (*time_us)(void *context);
     uint32_t (*time_us32)(void *context);
-    /* One frame of 16 bits each way with chip select low around it, SPI mode 3, at most 1 MHz, then 9 us or more of rest.
-     * Bounded; false: it did not take place. */
+    /* One frame of 16 bits each way with chip select low around it, SPI mode 3, at most ADIS16405_SCK_MAX_HZ, then
+     * ADIS16405_STALL_US of rest. Bounded; false: it did not take place. */
     bool (*word)(void *context, uint16_t out, uint16_t *in);
     /* Begins a burst (0x3E00, then 12 words, chip select low throughout); its end is told by adis16405_burst(). Breaks off
      * one under way. */
@@ -149,7 +156,7 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 void adis16405_poll(adis16405_t *self);
 
 /* From the main loop: takes no samples from here on, while interrupts come late or not at all; and goes on. Samples not taken are
- * missing in time. Waits for a reading under way, 2 ms at most. */
+ * missing in time. Waits for a reading under way, 4 ms at most. */
 void adis16405_pause(adis16405_t *self, bool on);
 
 /* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset, but no negative XGYRO_OFF) to its readings by its offset

@@ -1,12 +1,11 @@
-/* ADIS16405 on SPI0, mode 3, 1 MHz. Registers one frame at a time and polled; bursts byte by byte from the interrupt: this
- * SPI has no DMA, and TXD holds one byte in waiting. */
+/* ADIS16405 on SPI0, mode 3, 1 MHz, or 250 kHz in the sensor's slow mode. Registers one frame at a time and polled; bursts byte by
+ * byte from the interrupt: this SPI has no DMA, and TXD holds one byte in waiting. */
 #include "board.h"
 #include "sensor.h"
 #include "nrf51.h"
 
 enum { BURST_WORDS = 12, BURST_BYTES = 2 + 2 * BURST_WORDS, BURST_COMMAND = 0x3E };
-enum { STALL_US = 10 }; /* between frames: the data sheet asks for 9 */
-enum { BYTE_US = 50 };  /* a byte takes 8 */
+enum { BYTE_US = 100 }; /* a byte takes 8, or 32 */
 
 static volatile uint32_t sent, received;
 static volatile uint8_t burst[BURST_BYTES];
@@ -44,7 +43,7 @@ void spi_init(void)
     SPI0_PSELSCK = PIN_SCK;
     SPI0_PSELMOSI = PIN_MOSI;
     SPI0_PSELMISO = PIN_MISO;
-    SPI0_FREQUENCY = SPI0_FREQUENCY_1M;
+    SPI0_FREQUENCY = ADIS16405_SCK_MAX_HZ(SELFCAL_MODEL_RATE_HZ) < 1000000U ? SPI0_FREQUENCY_K250 : SPI0_FREQUENCY_M1;
     SPI0_CONFIG = SPI0_CONFIG_MODE3;
     SPI0_ENABLE = 1U;
     GPIOTE_CONFIG0 = GPIOTE_RISING(PIN_READY);
@@ -52,6 +51,12 @@ void spi_init(void)
     GPIOTE_INTENSET = BIT(0);
     irq_enable(IRQ_GPIOTE);
     irq_enable(IRQ_SPI0);
+}
+
+/* Between frames. */
+static void stall(void)
+{
+    clock_spin_us(ADIS16405_STALL_US(SELFCAL_MODEL_RATE_HZ));
 }
 
 static bool exchange(uint8_t out, uint8_t *in)
@@ -88,7 +93,7 @@ bool spi_word(void *context, uint16_t out, uint16_t *in)
     select_sensor(true);
     const bool done = exchange((uint8_t)(out >> 8), &high) && exchange((uint8_t)out, &low);
     select_sensor(false);
-    clock_spin_us(STALL_US);
+    stall();
     *in = (uint16_t)((uint32_t)high << 8 | low);
     return done;
 }
@@ -122,7 +127,7 @@ void spi_handler(void)
     if (received == BURST_BYTES) {
         SPI0_INTENCLR = SPI0_INTEN_READY;
         select_sensor(false);
-        clock_spin_us(STALL_US);
+        stall();
         uint16_t words[BURST_WORDS];
         for (size_t i = 0; i < BURST_WORDS; i++) {
             words[i] = (uint16_t)((uint32_t)burst[2U * i + 2U] << 8 | burst[2U * i + 3U]);

@@ -39,13 +39,13 @@ void clock_init(void)
     board_clock.crystal = await(&RCC_CR, RCC_CR_HSERDY, RCC_CR_HSERDY);
     const bool locked = board_clock.crystal ? pll_start(HSE_HZ, RCC_PLLCFGR_SRC_HSE) : pll_start(HSI_HZ, 0U);
     if (locked) {
-        RCC_CFGR = RCC_CFGR_PPRE1_DIV4 | RCC_CFGR_PPRE2_DIV2;
+        RCC_CFGR = RCC_CFGR_PPRE1_DIV4 | RCC_CFGR_PPRE2_DIV4; /* SPI1 divides PCLK2 by 256 at most */
         RCC_CFGR |= RCC_CFGR_SW_PLL;
     }
     if (locked && await(&RCC_CFGR, RCC_CFGR_SW_MASK << RCC_CFGR_SWS_POS, RCC_CFGR_SW_PLL << RCC_CFGR_SWS_POS)) {
         board_clock.hclk_hz = PLL_HZ;
         board_clock.pclk1_hz = PLL_HZ / 4U;
-        board_clock.pclk2_hz = PLL_HZ / 2U;
+        board_clock.pclk2_hz = PLL_HZ / 4U;
         board_clock.tim2_hz = PLL_HZ / 2U; /* twice PCLK1 where that is divided, section 7.2 */
         if (board_clock.crystal) {
             RCC_CR |= RCC_CR_CSSON; /* a crystal that stops raises NMI, which records and resets: the next start takes HSI */
