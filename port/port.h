@@ -50,8 +50,9 @@ typedef struct {
     const void *(*stored)(void *context, bool older, size_t *length);
 
     /* A save: begin, put until all is put, end, also after one of the others has failed (then the state is not `whole`); false: it
-     * has failed and what was saved before stands. May block for 2 s; samples lost meanwhile are counted by the sensor's driver. */
-    bool (*save_begin)(void *context);
+     * has failed and what was saved before stands: the newest state, or with `keep_older` the one before it. May block for 2 s;
+     * samples lost meanwhile are counted by the sensor's driver. */
+    bool (*save_begin)(void *context, bool keep_older);
     bool (*save_put)(void *context, const void *bytes, size_t count);
     bool (*save_end)(void *context, bool whole);
 

@@ -83,12 +83,12 @@ static void restore(app_t *app)
             const uint64_t block = app->bank.block, past = (app->bank.position + module->save_gap) % block;
             (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
             (void)tell_sensor(app);
-            app->told.state_found = older == 0 ? 1U : 2U;
+            app->told.state_found = older == 0 ? SELFCAL_STATUS_STATE_FOUND_NEWEST : SELFCAL_STATUS_STATE_FOUND_OLDER;
             app->restored = true;
             return;
         }
         app->told.state_refused = (uint32_t)-status;
-        app->told.state_found = 3U;
+        app->told.state_found = SELFCAL_STATUS_STATE_FOUND_REFUSED;
     }
 }
 
@@ -135,7 +135,9 @@ static void save(app_t *app, uint32_t now)
         pass(app, count);
     }
     app->saved_ms = now;
-    const bool whole = module->save_begin(module->context) &&
+    /* The state in use is the one to be kept, though the newest be whole: start-up may have refused that as another model's. */
+    const bool keep_older = app->told.state_found == SELFCAL_STATUS_STATE_FOUND_OLDER && app->told.state_saves == 0U;
+    const bool whole = module->save_begin(module->context, keep_older) &&
                        selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK;
     if (module->save_end(module->context, whole)) {
         app->told.state_saves++;

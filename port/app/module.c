@@ -52,11 +52,11 @@ static void module_tell(void *context, selfcal_module_t *told)
 }
 
 /* Flash at work holds the processor up, and with it the interrupts that stamp samples: none is taken meanwhile. */
-static bool module_save_begin(void *context)
+static bool module_save_begin(void *context, bool keep_older)
 {
     board->feed();
     sensor_pause(true);
-    return slots_begin(context);
+    return slots_begin(context, keep_older);
 }
 
 static bool module_save_end(void *context, bool whole)

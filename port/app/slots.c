@@ -78,12 +78,11 @@ const void *slots_stored(void *context, bool older, size_t *length)
     return start_of(self, slot) + SLOTS_HEADER_BYTES;
 }
 
-bool slots_begin(void *context)
+bool slots_begin(void *context, bool keep_older)
 {
     slots_t *self = context;
-    /* The newest state stays; but if its payload has been damaged since, the one before it does. */
     const uint32_t newest = find(self, false), older = find(self, true);
-    const uint32_t kept = newest != NONE && !whole_slot(self, newest) && older != NONE ? older : newest;
+    const uint32_t kept = older != NONE && (keep_older || !whole_slot(self, newest)) ? older : newest;
     self->slot = kept == 0U ? 1U : 0U;
     self->sequence = newest == NONE ? 1U : header_of(self, newest).sequence + 1U;
     self->at = SLOTS_HEADER_BYTES;

@@ -34,9 +34,10 @@ typedef struct {
  * checksum tells. */
 const void *slots_stored(void *context, bool older, size_t *length);
 
-/* A save: begin erases the slot that is not the newest, put appends, end writes the header if the state is `whole`. Until the header's
- * last word is written the newest state stays what it was. False: the memory refused, or is full; the save is void. */
-bool slots_begin(void *context);
+/* A save: begin erases the slot of the older state, put appends, end writes the header if the state is `whole`. Until the header's last
+ * word is written the newest state stays what it was. With `keep_older`, or a newest state that has been damaged, the one before it is
+ * kept instead, where there is one. False: the memory refused, or is full; the save is void. */
+bool slots_begin(void *context, bool keep_older);
 bool slots_put(void *context, const void *bytes, size_t count);
 bool slots_end(void *context, bool whole);
 

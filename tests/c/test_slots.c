@@ -62,17 +62,22 @@ void setUp(void)
 void tearDown(void) {}
 
 /* A state of `length` bytes that `seed` tells from others, in pieces of uneven size. */
-static bool save(uint8_t seed, size_t length)
+static bool save_keeping(bool older, uint8_t seed, size_t length)
 {
     uint8_t bytes[2 * STRIDE];
     for (size_t i = 0; i < length; i++) {
         bytes[i] = (uint8_t)(seed + 7U * i);
     }
-    bool whole = slots_begin(&slots);
+    bool whole = slots_begin(&slots, older);
     for (size_t at = 0; at < length && whole; at += 13U) {
         whole = slots_put(&slots, bytes + at, length - at < 13U ? length - at : 13U);
     }
     return slots_end(&slots, whole);
+}
+
+static bool save(uint8_t seed, size_t length)
+{
+    return save_keeping(false, seed, length);
 }
 
 /* Which state is there; 0: none, or it is not what was put. */
@@ -138,7 +143,7 @@ static void a_refused_operation_voids_the_save(void)
 static void a_state_that_is_not_whole_is_not_headed(void)
 {
     TEST_ASSERT_TRUE(save(1, 100));
-    TEST_ASSERT_TRUE(slots_begin(&slots) && slots_put(&slots, "half", 4));
+    TEST_ASSERT_TRUE(slots_begin(&slots, false) && slots_put(&slots, "half", 4));
     TEST_ASSERT_FALSE(slots_end(&slots, false));
     TEST_ASSERT_EQUAL(1, stored(false));
     TEST_ASSERT_EQUAL(0, stored(true));
@@ -152,6 +157,38 @@ static void the_next_save_overwrites_the_damaged_one(void)
     TEST_ASSERT_EQUAL(1, stored(true));
     TEST_ASSERT_TRUE(save(3, 100));
     TEST_ASSERT_EQUAL(3, stored(false));
+    TEST_ASSERT_EQUAL(1, stored(true));
+}
+
+/* As the application asks when start-up has refused the newest, whole as it is: a cut anywhere leaves the state in use, also in the
+ * save after that, which finds no other. */
+static void the_older_one_is_kept_where_it_is_asked_for(void)
+{
+    long total = 1;
+    for (long k = 0; k < total; k++) {
+        setUp();
+        TEST_ASSERT_TRUE(save(1, 100) && save(2, 100));
+        total = operations / 2;
+        operations = 0;
+        cut_at = k;
+        TEST_ASSERT_FALSE(save_keeping(true, 3, 100));
+        power_on();
+        TEST_ASSERT_EQUAL(1, stored(false));
+        cut_at = 1;
+        TEST_ASSERT_FALSE(save_keeping(true, 4, 100));
+        power_on();
+        TEST_ASSERT_EQUAL(1, stored(false));
+        TEST_ASSERT_TRUE(save_keeping(true, 5, 100));
+        TEST_ASSERT_EQUAL(5, stored(false));
+        TEST_ASSERT_EQUAL(1, stored(true));
+    }
+    TEST_ASSERT_GREATER_THAN(30, total);
+}
+
+static void with_one_state_or_none_there_is_no_older_one_to_keep(void)
+{
+    TEST_ASSERT_TRUE(save_keeping(true, 1, 100) && save_keeping(true, 2, 100));
+    TEST_ASSERT_EQUAL(2, stored(false));
     TEST_ASSERT_EQUAL(1, stored(true));
 }
 
@@ -186,6 +223,8 @@ int main(void)
     RUN_TEST(a_refused_operation_voids_the_save);
     RUN_TEST(a_state_that_is_not_whole_is_not_headed);
     RUN_TEST(the_next_save_overwrites_the_damaged_one);
+    RUN_TEST(the_older_one_is_kept_where_it_is_asked_for);
+    RUN_TEST(with_one_state_or_none_there_is_no_older_one_to_keep);
     RUN_TEST(a_state_longer_than_a_slot_is_refused);
     RUN_TEST(the_sequence_wraps);
     return UNITY_END();

@@ -826,6 +826,24 @@ def test_damaged_and_foreign_states_are_refused_and_told(target: str) -> None:
     assert found(other) == (REFUSED, 8, 0)
 
 
+def test_a_power_cut_after_another_model_s_save() -> None:
+    """Two saves, one of an image of another model over the first, the first image again, a cut in its next save: the
+    state that it went on from is still there. The other model's was whole and the newest."""
+    board, _, _, _, _ = two_saves("stm32f405")
+    other = saver("stm32f405", "other", 0.02, retained=board.retained())
+    assert found(other) == (REFUSED, 8, 0)
+    while other.value("app.told.state_saves") < 1:
+        other.run(0.1)
+    board.power_cycle(other.retained())
+    outcome, refused, samples = found(board)
+    assert (outcome, refused) == (OLDER, 8)
+    board.flash.cut_at = board.flash.operations + 500
+    board.run(4.0)
+    assert board.machine.stopped == "power cut"
+    board.power_cycle()
+    assert found(board) == (NEWEST, 0, samples)
+
+
 @pytest.mark.parametrize("target", TARGETS)
 def test_flash_that_refuses_is_told_and_loses_nothing(target: str) -> None:
     """An operation that the flash refuses voids the save: counted, the sensor goes on, and what was saved before
