@@ -286,6 +286,23 @@ def test_contradictions_with_a_right_checksum_are_refused() -> None:
         assert (decoder.statistics.refused, decoder.statistics.received) == (1, 0)
 
 
+def corrected_frame(counter: int, item: int, value: int) -> can.Message:
+    """A frame of message CORRECTED of the module's third second."""
+    fields = {"value": (0, 32, value), "item": (32, 6, item), "counter": (38, 6, counter), "time": (44, 8, 2)}
+    return with_bits("t2078" + "0" * 16, **fields)
+
+
+def test_a_corrected_sample_holds_nothing_of_the_one_before() -> None:
+    """Axis gx (items 1 and 7) is in the first set, not in the second: its value must not stand beside the new time."""
+    decoder = Decoder()
+    for counter, (item, value) in enumerate([(0, 2000), (1, 0x3F800000), (7, 0x3F000000), (13, 2), (0, 2100), (13, 1)]):
+        decoder.feed(corrected_frame(counter, item, value))
+        if counter == 3:
+            assert decoder.corrected == {"time_ms": 2000.0, "corrected_gx": 1.0, "sd_gx": 0.5, "motion": 2.0}
+    assert decoder.corrected == {"time_ms": 2100.0, "motion": 1.0}
+    assert (decoder.statistics.received, decoder.statistics.refused) == (6, 0)
+
+
 def test_repeated_and_late_frames_are_refused() -> None:
     all_lines = lines(stream(1, 2))
     decoder = Decoder(from_start=True)

@@ -173,8 +173,9 @@ class Decoder:
         self.statistics = Statistics()
         #: Last value of each status signal.
         self.status: dict[str, float] = {}
-        #: Last value of each signal of the corrected sample, and of the answers to commands.
+        #: Signals of the last corrected sample, as far as they have come.
         self.corrected: dict[str, float] = {}
+        #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
         #: Module time of the last opening or status frame, unwrapped, ms.
         self.time_ms = 0
@@ -234,6 +235,8 @@ class Decoder:
                 self._exact(int(values["frames_sent"]))
                 self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
             return self.flush()
+        if definition.name == CORRECTED and "time_ms" in values:
+            self.corrected = {}  # a new set: an axis that is no longer sent has no part in it
         if definition.name in (CORRECTED, ANSWER):
             (self.corrected if definition.name == CORRECTED else self.answer).update(values)
             return self.flush()
