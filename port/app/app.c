@@ -214,6 +214,23 @@ static void give(app_t *app, const float reading[])
 #endif
 }
 
+#if APP_CORRECTED_MS
+/* Counts how many readings in a row are alike: the bank does not while the module moves. */
+static void count_same(app_t *app, const float reading[])
+{
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        const uint32_t before = reading[axis] == app->reading[axis] ? app->same[axis] : 0U;
+        app->same[axis] = before < UINT32_MAX ? before + 1U : before;
+    }
+}
+
+static bool stuck(const app_t *app, uint8_t axis)
+{
+    const uint32_t limit = selfcal_model.axis[axis].stuck_limit;
+    return limit > 0U && app->same[axis] >= limit;
+}
+#endif
+
 static bool take_sample(app_t *app)
 {
     float reading[SELFCAL_MODEL_AXES];
@@ -231,6 +248,7 @@ static bool take_sample(app_t *app)
         app->fresh = true;
 #if APP_CORRECTED_MS
         app->passed += (uint64_t)missing + 1U;
+        count_same(app, reading);
         memcpy(app->reading, reading, sizeof reading);
         app->reading_ms = app->port->time_ms(app->port->context);
         app->newer = true;
@@ -553,7 +571,7 @@ static void correct(app_t *app)
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         const uint64_t since = app->passed - app->rests_on[axis];
         float bias = NAN, sd = NAN;
-        if (app->has_report[axis] && !selfcal_retired(&app->bank, axis)) {
+        if (app->has_report[axis] && !selfcal_retired(&app->bank, axis) && !stuck(app, axis)) {
             (void)selfcal_predict(&app->last_report[axis], &selfcal_model, (float)since / SELFCAL_MODEL_RATE_HZ, &bias, &sd);
         }
         app->corrected.value[axis] = app->reading[axis] - bias;

@@ -414,6 +414,33 @@ def test_corrected_samples_are_of_sound_samples() -> None:
     assert corrected(board, since) != []
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_channel_that_stands_still_has_no_corrected_samples(moving: bool) -> None:
+    """gx gives one reading for ever, `stuck_limit` is 1000: after 9.8 s none of it, at rest and while the module moves,
+    where the bank counts nothing; the others go on, and so does gx once it lives again."""
+    board = Board(image(**ORDERS), seed=36)
+    board.run(7.0)
+    rest, shake = board.sensor.source, 400.0 if moving else 0.0
+    board.sensor.source = lambda k: (-9.0, rest(k)[1] + shake * math.sin(k / 8), *rest(k)[2:])
+    since = len(board.frames)
+    board.run(9.4)
+    before = corrected(board, since)[1:]  # the first may have begun before
+    since = len(board.frames)
+    board.run(1.6)
+    after = [one for one in corrected(board, since)[1:] if one["time_ms"] > 7000 + 9800 + 100]
+    assert status(board)["motion"] == (MOVING if moving else RESTING)
+    assert status(board)["axes_retired"] == 0
+    board.sensor.source = rest
+    since = len(board.frames)
+    board.run(1.0)
+    again = corrected(board, since)[1:]
+    assert min(map(len, (before, after, again))) > 2
+    for one in (*before, *again):
+        assert all(math.isfinite(one[f"corrected_{axis}"]) for axis in AXES)
+    for one in after:
+        assert [axis for axis in AXES if f"corrected_{axis}" in one and f"sd_{axis}" in one] == [*AXES[1:]]
+
+
 def test_an_axis_outside_the_priors_has_no_bias() -> None:
     """ax shakes with 65 m/s^2, 130 times the largest N, and without the gate: its report has no number, so there is no
     corrected sample of it and nothing to write to the sensor; the other axes go on."""
