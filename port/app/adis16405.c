@@ -445,7 +445,7 @@ static void start_on(adis16405_t *self, uint64_t now)
         } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
             fail(self, ADIS16405_SELF_TEST, now);
         } else {
-            enter(self, STEP_SELF_TEST, now);
+            enter(self, STEP_SELF_TEST, self->bus->time_us(self->bus->context)); /* the set-up took 20 ms in slow mode */
         }
         return;
     default: break;
