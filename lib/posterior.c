@@ -244,17 +244,10 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_wide_t n_
     field->share = p0 * v.a / (p0 * v.a + var);
 }
 
-/* delta + e^(-2 delta)/2 - 1/2; by its series where that would cancel. */
+/* delta + e^(-2 delta)/2 - 1/2: two terms of delta's order leave one of delta^2; n_eff times what that costs in float is 2e-3 where n_eff
+ * is 10^8. */
 static selfcal_real_t sigma_shape(selfcal_real_t delta) {
-    if (r_fabs(delta) > R(0.1)) {
-        return delta + R(0.5) * r_expm1(R(-2.0) * delta);
-    }
-    selfcal_real_t term = delta * delta, sum = R(0.0);
-    for (int k = 3; k < 12; k++) {
-        sum += term;
-        term *= R(-2.0) * delta / (selfcal_real_t)k;
-    }
-    return sum;
+    return r_fma(R(0.5), r_expm1(R(-2.0) * delta), delta);
 }
 
 /* Where n_eff times that reaches SIGMA_DEPTH, on one side of 0. */
@@ -271,15 +264,19 @@ static selfcal_real_t sigma_end(selfcal_real_t n_eff, selfcal_real_t sign) {
     return outside;
 }
 
-static void sigma_cells(selfcal_work_t *work) {
+/* What the sigma_v cells make of [from, to], with weights that are 1 where the ln-likelihood lies `drop` below the mode. */
+static void sigma_cells(selfcal_work_t *work, selfcal_real_t from, selfcal_real_t to, selfcal_real_t drop) {
+    const selfcal_real_t width = (to - from) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
+    if (from == work->delta_from && width == work->delta_width) {
+        return;
+    }
+    work->delta_from = from;
+    work->delta_width = width;
     const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
-    const selfcal_real_t lo = sigma_end(n_eff, R(-1.0)), hi = sigma_end(n_eff, R(1.0));
-    work->delta_width = (hi - lo) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        const selfcal_real_t delta = lo + ((selfcal_real_t)k + R(0.5)) * work->delta_width;
-        work->delta[k] = delta;
+        const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width;
         work->delta_expm1[k] = r_expm1(delta);
-        work->delta_weight[k] = r_exp(-n_eff * sigma_shape(delta)) * work->delta_width;
+        work->delta_weight[k] = r_exp(r_fma(-n_eff, sigma_shape(delta), drop)) * width;
     }
 }
 
@@ -619,10 +616,11 @@ static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, 
     cell->ln_sigma += e.ln_sigma;
 }
 
-/* Part of [middle - width/2, middle + width/2] that the prior's limits leave. */
-static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t middle, selfcal_real_t width) {
-    const selfcal_real_t lo = r_fmax(middle - R(0.5) * width, (selfcal_real_t)prior->ln_min);
-    const selfcal_real_t hi = r_fmin(middle + R(0.5) * width, (selfcal_real_t)prior->ln_max);
+/* Part of [*middle - width/2, *middle + width/2] that the prior's limits leave, whose middle *middle becomes. */
+static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t *middle, selfcal_real_t width) {
+    const selfcal_real_t lo = r_fmax(*middle - R(0.5) * width, (selfcal_real_t)prior->ln_min);
+    const selfcal_real_t hi = r_fmin(*middle + R(0.5) * width, (selfcal_real_t)prior->ln_max);
+    *middle = R(0.5) * (lo + hi);
     return hi > lo ? (hi - lo) / width : R(0.0);
 }
 
@@ -637,6 +635,43 @@ static void cell_parameters(const row_t *row, const cell_t *cell, selfcal_real_t
 static bool has_parameter(selfcal_law_t law, unsigned parameter) {
     return parameter == SELFCAL_N || (parameter == SELFCAL_K && has_walk(law)) ||
            (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && has_alpha(law));
+}
+
+/* What counts of sigma_v in a cell: the part of [delta_lo, delta_hi] about the height's peak that the limits leave, and how far below the
+ * conditional mode that peak lies, in ln. Nothing is left unless from < to. */
+typedef struct {
+    selfcal_real_t from, to, drop;
+} reach_t;
+
+/* `half`: what N and the drift parameter run through from the middle of a cell to its side, so that so far beyond the limits parts of the cell
+ * count; 0 from here on where even that does not bring the mode within them, since then the profile as a rule rises as fast to the
+ * other side. Away from the mode the height falls by SIGMA_DEPTH sooner than about it (the shape is convex), at the peak's slope or faster. */
+static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]) {
+    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
+    const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
+    reach_t reach = {-INFINITY, INFINITY, R(0.0)};
+    for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
+        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        const selfcal_prior_t *prior = &prior_of(work)[p];
+        const selfcal_real_t lo = (selfcal_real_t)prior->ln_min - ln_value[p], hi = (selfcal_real_t)prior->ln_max - ln_value[p];
+        if (lo > half[j] || hi < -half[j]) {
+            half[j] = R(0.0);
+        }
+        reach.from = r_fmax(reach.from, lo - half[j]);
+        reach.to = r_fmin(reach.to, hi + half[j]);
+    }
+    const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to), whole = work->delta_hi - work->delta_lo;
+    if (peak == R(0.0) && reach.to - reach.from > R(0.3) * whole) { /* the usual cells will do */
+        reach.from = work->delta_lo;
+        reach.to = work->delta_hi;
+        return reach;
+    }
+    const selfcal_real_t shape = sigma_shape(peak);
+    const selfcal_real_t depth = SIGMA_DEPTH / (n_eff * r_fabs(R(2.0) * (peak - shape))); /* over the slope, 1 - e^(-2 delta) */
+    reach.drop = n_eff * shape;
+    reach.from = r_fmax(reach.from, peak + r_fmax(work->delta_lo, -depth));
+    reach.to = r_fmin(reach.to, peak + r_fmin(work->delta_hi, depth));
+    return reach;
 }
 
 /* ---------------------------------------------------------------------------------------------------- search of the box */
@@ -655,33 +690,22 @@ static void begin_pass(selfcal_work_t *work) {
 }
 
 static void step_scan(selfcal_work_t *work) {
-    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = prior_of(work);
-    const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
-    const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
     row_t row;
     make_row(work, &row);
-    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(work, hypothesis->rho)); i < work->at; i++) {
+    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(work, hypothesis_of(work)->rho)); i < work->at; i++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         make_cell(work, &row, i, &cell);
         cell_parameters(&row, &cell, ln_value);
-        /* The height at the sigma_v next to its mode that the limits leave, half a cell along rho beyond them included. */
-        selfcal_real_t from = work->delta[0], to = work->delta[SELFCAL_SIGMA_CELLS - 1];
-        for (unsigned j = 0; j < sides; j++) {
-            const unsigned p = j == 0U ? SELFCAL_N : drift;
-            const selfcal_real_t half = j == 0U ? R(0.0) : R(0.5) * work->width[0];
-            from = r_fmax(from, (selfcal_real_t)prior[p].ln_min - ln_value[p] - half);
-            to = r_fmin(to, (selfcal_real_t)prior[p].ln_max - ln_value[p] + half);
-        }
-        if (!(from < to)) {
+        selfcal_real_t half[2] = {R(0.0), R(0.5) * work->width[0]};
+        const reach_t reach = reach_of(work, ln_value, half);
+        cell.profile -= reach.drop;
+        if (!(reach.from < reach.to) || !(cell.profile > (selfcal_real_t)-INFINITY)) {
             continue;
-        }
-        if (from > R(0.0) || to < R(0.0)) {
-            cell.profile -= (selfcal_real_t)work->n_eff * sigma_shape(from > R(0.0) ? from : to);
         }
         if (cell.profile > work->best) {
             work->best = cell.profile;
+            work->drop[work->hypothesis] = reach.drop;
             memcpy(work->best_ln, ln_value, sizeof ln_value);
         }
         if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
@@ -693,10 +717,10 @@ static void step_scan(selfcal_work_t *work) {
             work->found_hi[d] = r_fmax(work->found_hi[d], middle[d] + R(1.5) * work->width[d]);
         }
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            const selfcal_real_t reach = p == SELFCAL_ALPHA ? R(0.0) : R(1.0);
+            const selfcal_real_t share = p == SELFCAL_ALPHA ? R(0.0) : R(1.0);
             const selfcal_real_t side = p == SELFCAL_ALPHA ? work->width[1] : (p == SELFCAL_N ? R(0.0) : work->width[0]);
-            work->range_lo[p] = r_fmin(work->range_lo[p], ln_value[p] + reach * work->delta[0] - side);
-            work->range_hi[p] = r_fmax(work->range_hi[p], ln_value[p] + reach * work->delta[SELFCAL_SIGMA_CELLS - 1] + side);
+            work->range_lo[p] = r_fmin(work->range_lo[p], ln_value[p] + share * reach.from - side);
+            work->range_hi[p] = r_fmax(work->range_hi[p], ln_value[p] + share * reach.to + side);
         }
     }
 }
@@ -825,54 +849,65 @@ typedef struct {
     const selfcal_prior_t *prior;
     selfcal_real_t ln_value, width; /* at sigma_v's conditional mode; what it runs through at each sigma_v of the cell */
     selfcal_real_t off;             /* from the best cell, relative */
+    bool cut;                       /* the limits do not leave all of it */
     spread_t spread;
 } side_t;
 
-/* `fall`: change of ln sigma_v's mode from one side of the cell to the other. */
-static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t fall) {
+/* `fall`: change of ln sigma_v's mode from one side of the cell to the other; `height` at that mode, in ln. */
+static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t density, selfcal_real_t fall) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
-    bool whole = true; /* the priors leave all of the cell */
+    /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
+     * noise, sigma_v falls as rho rises and their product stands still. */
+    selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(work->width[0] + fall)};
+    const reach_t reach = reach_of(work, ln_value, half);
+    moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
+    height -= reach.drop;
+    if (!(reach.from < reach.to) || !(height >= -DEPTH)) { /* nor NaN */
+        return sum;
+    }
+    height = r_exp(r_fmin(height, DEPTH)) * density;
+    sigma_cells(work, reach.from, reach.to, reach.drop);
+    const selfcal_real_t width = work->delta_width;
     side_t side[2];
     for (unsigned j = 0; j < sides; j++) {
         const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
         side_t *s = &side[j];
         s->prior = &prior_of(work)[p];
         s->ln_value = ln_value[p];
-        /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
-         * noise, sigma_v falls as rho rises and their product stands still. */
-        s->width = r_fmax(work->delta_width, sides == 1U ? R(0.0) : r_fabs(j == 0U ? fall : work->width[0] + fall));
+        s->width = r_fmax(width, R(2.0) * half[j]);
         s->off = r_expm1(ln_value[p] - work->best_ln[p]);
         s->spread = spread_over(work, p, s->width);
-        whole = whole && ln_value[p] + work->delta[0] - R(0.5) * s->width >= (selfcal_real_t)s->prior->ln_min &&
-                ln_value[p] + work->delta[SELFCAL_SIGMA_CELLS - 1] + R(0.5) * s->width <= (selfcal_real_t)s->prior->ln_max;
+        const selfcal_real_t side_half = R(0.5) * s->width;
+        s->cut = s->ln_value + reach.from - side_half < (selfcal_real_t)s->prior->ln_min ||
+                 s->ln_value + reach.to + side_half > (selfcal_real_t)s->prior->ln_max;
     }
-    moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        selfcal_real_t w = height * work->delta_weight[k];
+        const selfcal_real_t delta = reach.from + ((selfcal_real_t)k + R(0.5)) * width, e = work->delta_expm1[k];
+        selfcal_real_t w = height * work->delta_weight[k], ln[2], dev[2];
         for (unsigned j = 0; j < sides; j++) {
             const side_t *s = &side[j];
-            const selfcal_real_t ln = s->ln_value + work->delta[k];
-            if (!whole) {
-                w *= permitted(s->prior, ln, s->width);
+            ln[j] = s->ln_value + delta;
+            dev[j] = r_fma(s->off, e, s->off + e);
+            if (s->cut) {
+                const selfcal_real_t middle = ln[j];
+                w *= permitted(s->prior, &ln[j], s->width);
+                dev[j] = r_fma(ln[j] - middle, R(1.0) + dev[j], dev[j]);
             }
             /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
             if (s->prior->uniform) {
-                w *= r_exp(ln);
+                w *= r_exp(ln[j]);
             }
         }
         if (!(w > R(0.0))) {
             continue;
         }
-        const selfcal_real_t e = work->delta_expm1[k];
         sum.mass += w;
         for (unsigned j = 0; j < sides; j++) {
-            const side_t *s = &side[j];
-            const selfcal_real_t dev = r_fma(s->off, e, s->off + e);
-            const selfcal_real_t weighed = w * dev;
+            const selfcal_real_t weighed = w * dev[j];
             sum.first[j] += weighed;
-            sum.second[j] = r_fma(weighed, dev, sum.second[j]);
-            deposit(&s->spread, s->ln_value + work->delta[k], w);
+            sum.second[j] = r_fma(weighed, dev[j], sum.second[j]);
+            deposit(&side[j].spread, ln[j], w);
         }
     }
     return sum;
@@ -906,15 +941,14 @@ static void step_sum(selfcal_work_t *work) {
         if (i < last) {
             make_cell(work, &row, (uint16_t)(i + 1U), &after);
         }
-        if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
-            continue;
-        }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         cell_parameters(&row, &cell, ln_value);
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
-        /* Above the best of the search are cells out of the priors' reach, however far: their mass is 0 times a finite height. */
-        const selfcal_real_t height = r_exp(r_fmin(cell.profile - work->best, DEPTH));
-        const moments_t sum = sum_cell(work, ln_value, height * alpha_density, fall);
+        const selfcal_real_t width = work->delta_width;
+        const moments_t sum = sum_cell(work, ln_value, cell.profile - work->best, alpha_density, fall);
+        if (work->delta_width != width) { /* sigma_v's cells were laid anew, for more than a cell's sums */
+            work->at = (uint16_t)(work->at > i + 3U ? work->at - 2U : i + 1U);
+        }
         part_mass += (selfcal_wide_t)sum.mass;
         work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
         for (unsigned j = 0; j < 2U; j++) { /* zero without a drift */
@@ -981,9 +1015,8 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
 
 static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
-    const selfcal_wide_t centre = exp((selfcal_wide_t)work->best_ln[p]);
-    const selfcal_wide_t mean = work->first[p] / work->mass;
-    const selfcal_wide_t variance = fmax(work->second[p] / work->mass - mean * mean, 0.0);
+    const selfcal_real_t centre = r_exp(work->best_ln[p]), mean = (selfcal_real_t)(work->first[p] / work->mass);
+    const selfcal_real_t variance = r_fmax(r_fma(-mean, mean, (selfcal_real_t)(work->second[p] / work->mass)), R(0.0));
     const selfcal_real_t step = histogram_step(work, p);
     selfcal_real_t total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
@@ -994,8 +1027,8 @@ static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_esti
     }
     const selfcal_real_t ln_mean = ln_first / total;
     const selfcal_real_t ln_sd = r_sqrt(r_fmax(ln_second / total - ln_mean * ln_mean, R(0.0)));
-    estimate->mean = (float)(centre * (1.0 + mean));
-    estimate->sd = (float)(centre * sqrt(variance));
+    estimate->mean = (float)r_fma(centre, mean, centre);
+    estimate->sd = (float)(centre * r_sqrt(variance));
     estimate->median = (float)r_exp(quantile(work, p, total, R(0.5)));
     estimate->q05 = (float)r_exp(quantile(work, p, total, R(0.05)));
     estimate->q95 = (float)r_exp(quantile(work, p, total, R(0.95)));
@@ -1039,8 +1072,7 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
 /* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
  * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
 static void step_bias(selfcal_work_t *work) {
-    const selfcal_wide_t best_n = exp((selfcal_wide_t)work->best_ln[SELFCAL_N]);
-    const selfcal_wide_t best_sq = best_n * best_n / (selfcal_wide_t)work->bank->model->dt_s;
+    const selfcal_wide_t best_sq = (selfcal_wide_t)(r_exp(R(2.0) * work->best_ln[SELFCAL_N]) / (selfcal_real_t)work->bank->model->dt_s);
     const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
     const selfcal_wide_t mean_sq = best_sq * (1.0 + 2.0 * first + second), prior_precision = mean_sq / (sd * sd);
@@ -1135,9 +1167,9 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     }
 }
 
-static selfcal_wide_t ln_prior_density(const selfcal_prior_t *prior) {
-    const selfcal_wide_t lo = (selfcal_wide_t)prior->ln_min, hi = (selfcal_wide_t)prior->ln_max;
-    return -log(prior->uniform ? exp(hi) - exp(lo) : hi - lo);
+static selfcal_real_t ln_prior_density(const selfcal_prior_t *prior) {
+    const selfcal_real_t hi = (selfcal_real_t)prior->ln_max, width = hi - (selfcal_real_t)prior->ln_min;
+    return prior->uniform ? -hi - r_log(-r_expm1(-width)) : -r_log(width);
 }
 
 /* One parameter a step. */
@@ -1150,14 +1182,13 @@ static void step_estimates(selfcal_work_t *work, selfcal_posterior_t *posterior)
 
 static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
     if (!(work->mass > 0.0)) {
-        posterior->ln_evidence = (selfcal_wide_t)-INFINITY; /* the priors leave nothing of the likelihood */
-        return;
+        return; /* the priors leave nothing of the likelihood */
     }
     posterior->ln_evidence = work->peak + (selfcal_wide_t)work->best +
                              log(work->mass * (selfcal_wide_t)work->width[0] * (selfcal_wide_t)work->width[1]);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         if (has_parameter(hypothesis_of(work)->law, p)) {
-            posterior->ln_evidence += ln_prior_density(&prior_of(work)[p]);
+            posterior->ln_evidence += (selfcal_wide_t)ln_prior_density(&prior_of(work)[p]);
         }
     }
     finish_bias(work, posterior);
@@ -1166,30 +1197,58 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
     }
 }
 
+/* No law has an evidence, nor what follows from one. */
+static void know_nothing(const selfcal_work_t *work, selfcal_report_t *report) {
+    for (int h = 0; h < SELFCAL_HYPOTHESES_MAX; h++) {
+        selfcal_posterior_t *posterior = &report->hypothesis[h];
+        posterior->ln_evidence = (selfcal_wide_t)-INFINITY;
+        posterior->bias_mean = NAN;
+        posterior->bias_sd = NAN;
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            const selfcal_estimate_t nothing = {NAN, NAN, NAN, NAN, NAN, 0};
+            posterior->parameter[p] = nothing;
+        }
+        for (int r = 0; work->coefficients != NULL && h < work->bank->model->hypotheses && r < SELFCAL_REGRESSORS_MAX; r++) {
+            work->coefficients[h].mean[r] = NAN;
+            work->coefficients[h].sd[r] = NAN;
+        }
+    }
+}
+
 /* (13), and the bias over all hypotheses. */
 static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) {
     const selfcal_model_t *model = work->bank->model;
-    selfcal_wide_t best = (selfcal_wide_t)-INFINITY, sum = 0.0, mean = 0.0, square = 0.0;
+    selfcal_wide_t best = (selfcal_wide_t)-INFINITY;
+    uint8_t likeliest = 0;
     for (uint8_t h = 0; h < model->hypotheses; h++) {
-        best = fmax(best, report->hypothesis[h].ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability);
+        const selfcal_wide_t joint = report->hypothesis[h].ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability;
+        if (joint > best) {
+            best = joint;
+            likeliest = h;
+        }
     }
-    for (uint8_t h = 0; h < model->hypotheses; h++) {
-        sum += exp(report->hypothesis[h].ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best);
+    if (work->drop[likeliest] > SIGMA_DEPTH) { /* to that law too all the noise that the priors allow is as good as impossible */
+        know_nothing(work, report);
     }
+    const selfcal_real_t about = (selfcal_real_t)report->hypothesis[likeliest].bias_mean;
+    selfcal_real_t sum = R(0.0), mean = R(0.0), square = R(0.0);
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         selfcal_posterior_t *posterior = &report->hypothesis[h];
-        const selfcal_wide_t weight = exp(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best) / sum;
+        const selfcal_real_t weight = r_exp((selfcal_real_t)(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best));
         posterior->probability = (float)weight;
-        /* a law without evidence has no bias, and counts for nothing; if none has any, the weights are NaN, and so is the mean */
-        mean += weight != 0.0 ? weight * (selfcal_wide_t)posterior->bias_mean : 0.0;
+        sum += weight;
+        if (weight != R(0.0)) { /* a law without evidence has no bias, and counts for nothing; if none has any, all is NaN */
+            const selfcal_real_t off = (selfcal_real_t)posterior->bias_mean - about, sd = (selfcal_real_t)posterior->bias_sd;
+            mean = r_fma(weight, off, mean);
+            square = r_fma(weight, r_fma(off, off, sd * sd), square);
+        }
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
-        const selfcal_posterior_t *posterior = &report->hypothesis[h];
-        const selfcal_wide_t off = (selfcal_wide_t)posterior->bias_mean - mean, sd = (selfcal_wide_t)posterior->bias_sd;
-        square += posterior->probability != 0.0F ? (selfcal_wide_t)posterior->probability * (off * off + sd * sd) : 0.0;
+        report->hypothesis[h].probability /= (float)sum;
     }
-    report->bias_mean = (float)mean;
-    report->bias_sd = (float)sqrt(square);
+    mean /= sum;
+    report->bias_mean = (float)(about + mean);
+    report->bias_sd = (float)r_sqrt(square / sum - mean * mean);
 }
 
 /* --------------------------------------------------------------------------------------------------------------- slices */
@@ -1220,24 +1279,10 @@ selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *se
     work->mask = mask;
     work->unknowns = unknowns;
     work->coefficients = coefficients;
-    for (int h = 0; coefficients != NULL && h < self->model->hypotheses; h++) {
-        for (int r = 0; r < SELFCAL_REGRESSORS_MAX; r++) {
-            coefficients[h].mean[r] = NAN;
-            coefficients[h].sd[r] = NAN;
-        }
-    }
     work->stage = GATHER;
     memset(report, 0, sizeof *report);
     report->axis = axis;
-    for (int h = 0; h < SELFCAL_HYPOTHESES_MAX; h++) {
-        selfcal_posterior_t *posterior = &report->hypothesis[h];
-        posterior->bias_mean = NAN;
-        posterior->bias_sd = NAN;
-        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            const selfcal_estimate_t nothing = {NAN, NAN, NAN, NAN, NAN, 0};
-            posterior->parameter[p] = nothing;
-        }
-    }
+    know_nothing(work, report);
     return SELFCAL_OK;
 }
 
@@ -1344,7 +1389,9 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case SIGMA:
-        sigma_cells(work);
+        work->delta_lo = sigma_end((selfcal_real_t)work->n_eff, R(-1.0));
+        work->delta_hi = sigma_end((selfcal_real_t)work->n_eff, R(1.0));
+        work->delta_from = work->delta_hi; /* no cells yet */
         go_to(work, VALUES);
         break;
     case VALUES:

@@ -786,8 +786,10 @@ typedef struct {
     selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
     selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
     uint8_t basis_first[SELFCAL_REPORT_CELLS]; /* first node of each row of scratch.grid.basis */
-    /* sigma_v cells: offsets in ln from the conditional mode, with their weights */
-    selfcal_real_t delta[SELFCAL_SIGMA_CELLS], delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS], delta_width;
+    /* sigma_v's offset in ln from its conditional mode: where it ends if no limit does; the first of the cells in hand, their width, and of
+     * each the offset's exponential, less 1, and the weight */
+    selfcal_real_t delta_lo, delta_hi, delta_from, delta_width, delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS];
+    selfcal_real_t drop[SELFCAL_HYPOTHESES_MAX]; /* of the ln-likelihood from that mode to the priors' limits, in each law's best cell */
     /* posterior sums */
     selfcal_wide_t mass, off_grid;
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
