@@ -641,34 +641,38 @@ static bool has_parameter(selfcal_law_t law, unsigned parameter) {
  * conditional mode that peak lies, in ln. Nothing is left unless from < to. */
 typedef struct {
     selfcal_real_t from, to, drop;
+    selfcal_real_t base; /* drop where N's limits leave a flank alone, which all cells see alike, or the limits leave little; else 0, and all
+                          * of [delta_lo, delta_hi], of which parts do not count */
 } reach_t;
 
 /* `half`: what N and the drift parameter run through from the middle of a cell to its side, so that so far beyond the limits parts of the cell
- * count; 0 from here on where even that does not bring the mode within them, since then the profile as a rule rises as fast to the
- * other side. Away from the mode the height falls by SIGMA_DEPTH sooner than about it (the shape is convex), at the peak's slope or faster. */
+ * count; 0 for N from here on where even that does not bring the mode within them, since then the profile as a rule rises as fast to
+ * the other side. Away from the mode the height falls by SIGMA_DEPTH sooner than about it (the shape is convex), at the peak's slope or faster. */
 static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
-    reach_t reach = {-INFINITY, INFINITY, R(0.0)};
+    reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0)};
+    bool flank = false;
     for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
         const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
         const selfcal_prior_t *prior = &prior_of(work)[p];
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min - ln_value[p], hi = (selfcal_real_t)prior->ln_max - ln_value[p];
-        if (lo > half[j] || hi < -half[j]) {
+        if (j == 0U && (lo > half[j] || hi < -half[j])) {
             half[j] = R(0.0);
+            flank = true;
         }
         reach.from = r_fmax(reach.from, lo - half[j]);
         reach.to = r_fmin(reach.to, hi + half[j]);
     }
-    const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to), whole = work->delta_hi - work->delta_lo;
-    if (peak == R(0.0) && reach.to - reach.from > R(0.3) * whole) { /* the usual cells will do */
+    const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to), shape = sigma_shape(peak);
+    reach.drop = n_eff * shape;
+    if (!flank && reach.to - reach.from > R(0.3) * (work->delta_hi - work->delta_lo)) {
         reach.from = work->delta_lo;
         reach.to = work->delta_hi;
         return reach;
     }
-    const selfcal_real_t shape = sigma_shape(peak);
+    reach.base = reach.drop;
     const selfcal_real_t depth = SIGMA_DEPTH / (n_eff * r_fabs(R(2.0) * (peak - shape))); /* over the slope, 1 - e^(-2 delta) */
-    reach.drop = n_eff * shape;
     reach.from = r_fmax(reach.from, peak + r_fmax(work->delta_lo, -depth));
     reach.to = r_fmin(reach.to, peak + r_fmin(work->delta_hi, depth));
     return reach;
@@ -862,12 +866,11 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(work->width[0] + fall)};
     const reach_t reach = reach_of(work, ln_value, half);
     moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
-    height -= reach.drop;
-    if (!(reach.from < reach.to) || !(height >= -DEPTH)) { /* nor NaN */
+    if (!(reach.from < reach.to) || !(height - reach.drop >= -DEPTH)) { /* nor NaN */
         return sum;
     }
-    height = r_exp(r_fmin(height, DEPTH)) * density;
-    sigma_cells(work, reach.from, reach.to, reach.drop);
+    height = r_exp(r_fmin(height - reach.base, DEPTH)) * density;
+    sigma_cells(work, reach.from, reach.to, reach.base);
     const selfcal_real_t width = work->delta_width;
     side_t side[2];
     for (unsigned j = 0; j < sides; j++) {
