@@ -6,6 +6,10 @@
 #include "port.h"
 #include "selfcal_model.h"
 
+/* How its SPI is clocked at the model's rate, and what lies between two frames. */
+#define SENSOR_SCK_MAX_HZ ADIS16405_SCK_MAX_HZ(SELFCAL_MODEL_RATE_HZ)
+#define SENSOR_STALL_US ADIS16405_STALL_US(SELFCAL_MODEL_RATE_HZ)
+
 /* False: the model has an axis or a rate that the sensor has not. */
 bool sensor_init(const adis16405_bus_t *bus);
 

@@ -43,7 +43,7 @@ void spi_init(void)
     SPI0_PSELSCK = PIN_SCK;
     SPI0_PSELMOSI = PIN_MOSI;
     SPI0_PSELMISO = PIN_MISO;
-    SPI0_FREQUENCY = ADIS16405_SCK_MAX_HZ(SELFCAL_MODEL_RATE_HZ) < 1000000U ? SPI0_FREQUENCY_K250 : SPI0_FREQUENCY_M1;
+    SPI0_FREQUENCY = SENSOR_SCK_MAX_HZ < 1000000U ? SPI0_FREQUENCY_K250 : SPI0_FREQUENCY_M1;
     SPI0_CONFIG = SPI0_CONFIG_MODE3;
     SPI0_ENABLE = 1U;
     GPIOTE_CONFIG0 = GPIOTE_RISING(PIN_READY);
@@ -51,12 +51,6 @@ void spi_init(void)
     GPIOTE_INTENSET = BIT(0);
     irq_enable(IRQ_GPIOTE);
     irq_enable(IRQ_SPI0);
-}
-
-/* Between frames. */
-static void stall(void)
-{
-    clock_spin_us(ADIS16405_STALL_US(SELFCAL_MODEL_RATE_HZ));
 }
 
 static bool exchange(uint8_t out, uint8_t *in)
@@ -93,7 +87,7 @@ bool spi_word(void *context, uint16_t out, uint16_t *in)
     select_sensor(true);
     const bool done = exchange((uint8_t)(out >> 8), &high) && exchange((uint8_t)out, &low);
     select_sensor(false);
-    stall();
+    clock_spin_us(SENSOR_STALL_US);
     *in = (uint16_t)((uint32_t)high << 8 | low);
     return done;
 }
@@ -127,7 +121,7 @@ void spi_handler(void)
     if (received == BURST_BYTES) {
         SPI0_INTENCLR = SPI0_INTEN_READY;
         select_sensor(false);
-        stall();
+        clock_spin_us(SENSOR_STALL_US);
         uint16_t words[BURST_WORDS];
         for (size_t i = 0; i < BURST_WORDS; i++) {
             words[i] = (uint16_t)((uint32_t)burst[2U * i + 2U] << 8 | burst[2U * i + 3U]);

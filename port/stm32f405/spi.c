@@ -37,7 +37,7 @@ void spi_init(void)
     GPIO_PUPDR(GPIOB) = (GPIO_PUPDR(GPIOB) & ~0x3U) | 0x2U;
 
     uint32_t rate = 0; /* PCLK2 / 2^(rate + 1) */
-    while (rate < 7U && board_clock.pclk2_hz >> (rate + 1U) > ADIS16405_SCK_MAX_HZ(SELFCAL_MODEL_RATE_HZ)) {
+    while (rate < 7U && board_clock.pclk2_hz >> (rate + 1U) > SENSOR_SCK_MAX_HZ) {
         rate++;
     }
     SPI1_CR1 = SPI_CR1_CPHA | SPI_CR1_CPOL | SPI_CR1_MSTR | rate << SPI_CR1_BR_POS | SPI_CR1_SSI | SPI_CR1_SSM | SPI_CR1_DFF16;
@@ -63,12 +63,6 @@ static bool await_status(uint32_t mask, uint32_t value)
     return true;
 }
 
-/* Between frames. */
-static void stall(void)
-{
-    clock_spin_us(ADIS16405_STALL_US(SELFCAL_MODEL_RATE_HZ));
-}
-
 static void stop_dma(void)
 {
     SPI1_CR2 = 0U;
@@ -85,7 +79,7 @@ bool spi_word(void *context, uint16_t out, uint16_t *in)
     if (((DMA_SCR(RX_STREAM) | DMA_SCR(TX_STREAM)) & DMA_SCR_EN) != 0U) { /* a burst that never ended */
         stop_dma();
         select_sensor(false);
-        stall();
+        clock_spin_us(SENSOR_STALL_US);
     }
     SPI1_CR2 = 0U;
     (void)SPI1_DR;
@@ -94,7 +88,7 @@ bool spi_word(void *context, uint16_t out, uint16_t *in)
     const bool done = await_status(SPI_SR_RXNE, SPI_SR_RXNE) && await_status(SPI_SR_BSY, 0U);
     *in = (uint16_t)SPI1_DR;
     select_sensor(false);
-    stall();
+    clock_spin_us(SENSOR_STALL_US);
     return done;
 }
 
@@ -132,7 +126,7 @@ void sensor_burst_handler(void)
     const bool whole = (flags & DMA_LISR_TCIF0) != 0U && (flags & DMA_LISR_TEIF0) == 0U && await_status(SPI_SR_BSY, 0U);
     stop_dma();
     select_sensor(false);
-    stall();
+    clock_spin_us(SENSOR_STALL_US);
     uint16_t words[BURST_WORDS - 1];
     for (size_t i = 0; i < BURST_WORDS - 1; i++) {
         words[i] = burst_in[i + 1];
