@@ -16,11 +16,12 @@
  * they leave, so the interpolated thing is always the likelihood alone. */
 #include "internal.h"
 
-/* Stages of a report, and what one step of it takes at most: below 60 000 instructions on a Cortex-M4F. */
+/* Stages of a report, and what one step of it takes at most: below 61 000 instructions on a Cortex-M4F, wherever limits cut the cells; of
+ * sums under uniform priors, which cost an exponential in each cell, below 72 000. */
 enum { GATHER, TRUTH, FIT, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_SCANNED_CELLS 24U
-#define STEP_SUMMED_CELLS 5U
+#define STEP_SUMMED_CELLS 3U
 #define STEP_LINES 8U
 
 /* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
@@ -546,15 +547,8 @@ static void first_box(selfcal_work_t *work) {
     set_box(work, work->limit_lo, work->limit_hi);
 }
 
-/* One row of cells: coefficients of the two splines in rho, alpha taken out. */
-typedef struct {
-    selfcal_real_t profile[SELFCAL_GRID_MAX], ln_sigma[SELFCAL_GRID_MAX];
-    selfcal_real_t basis[6]; /* of alpha */
-    uint8_t basis_first;
-    selfcal_real_t ln_alpha, shift, half_ln_dt;
-} row_t;
-
-static void make_row(const selfcal_work_t *work, row_t *row) {
+static void make_row(selfcal_work_t *work) {
+    selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
     row->ln_alpha = cell_middle(work, 1, work->row);
@@ -585,7 +579,8 @@ typedef struct {
     bool off_grid;
 } cell_t;
 
-static void make_cell(const selfcal_work_t *work, const row_t *row, uint16_t i, cell_t *cell) {
+static void make_cell(const selfcal_work_t *work, uint16_t i, cell_t *cell) {
+    const selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     cell->off_grid = false;
     cell->ln_rho = R(0.0);
@@ -625,7 +620,8 @@ static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t *mi
 }
 
 /* ln of the parameters at the conditional mode of a cell. */
-static void cell_parameters(const row_t *row, const cell_t *cell, selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
+static void cell_parameters(const selfcal_work_t *work, const cell_t *cell, selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
+    const selfcal_cell_row_t *row = &work->scratch.grid.row;
     ln_value[SELFCAL_N] = cell->ln_sigma + row->half_ln_dt;
     ln_value[SELFCAL_ALPHA] = row->ln_alpha;
     ln_value[SELFCAL_K] = cell->ln_rho + cell->ln_sigma + row->shift;
@@ -694,13 +690,15 @@ static void begin_pass(selfcal_work_t *work) {
 }
 
 static void step_scan(selfcal_work_t *work) {
-    row_t row;
-    make_row(work, &row);
+    if (work->at == 0U) {
+        make_row(work);
+    }
+    const selfcal_cell_row_t *row = &work->scratch.grid.row;
     for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(work, hypothesis_of(work)->rho)); i < work->at; i++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
-        make_cell(work, &row, i, &cell);
-        cell_parameters(&row, &cell, ln_value);
+        make_cell(work, i, &cell);
+        cell_parameters(work, &cell, ln_value);
         selfcal_real_t half[2] = {R(0.0), R(0.5) * work->width[0]};
         const reach_t reach = reach_of(work, ln_value, half);
         cell.profile -= reach.drop;
@@ -715,7 +713,7 @@ static void step_scan(selfcal_work_t *work) {
         if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
             continue;
         }
-        const selfcal_real_t middle[2] = {cell.ln_rho, row.ln_alpha};
+        const selfcal_real_t middle[2] = {cell.ln_rho, row->ln_alpha};
         for (int d = 0; d < 2; d++) {
             work->found_lo[d] = r_fmin(work->found_lo[d], middle[d] - R(1.5) * work->width[d]);
             work->found_hi[d] = r_fmax(work->found_hi[d], middle[d] + R(1.5) * work->width[d]);
@@ -817,29 +815,28 @@ static spread_t spread_over(selfcal_work_t *work, unsigned p, selfcal_real_t wid
     return spread;
 }
 
-/* Spreads mass evenly over the width about a value of ln(parameter); what would lie outside is pushed in. */
+/* Spreads mass evenly over the width about a value of ln(parameter); what would lie outside is pushed in. Until finish_estimate() the
+ * bins hold differences, each to the one before: a mass as wide as all of them costs no more than one within a bin. */
 static void deposit(const spread_t *spread, selfcal_real_t middle, selfcal_real_t mass) {
     const selfcal_real_t last = (selfcal_real_t)SELFCAL_HISTOGRAM;
     const selfcal_real_t at = (middle - spread->lo) * spread->per_step;
-    selfcal_real_t from = at - spread->half, to = at + spread->half, density = mass * spread->per_width;
-    if (from < R(0.0) || to > last) {
-        from = r_fmin(r_fmax(from, R(0.0)), last);
-        to = r_fmin(r_fmax(to, R(0.0)), last);
-        density = to > from ? mass / (to - from) : R(0.0);
+    selfcal_real_t edge[2] = {at - spread->half, at + spread->half}, density = mass * spread->per_width;
+    if (edge[0] < R(0.0) || edge[1] > last) {
+        edge[0] = r_fmin(r_fmax(edge[0], R(0.0)), last);
+        edge[1] = r_fmin(r_fmax(edge[1], R(0.0)), last);
+        if (!(edge[0] < edge[1])) {
+            edge[0] = r_fmin(edge[0], last - R(1.0));
+            edge[1] = edge[0] + R(1.0);
+        }
+        density = mass / (edge[1] - edge[0]);
     }
-    int bin = (int)from;
-    if (!(to > from)) {
-        spread->bins[bin < SELFCAL_HISTOGRAM ? bin : SELFCAL_HISTOGRAM - 1] += mass;
-        return;
+    for (int j = 0; j < 2; j++) {
+        const int bin = (int)edge[j];
+        const selfcal_real_t share = density * (edge[j] - (selfcal_real_t)bin);
+        spread->bins[bin] += density - share;
+        spread->bins[bin + 1] += share;
+        density = -density;
     }
-    selfcal_real_t next = (selfcal_real_t)(bin + 1);
-    while (next < to) {
-        spread->bins[bin] += density * (next - from);
-        from = next;
-        next += R(1.0);
-        bin++;
-    }
-    spread->bins[bin < SELFCAL_HISTOGRAM ? bin : SELFCAL_HISTOGRAM - 1] += density * (to - from);
 }
 
 /* What a cell adds to the sums, sigma_v integrated: its mass, and first and second moments of N and of the drift parameter about the
@@ -927,30 +924,32 @@ static void step_sum(selfcal_work_t *work) {
     selfcal_real_t weight[SELFCAL_GRID_MAX], weight_sq[SELFCAL_GRID_MAX]; /* of the rho basis functions */
     memset(weight, 0, sizeof weight);
     memset(weight_sq, 0, sizeof weight_sq);
-    row_t row;
-    make_row(work, &row);
-    const selfcal_real_t alpha_density = prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL ? r_exp(row.ln_alpha) : R(1.0);
+    if (work->at == 0U) {
+        make_row(work);
+    }
+    const selfcal_cell_row_t *row = &work->scratch.grid.row;
+    const selfcal_real_t alpha_density = prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL ? r_exp(row->ln_alpha) : R(1.0);
     selfcal_wide_t part_mass = 0.0;
     uint16_t i = part(work, STEP_SUMMED_CELLS, (uint16_t)(last + 1U));
     cell_t before, cell, after;
-    make_cell(work, &row, i, &after);
+    make_cell(work, i, &after);
     cell = after;
     if (i > 0U) {
-        make_cell(work, &row, (uint16_t)(i - 1U), &cell);
+        make_cell(work, (uint16_t)(i - 1U), &cell);
     }
     for (; i < work->at; i++) {
         before = cell;
         cell = after;
         if (i < last) {
-            make_cell(work, &row, (uint16_t)(i + 1U), &after);
+            make_cell(work, (uint16_t)(i + 1U), &after);
         }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
-        cell_parameters(&row, &cell, ln_value);
+        cell_parameters(work, &cell, ln_value);
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
         const selfcal_real_t width = work->delta_width;
         const moments_t sum = sum_cell(work, ln_value, cell.profile - work->best, alpha_density, fall);
         if (work->delta_width != width) { /* sigma_v's cells were laid anew, for more than a cell's sums */
-            work->at = (uint16_t)(work->at > i + 3U ? work->at - 2U : i + 1U);
+            work->at = (uint16_t)(i + 1U);
         }
         part_mass += (selfcal_wide_t)sum.mass;
         work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
@@ -971,17 +970,17 @@ static void step_sum(selfcal_work_t *work) {
     }
     work->mass += part_mass;
     if (hypothesis->alpha != NULL) {
-        const selfcal_wide_t dev = expm1((selfcal_wide_t)row.ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);
+        const selfcal_wide_t dev = expm1((selfcal_wide_t)row->ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);
         const spread_t spread = spread_over(work, SELFCAL_ALPHA, work->width[1]);
         work->first[SELFCAL_ALPHA] += part_mass * dev;
         work->second[SELFCAL_ALPHA] += part_mass * dev * dev;
-        deposit(&spread, row.ln_alpha, (selfcal_real_t)part_mass);
+        deposit(&spread, row->ln_alpha, (selfcal_real_t)part_mass);
     }
     for (uint16_t j = 0; j < rows; j++) {
         for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
-            const size_t at = (size_t)j * columns + row.basis_first + k;
-            work->scratch.grid.field[0][at] = r_fma(weight[j], row.basis[k], work->scratch.grid.field[0][at]);
-            work->scratch.grid.field[1][at] = r_fma(weight_sq[j], row.basis[k], work->scratch.grid.field[1][at]);
+            const size_t at = (size_t)j * columns + row->basis_first + k;
+            work->scratch.grid.field[0][at] = r_fma(weight[j], row->basis[k], work->scratch.grid.field[0][at]);
+            work->scratch.grid.field[1][at] = r_fma(weight_sq[j], row->basis[k], work->scratch.grid.field[1][at]);
         }
     }
 }
@@ -1009,24 +1008,26 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
         const selfcal_real_t from = work->range_lo[p] + (selfcal_real_t)bin * step;
         const selfcal_real_t part = r_fmin(hi, from + step) - r_fmax(lo, from);
-        if (part > R(0.0) && step > R(0.0)) {
+        if (part > R(0.0)) { /* step is not 0 then */
             mass += work->scratch.grid.histogram[p][bin] * r_fmin(part / step, R(1.0));
         }
     }
     return mass;
 }
 
-static void finish_estimate(const selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
+static void finish_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_real_t centre = r_exp(work->best_ln[p]), mean = (selfcal_real_t)(work->first[p] / work->mass);
     const selfcal_real_t variance = r_fmax(r_fma(-mean, mean, (selfcal_real_t)(work->second[p] / work->mass)), R(0.0));
     const selfcal_real_t step = histogram_step(work, p);
-    selfcal_real_t total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
+    selfcal_real_t mass = R(0.0), total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
     for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
         const selfcal_real_t at = ((selfcal_real_t)bin + R(0.5)) * step;
-        total += work->scratch.grid.histogram[p][bin];
-        ln_first = r_fma(work->scratch.grid.histogram[p][bin], at, ln_first);
-        ln_second = r_fma(work->scratch.grid.histogram[p][bin] * at, at, ln_second);
+        mass += work->scratch.grid.histogram[p][bin]; /* where there is none, rounding leaves some of either sign */
+        work->scratch.grid.histogram[p][bin] = mass;
+        total += mass;
+        ln_first = r_fma(mass, at, ln_first);
+        ln_second = r_fma(mass * at, at, ln_second);
     }
     const selfcal_real_t ln_mean = ln_first / total;
     const selfcal_real_t ln_sd = r_sqrt(r_fmax(ln_second / total - ln_mean * ln_mean, R(0.0)));

@@ -761,6 +761,14 @@ typedef struct {
     selfcal_real_t triangle[SELFCAL_TRIANGLE];
 } selfcal_fit_t;
 
+/* One row of a report's cells: coefficients of the two splines in rho, alpha taken out. Private. */
+typedef struct {
+    selfcal_real_t profile[SELFCAL_GRID_MAX], ln_sigma[SELFCAL_GRID_MAX];
+    selfcal_real_t basis[6]; /* of alpha */
+    uint8_t basis_first;
+    selfcal_real_t ln_alpha, shift, half_ln_dt;
+} selfcal_cell_row_t;
+
 /* Scratch of a report under way. Private but for reading `gathered`; may be shared by all axes and reused. */
 typedef struct {
     selfcal_t *bank;
@@ -801,7 +809,8 @@ typedef struct {
             selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
             /* ... as they are, and with sigma_v^2 over that of the best cell */
             selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
-            selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM];
+            selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM + 2]; /* a mass that ends at the last bin's end reaches beyond it */
+            selfcal_cell_row_t row;
         } grid;
     } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */

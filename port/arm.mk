@@ -9,8 +9,8 @@ CONFIG_cortex-m0 := -DSELFCAL_REPORT_CELLS=40 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL
                     -DSELFCAL_ALPHA_MAX=7 -DSELFCAL_HYPOTHESIS_NODES_MAX=98 -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_FIXED=16 -DSELFCAL_PUSH_EVERY=16
 ARM_cortex-m4f-portable := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard $(CONFIG_cortex-m4f)
 ARM_cortex-m4f := $(ARM_cortex-m4f-portable) -DSELFCAL_KERNEL_M4F
-ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb $(CONFIG_cortex-m0)
-ARM_cortex-m0-32bit := -mcpu=cortex-m0 -mthumb $(filter-out -DSELFCAL_FIXED=% -DSELFCAL_PUSH_EVERY=%,$(CONFIG_cortex-m0)) -DSELFCAL_FIXED=32
+ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb -fconserve-stack $(CONFIG_cortex-m0)
+ARM_cortex-m0-32bit := -mcpu=cortex-m0 -mthumb -fconserve-stack $(filter-out -DSELFCAL_FIXED=% -DSELFCAL_PUSH_EVERY=%,$(CONFIG_cortex-m0)) -DSELFCAL_FIXED=32
 ARM_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
 ARM_COMPILE := -std=c99 -ffp-contract=off -fno-math-errno -ffunction-sections -fdata-sections $(ARM_WARNINGS)
 # What every sample runs through is compiled for speed, the rest for size: 4 KB less, 3 % more instructions in a report. Beside the assembly
