@@ -60,8 +60,10 @@ typedef struct {
      * now; kept through a restart of the sensor. Samples of before are given no more. False: it cannot, and adds what it did. */
     bool (*write_offsets)(void *context, const float wanted[], float got[]);
 
-    /* For commands: a random number, false if there is none; and a restart. NULL without commands. */
+    /* For commands: a random number, false if there is none; whether all frames that were sent have left; and a restart. NULL without
+     * commands. */
     bool (*random)(void *context, uint32_t *number);
+    bool (*sent)(void *context);
     void (*restart)(void *context);
 
     uint32_t save_period_ms; /* between saves, at least: bounds the wear */

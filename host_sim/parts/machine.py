@@ -1,7 +1,8 @@
 """The processor: Unicorn's Cortex-M4F or -M0 with the NVIC, SysTick and system control block that it lacks, and time.
 
 Time goes by one cycle an instruction while the processor runs, and jumps to the next event while it sleeps (WFI).
-Interrupts are taken between any two instructions, where their event falls, at one priority: handlers do not nest.
+Interrupts are taken between any two instructions, where their event falls. A handler is broken into by one of a higher
+priority (a lower number) alone.
 """
 
 from __future__ import annotations
@@ -110,6 +111,7 @@ class Machine:
         self._order = itertools.count()
         self._pending: set[int] = set()
         self._enabled: set[int] = set()
+        self.priority: dict[int, int] = {}  # of exceptions that do not have 0, the highest
         self._asleep = False
         self._reset_wanted: str | None = None
         self._exception_return = False
@@ -248,6 +250,7 @@ class Machine:
         2.3.7)."""
         uc = self.uc
         context = uc.context_save()
+        outer, priority = self._in_handler, self.priority.get(exception, 0)
         uc.reg_write(arm.UC_ARM_REG_SP, (uc.reg_read(arm.UC_ARM_REG_SP) - 104) & ~7)
         uc.reg_write(arm.UC_ARM_REG_LR, 0xFFFFFFF9)
         self._exception_return = False
@@ -260,14 +263,34 @@ class Machine:
             if self._reset_wanted or self.stopped:
                 return
             self._spent += self.core.fine / self.hclk_mhz
+            if priority > 0:
+                self._preempt(priority)
+                if self._reset_wanted or self.stopped:
+                    return
             address = uc.reg_read(arm.UC_ARM_REG_PC)
         else:
             self.violations.append(
                 f"handler of exception {exception} did not return within {HANDLER_MOST} instructions"
             )
-        self._in_handler = False
+        self._in_handler = outer
         uc.context_restore(context)
+        self._exception_return = False
         self._spent += 0.3  # entry and exit
+
+    def _preempt(self, priority: int) -> None:
+        """Between two stretches of a handler: what is due, and the handlers that break into this one."""
+        self.now_us += self._spent
+        self._spent = 0.0
+        self._events_due()
+        while not self._reset_wanted and not self.stopped and not self.uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
+            higher = [exception for exception in self._ready() if self.priority.get(exception, 0) < priority]
+            if not higher:
+                break
+            self._pending.discard(higher[0])
+            self._take(higher[0])
+            self.now_us += self._spent
+            self._spent = 0.0
+            self._events_due()
 
     def _fault(self, error: UcError) -> None:
         """HardFault, with the frame that its handler looks at."""
@@ -297,6 +320,7 @@ class Machine:
             part.reset()
         self._pending.clear()
         self._enabled.clear()
+        self.priority.clear()
         self._asleep = self._in_handler = False
         self._reset_wanted = None
         for number in range(13):
@@ -324,7 +348,9 @@ class Machine:
         return self._events[0][0] if self._events else float("inf")
 
     def _ready(self) -> list[int]:
-        return sorted(e for e in self._pending if e < EXC_IRQ0 or e in self._enabled)
+        """What may be taken, first things first (PM0214 2.3.5)."""
+        ready = (e for e in self._pending if e < EXC_IRQ0 or e in self._enabled)
+        return sorted(ready, key=lambda e: (self.priority.get(e, 0), e))
 
     def run(self, until_us: float) -> None:
         """Let time go by up to `until_us`, or until stop()."""
@@ -392,7 +418,7 @@ class SystemControl(Part):
         self.tick = self.machine.at(self.start_us + passed * period - now, self._tick)
 
     def read(self, offset: int) -> int:
-        """SYST_*, CFSR, SHCSR, CPACR."""
+        """SYST_*, NVIC_IPR, CFSR, SHCSR, CPACR."""
         if offset == 0x10:
             return self.csr
         if offset == 0x14:
@@ -400,6 +426,9 @@ class SystemControl(Part):
         if offset == 0x18:
             passed = (self.machine.time_us - self.start_us) * self.machine.hclk_mhz
             return int(self.rvr - passed % (self.rvr + 1))
+        if 0x400 <= offset < 0x4F0:
+            exceptions = range(EXC_IRQ0 + offset - 0x400, EXC_IRQ0 + offset - 0x3FC)
+            return sum(self.machine.priority.get(e, 0) << 8 * k for k, e in enumerate(exceptions))
         if offset == 0xD88:
             return int(self.machine.uc.reg_read(arm.UC_ARM_REG_C1_C0_2))
         if offset in (0xD28, 0xD24, 0xD0C):
@@ -407,7 +436,7 @@ class SystemControl(Part):
         raise KeyError(offset)
 
     def write(self, offset: int, value: int) -> None:
-        """SYST_*, NVIC_ISER, NVIC_ICER, AIRCR, CPACR."""
+        """SYST_*, NVIC_ISER, NVIC_ICER, NVIC_IPR, AIRCR, CPACR."""
         if offset == 0x10:
             self.csr = value
             if self.tick is not None:
@@ -424,6 +453,9 @@ class SystemControl(Part):
             for bit in range(32):
                 if value >> bit & 1:
                     self.machine.enable(EXC_IRQ0 + 8 * (offset & 0x7F) + bit, on=offset < 0x180)
+        elif 0x400 <= offset < 0x4F0:
+            for byte in range(4):  # the high bits alone are there: four of them, two on a Cortex-M0
+                self.machine.priority[EXC_IRQ0 + offset - 0x400 + byte] = value >> 8 * byte & 0xF0
         elif offset == 0xD0C:
             if value == 0x05FA0004:
                 self.machine.reset("software")

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from .machine import EXC_IRQ0, Event, Machine, Part
 
-HSE_HZ, HSI_HZ = 8_000_000, 16_000_000
+HSI_HZ = 16_000_000
 
 
 class Rcc(Part):
@@ -19,6 +19,7 @@ class Rcc(Part):
     def __init__(self, machine: Machine) -> None:
         super().__init__(machine)
         self.crystal = True
+        self.hse_hz = 8e6
         self.pll_works = True
         self.csr = self.FLAG["power"]
 
@@ -34,7 +35,7 @@ class Rcc(Part):
         self._apply()
 
     def _pll_hz(self) -> float:
-        source = HSE_HZ if self.pllcfgr >> 22 & 1 else HSI_HZ
+        source = self.hse_hz if self.pllcfgr >> 22 & 1 else HSI_HZ
         m, n = self.pllcfgr & 0x3F, self.pllcfgr >> 6 & 0x1FF
         p = 2 * ((self.pllcfgr >> 16 & 3) + 1)
         if not 0.95e6 <= source / m <= 2.1e6 or not 100e6 <= source / m * n <= 432e6:

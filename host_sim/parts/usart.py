@@ -27,7 +27,7 @@ class Usart(Part):
         """Off, 30.6.8."""
         self.cr1 = self.brr = 0
         self.tx_shift_until = 0.0
-        self.tx_full = self.rx_full = self.overrun = False
+        self.tx_full = self.rx_full = self.overrun = self.misframed = False
         self.rdr = 0
         if self.departure is not None:
             self.departure.cancel()
@@ -50,6 +50,7 @@ class Usart(Part):
         if self.cr1 & 0x2004 == 0x2004:
             if abs(self.baud / self.host_baud - 1.0) > 0.03:
                 byte = self.machine.random.getrandbits(8)
+                self.misframed = bool(self.machine.random.getrandbits(1))  # the stop bit is one by chance
             if self.rx_full:
                 self.overrun = True
                 self.overruns += 1
@@ -70,9 +71,10 @@ class Usart(Part):
     def read(self, offset: int) -> int:
         """SR, DR, BRR, CR1."""
         if offset == 0x00:
-            return self.overrun << 3 | self.rx_full << 5 | (self.departure is None) << 6 | (not self.tx_full) << 7
+            received = self.misframed << 1 | self.overrun << 3 | self.rx_full << 5
+            return received | (self.departure is None) << 6 | (not self.tx_full) << 7
         if offset == 0x04:
-            self.rx_full = self.overrun = False
+            self.rx_full = self.overrun = self.misframed = False
             self._interrupt()
             return self.rdr
         return {0x08: self.brr, 0x0C: self.cr1}[offset]

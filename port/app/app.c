@@ -12,6 +12,9 @@ enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES 
  * about after so long never will. */
 #define PATIENCE_MS 300000U
 
+/* Between statuses of a module, at most. */
+#define STATUS_MS 10000U
+
 unsigned port_axis(const char *name)
 {
     static const char *const names[PORT_AXES] = {"gx", "gy", "gz", "ax", "ay", "az"};
@@ -316,7 +319,7 @@ static void tell(app_t *app)
 static const uint64_t command_key[] = {APP_COMMAND_KEY};
 typedef char the_key_has_two_halves[sizeof command_key == 16U ? 1 : -1];
 enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
-#define RESTART_MS 100U /* for the answer to leave */
+#define RESTART_MS 3000U /* at most for the answer to leave: the 2 KB before it take 2.1 s at 9600 baud */
 
 static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result)
 {
@@ -490,6 +493,13 @@ void app_command(app_t *app, const uint8_t data[8])
 }
 #endif
 
+static void tell_status(app_t *app, uint32_t now)
+{
+    tell(app);
+    (void)selfcal_telemetry_status(&app->telemetry, selfcal_counters(&app->bank), SELFCAL_RUNNING, app->report_number, now);
+    app->told_ms = now;
+}
+
 /* Begins a report when one is due, and goes from its status over the axes to its end. Only with all frames out. */
 static bool advance(app_t *app)
 {
@@ -516,13 +526,15 @@ static bool advance(app_t *app)
             tell(app);
             (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_FINISHED, app->report_number, now);
             return true;
+        } else if (app->module != NULL && now - app->told_ms >= STATUS_MS) { /* how it is does not wait for a report that is far off */
+            tell_status(app, now);
+            return true;
         } else {
             return false;
         }
     }
     if (app->stage == STAGE_STATUS) {
-        tell(app);
-        (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_RUNNING, app->report_number, now);
+        tell_status(app, now);
         if (!app->fresh) { /* no sample since the last report: the status alone */
             app->stage = STAGE_END;
         }
@@ -598,8 +610,11 @@ static bool begin_frames(app_t *app)
             return true;
         }
     }
-    if (app->restarting && now - app->restart_ms > RESTART_MS) {
-        app->module->restart(app->module->context);
+    if (app->restarting) { /* and nothing else is sent */
+        if (app->module->sent(app->module->context) || now - app->restart_ms > RESTART_MS) {
+            app->module->restart(app->module->context);
+        }
+        return true;
     }
 #endif
     (void)now;

@@ -48,6 +48,7 @@ typedef struct {
     const port_t *port;
     const port_module_t *module; /* NULL: none */
     uint32_t period_ms, due_ms; /* between reports; when the next one is due */
+    uint32_t told_ms;           /* the last status */
     uint32_t report_number;
     uint8_t stage;    /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
     bool computing;   /* an axis's report is being worked out */

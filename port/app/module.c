@@ -73,6 +73,12 @@ static bool module_random(void *context, uint32_t *number)
     return board->random(number);
 }
 
+static bool module_sent(void *context)
+{
+    (void)context;
+    return board->sent();
+}
+
 static void module_restart(void *context)
 {
     (void)context;
@@ -88,9 +94,9 @@ void module_command(const uint8_t data[8])
 static const port_module_t module = {
     &slots, module_tell, slots_stored, module_save_begin, slots_put, module_save_end, sensor_write_offsets,
 #if APP_COMMANDS
-    module_random, module_restart,
+    module_random, module_sent, module_restart,
 #else
-    NULL, NULL,
+    NULL, NULL, NULL,
 #endif
     BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };

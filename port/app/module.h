@@ -25,6 +25,7 @@ typedef struct {
     uint32_t (*time_ms)(void);              /* since start, modulo 2^32 */
     uint32_t (*ticks)(void);                /* goes up each millisecond that interrupts are served */
     bool (*send)(const selfcal_frame_t *frame); /* as port_t's */
+    bool (*sent)(void);                     /* all frames that it took have left */
     void (*poll)(void);                     /* takes what came by the wire, and gives commands to module_command() */
     void (*sleep)(void);                    /* until a data-ready, the wire, or the next millisecond */
     void (*feed)(void);                     /* the watchdog, whose time is longer than an erase of the memory takes */

@@ -64,6 +64,7 @@ void ready_handler(void);
 
 void uart_init(void);
 bool uart_send(const selfcal_frame_t *frame);
+bool uart_sent(void); /* the last byte too */
 void uart_poll(void); /* takes what the host said */
 void uart_tell(selfcal_module_t *told);
 void uart_handler(void);

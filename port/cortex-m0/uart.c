@@ -83,6 +83,11 @@ void uart_poll(void)
     }
 }
 
+bool uart_sent(void)
+{
+    return !sending;
+}
+
 void uart_tell(selfcal_module_t *told)
 {
     told->frames_dropped = dropped;

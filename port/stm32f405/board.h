@@ -82,6 +82,7 @@ typedef struct {
 /* False: the bit rate cannot be made exactly from this clock, or the controller does not answer. Then nothing is sent. */
 bool can_init(uint32_t bit_per_s);
 bool can_send(const selfcal_frame_t *frame);
+bool can_sent(void); /* no frame waits in a mailbox */
 void can_poll(void); /* takes a command, in an image with commands */
 void can_counters(wire_counters_t *counters);
 void can_tx_handler(void);
@@ -92,6 +93,7 @@ uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s);
 
 void usart_init(uint32_t baud);
 bool usart_send(const selfcal_frame_t *frame);
+bool usart_sent(void); /* the last byte too */
 void usart_poll(void); /* takes what the host said */
 void usart_counters(wire_counters_t *counters);
 void usart_handler(void);

@@ -116,6 +116,11 @@ bool can_send(const selfcal_frame_t *frame)
     return true;
 }
 
+bool can_sent(void)
+{
+    return !working || (CAN_TSR >> CAN_TSR_TME_POS & 0x7U) == 0x7U;
+}
+
 void can_poll(void)
 {
 #ifdef APP_COMMAND_KEY

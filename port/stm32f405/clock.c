@@ -3,7 +3,15 @@
 #include "board.h"
 #include "stm32f405.h"
 
-enum { HSE_HZ = 8000000, HSI_HZ = 16000000, PLL_HZ = 168000000 };
+/* The board's crystal. */
+#ifndef BOARD_HSE_HZ
+#define BOARD_HSE_HZ 8000000
+#endif
+#if BOARD_HSE_HZ < 4000000 || BOARD_HSE_HZ > 26000000 || BOARD_HSE_HZ % 1000000 != 0
+#error "BOARD_HSE_HZ: 4000000 to 26000000, whole MHz"
+#endif
+
+enum { HSE_HZ = BOARD_HSE_HZ, HSI_HZ = 16000000, PLL_HZ = 168000000 };
 
 board_clock_t board_clock;
 static volatile uint32_t ticks;

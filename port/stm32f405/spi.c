@@ -47,6 +47,9 @@ void spi_init(void)
     EXTI_RTSR |= BIT(READY_PIN);
     EXTI_PR = BIT(READY_PIN);
     EXTI_IMR |= BIT(READY_PIN);
+    /* They wait for the sensor, 180 us in slow mode, in which two bytes come on a line of 115200 baud: the USART cannot wait as long. */
+    irq_give_way(IRQ_EXTI0);
+    irq_give_way(IRQ_DMA2_STREAM0);
     irq_enable(IRQ_EXTI0);
     irq_enable(IRQ_DMA2_STREAM0);
 }

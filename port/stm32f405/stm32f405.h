@@ -166,8 +166,11 @@
 #define USART1_DR REG32(0x40011004U)
 #define USART1_BRR REG32(0x40011008U)
 #define USART1_CR1 REG32(0x4001100CU)
+#define USART_SR_FE BIT(1)
+#define USART_SR_NF BIT(2)
 #define USART_SR_ORE BIT(3)
 #define USART_SR_RXNE BIT(5)
+#define USART_SR_TC BIT(6)
 #define USART_SR_TXE BIT(7)
 #define USART_CR1_RE BIT(2)
 #define USART_CR1_TE BIT(3)
@@ -239,6 +242,7 @@
 #define SYST_CVR REG32(0xE000E018U)
 #define SYST_CSR_RUN 7U /* processor clock, interrupt, on */
 #define NVIC_ISER(n) REG32(0xE000E100U + 4U * (n))
+#define NVIC_IPR(n) REG32(0xE000E400U + 4U * (n))
 #define SCB_VTOR REG32(0xE000ED08U)
 #define SCB_AIRCR REG32(0xE000ED0CU)
 #define SCB_SHCSR REG32(0xE000ED24U)
@@ -260,6 +264,12 @@ enum {
 static inline void irq_enable(uint32_t number)
 {
     NVIC_ISER(number / 32U) = BIT(number % 32U);
+}
+
+/* Its handler is broken into by those of interrupts that do not give way (priority 1 of 0 to 15, PM0214 4.3.7). */
+static inline void irq_give_way(uint32_t number)
+{
+    NVIC_IPR(number / 4U) |= 0x10U << 8U * (number % 4U);
 }
 
 static inline void irq_off(void)

@@ -69,6 +69,11 @@ void usart_poll(void)
     }
 }
 
+bool usart_sent(void)
+{
+    return out_tail == out_head && (USART1_SR & USART_SR_TC) != 0U;
+}
+
 void usart_counters(wire_counters_t *counters)
 {
     counters->dropped = dropped;
@@ -79,11 +84,12 @@ void usart_handler(void)
 {
     const uint32_t status = USART1_SR;
     if ((status & (USART_SR_RXNE | USART_SR_ORE)) != 0U) {
-        const uint8_t byte = (uint8_t)USART1_DR; /* clears both flags, section 30.6.1 */
-        if ((status & USART_SR_ORE) != 0U || in_head - in_tail == IN_BYTES) {
+        const uint8_t byte = (uint8_t)USART1_DR; /* clears them all, section 30.6.1 */
+        const bool room = in_head - in_tail < IN_BYTES, sound = (status & (USART_SR_FE | USART_SR_NF)) == 0U;
+        if ((status & USART_SR_ORE) != 0U || !sound || !room) {
             lost_in++;
         }
-        if ((status & USART_SR_RXNE) != 0U && in_head - in_tail < IN_BYTES) {
+        if ((status & USART_SR_RXNE) != 0U && sound && room) {
             in[in_head % IN_BYTES] = byte;
             in_head++;
         }

@@ -23,7 +23,7 @@ import struct
 import subprocess
 import sys
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
@@ -49,6 +49,7 @@ class Budget(TypedDict):
     flash: int
     ram: int
     stack: int
+    giving_way: list[str]  # handlers of a lower priority than the rest
     calls: dict[str, list[str]]
 
 
@@ -227,16 +228,21 @@ class Image:
 
         return depth(start)
 
-    def stack(self, calls: Mapping[str, list[str]]) -> tuple[int, str]:
-        """Bytes of the worst case, and the path that takes them."""
+    def stack(self, calls: Mapping[str, list[str]], giving_way: Collection[str] = ()) -> tuple[int, str]:
+        """Bytes of the worst case, and the path that takes them. The others break into handlers `giving_way`."""
         vectors = self.words("vectors")
         size, path = self.deepest(vectors[1] & ~1, calls)
         handlers = {word & ~1 for word in vectors[15:] if word}
-        deepest = [self.deepest(handler, calls) for handler in handlers if not self.resets(handler)]
         text = " > ".join(path)
-        if deepest:
-            size += EXCEPTION[self.has_fpu()] + max(deepest)[0]
-            text += f" + exception {EXCEPTION[self.has_fpu()]} + {' > '.join(max(deepest)[1])}"
+        for level in (True, False):
+            deepest = [
+                self.deepest(handler, calls)
+                for handler in handlers
+                if not self.resets(handler) and (self.functions[handler].name in giving_way) == level
+            ]
+            if deepest:
+                size += EXCEPTION[self.has_fpu()] + max(deepest)[0]
+                text += f" + exception {EXCEPTION[self.has_fpu()]} + {' > '.join(max(deepest)[1])}"
         return size, text
 
     def has_fpu(self) -> bool:
@@ -254,7 +260,8 @@ def measure(target: str) -> tuple[dict[str, int], str]:
     if not elf.is_file():
         raise FirmwareError(f"there is no {elf.relative_to(ROOT)}: make firmware")
     image = Image(elf)
-    stack, path = image.stack(read_budget(target)["calls"])
+    budget = read_budget(target)
+    stack, path = image.stack(budget["calls"], budget["giving_way"])
     room = image.symbols["link_stack"][0] - image.symbols["link_stack_low"][0]
     if stack > room:
         raise FirmwareError(f"the stack may take {stack} bytes, port/{target}/link.ld keeps {room}")

@@ -37,8 +37,10 @@ AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 #: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
 #: their rows go to build/campaigns.txt as well.
 MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
-#: A model whose bank takes no sample within a test, so that no report is made and time goes by fast.
-QUIET_RATE_HZ = 102.4
+#: A model whose bank takes no sample within a test, so that no report is made and time goes by fast. The slowest rate
+#: at which the sensor takes the clock of the default model; at SLOW_RATE_HZ it wants a slower one.
+QUIET_RATE_HZ = 163.84
+SLOW_RATE_HZ = 102.4
 QUIET_BANK_HZ = 0.01
 
 
@@ -50,8 +52,9 @@ def image(
     bank_hz: float = QUIET_BANK_HZ,
     laws: tuple[str, ...] = ("constant", "random_walk", "gauss_markov"),
     target: str = "stm32f405",
+    rate_hz: float = QUIET_RATE_HZ,
 ) -> Path:
-    """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: 102.4 Hz, bank at
+    """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: at `rate_hz`, bank at
     `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds)."""
     folder = ROOT / "build" / "firmware" / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,7 +66,7 @@ def image(
             document["bank_rate_hz"] = bank_hz
             document["hypotheses"] = dict.fromkeys(laws, 1)
             (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-            codegen(folder / "model.yaml", folder / "new", target=CORES[target], rate=QUIET_RATE_HZ)
+            codegen(folder / "model.yaml", folder / "new", target=CORES[target], rate=rate_hz)
         else:
             codegen(None, folder / "new", target=CORES[target])
         for file in (folder / "new").iterdir():

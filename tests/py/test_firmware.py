@@ -15,7 +15,7 @@ from typing import Any
 import can
 import numpy as np
 import pytest
-from firmware import AXES, Board, Tap, image, reports, status
+from firmware import AXES, QUIET_RATE_HZ, SLOW_RATE_HZ, Board, Tap, image, reports, status
 from gated import Gated
 
 from selfcal.model import Model
@@ -101,6 +101,18 @@ def test_can_bit_rate_is_what_it_is_built_for(kbit_per_s: int) -> None:
     assert board.machine.violations == []
 
 
+def test_another_crystal() -> None:
+    """25 MHz: the clocks are those of the data sheet, and a second on the board is one on the bus."""
+    board = Board(image("hse25", f"{QUIET['flags']} -DBOARD_HSE_HZ=25000000", quiet=True), seed=1)
+    board.rcc.hse_hz = 25e6
+    board.run(2.2)
+    assert board.rcc.pclk1_hz == 42e6
+    assert status(board)["clock"] == 1
+    assert [frame[1][4] for _, frame in board.frames].count(0) == 4
+    assert board.frames[-1][0] == pytest.approx(2.0e6, rel=1e-2)
+    assert board.machine.violations == []
+
+
 def test_frames_leave_in_order_without_gaps() -> None:
     """Counters of the frames on the bus: each one more than the last, though three mailboxes are filled at once."""
     board = Board(image("quiet", **QUIET), seed=1)
@@ -142,13 +154,14 @@ def test_serial_line_speaks_slcan() -> None:
     assert board.machine.violations == []
 
 
-def test_set_up_of_the_sensor() -> None:
-    """Registers after start, data sheet tables 15 to 18: 102.4 samples a second, +-300 deg/s, two taps, data-ready on
+@pytest.mark.parametrize(("name", "rate_hz", "divisor"), [("quiet", QUIET_RATE_HZ, 10), ("slow", SLOW_RATE_HZ, 16)])
+def test_set_up_of_the_sensor(name: str, rate_hz: float, divisor: int) -> None:
+    """Registers after start, data sheet tables 15 to 18: 1638.4 Hz over `divisor`, +-300 deg/s, two taps, data-ready on
     DIO1 rising; one self-test; every sample read by two bursts."""
-    board = Board(image("quiet", **QUIET), seed=1)
+    board = Board(image(name, **QUIET, rate_hz=rate_hz), seed=1)
     board.run(1.5)
     registers = board.sensor.registers
-    assert (registers[0x36], registers[0x38], registers[0x34]) == (15, 0x0401, 0x0006)
+    assert (registers[0x36], registers[0x38], registers[0x34]) == (divisor - 1, 0x0401, 0x0006)
     made = [index for index, us, _ in board.sensor.taken if 0.6e6 < us < 1.49e6]  # the last may still be being read
     assert [index for index in board.sensor.read_twice if made[0] <= index <= made[-1]] == made
     assert status(board)["sensor_fault_count"] == 0

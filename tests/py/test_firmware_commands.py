@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from firmware import AXES, MANY, Board, Tap, image, messages, parts, reports, status, tell
+from firmware import AXES, MANY, QUIET_BANK_HZ, SLOW_RATE_HZ, Board, Tap, image, messages, parts, reports, status, tell
 from gated import Gated
 from typer.testing import CliRunner
 
@@ -26,7 +26,7 @@ from selfcal.verbs import command as verb
 from selfcal.wire import Decoder
 
 KEY = bytes(range(16))
-RATE_HZ, BANK_HZ = 102.4, 5.12
+RATE_HZ, BANK_HZ = SLOW_RATE_HZ, 5.12
 #: A report each 3 s, a corrected sample each 0.2 s.
 FLAGS = f"-DBOARD_REPORT_MS=3000 -DAPP_CORRECTED_MS=200 {verb.build_flag(KEY)}"
 ORDERS: dict[str, Any] = {
@@ -34,6 +34,7 @@ ORDERS: dict[str, Any] = {
     "flags": FLAGS,
     "quiet": True,
     "bank_hz": BANK_HZ,
+    "rate_hz": RATE_HZ,
     "laws": ("constant", "random_walk"),
 }
 #: No bank sample within a test, so that time goes by fast.
@@ -255,6 +256,63 @@ def test_commands_over_the_serial_line() -> None:
     assert say(line(verb.payload("challenge"))).startswith(b"\a")
     assert say("C") == b"\r"
     assert say("\nV\r\n\r\nO\r\n").startswith(b"V0101\r\r\r")  # of a host that ends a line with both
+    assert board.machine.violations == []
+
+
+@pytest.mark.parametrize(("baud", "rate_hz"), [(115_200, SLOW_RATE_HZ), (2_000_000, 163.84), (2_000_000, 819.2)])
+def test_the_serial_line_loses_nothing_beside_the_sensor(baud: int, rate_hz: float) -> None:
+    """Lines without a pause while the sensor's frames are exchanged, which takes 180 us of handlers in slow mode: two
+    bytes at 115200 baud, and 30 us else: six at 2 Mbaud."""
+    flags = f"-DBOARD_REPORT_MS=3000000 -DBOARD_GATE=0 -DBOARD_CAN_KBITPS=0 {verb.build_flag(KEY)}"
+    name = f"line-{baud}-{rate_hz:g}"
+    board = Board(image(name, f"{flags} -DBOARD_USART_BAUD={baud}", quiet=True, rate_hz=rate_hz), seed=5)
+    board.usart.host_baud = float(baud)
+    tap = Tap(board)
+    board.run(1.5)
+    board.usart.say(b"O\r")
+    board.run(0.01)
+    board.text.clear()
+    trials = 40
+    for _ in range(trials):
+        board.usart.say(b"t2088" + b"FF" * 8 + b"\r")
+        board.run(25.0 * 10.0 / baud + 1.7e-3)
+    board.run(0.02)
+    assert bytes(board.text).count(b"z\r") == trials
+    assert board.value("lost_in") == board.usart.overruns == 0
+    board.usart.host_baud = 0.8 * baud  # a host at a wrong rate
+    board.usart.say(b"O\r" * 50)
+    board.run(100.0 * 10.0 / baud + 0.01)
+    assert board.value("lost_in") > 10  # half of them end without a stop bit
+    assert board.machine.violations == []
+    assert tap.wrong() == tap.misplaced(0) == 0
+
+
+@pytest.mark.parametrize(("baud", "corrected_ms", "bank_hz"), [(9600, 0, QUIET_BANK_HZ), (115_200, 20, BANK_HZ)])
+def test_the_answer_to_a_reset_leaves_before_it(baud: int, corrected_ms: int, bank_hz: float) -> None:
+    """Behind a second of telemetry at 9600 baud, and on a line that corrected samples fill."""
+    flags = f"-DBOARD_REPORT_MS=2000 -DAPP_CORRECTED_MS={corrected_ms} {verb.build_flag(KEY)}"
+    flags += f" -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD={baud}"
+    board = Board(image(f"last-word-{baud}", flags, quiet=True, bank_hz=bank_hz, laws=("constant",)), seed=35)
+    board.usart.host_baud = float(baud)
+
+    def told(what: bytes, seconds: float) -> bytes:
+        board.text.clear()
+        board.usart.say(f"t2088{what.hex().upper()}\r".encode())
+        board.run(seconds)
+        frames = [text[text.index(b"t2098") :] for text in bytes(board.text).split(b"\r") if b"t2098" in text]
+        assert len(frames) == 1
+        assert len(frames[0]) == 21
+        return bytes.fromhex(frames[0][5:].decode())
+
+    board.run(0.5)
+    board.usart.say(b"O\r")
+    board.run(5.55)  # the status of 6 s has just begun
+    number = struct.unpack("<I", told(verb.payload("challenge"), 1.8)[:4])[0]
+    board.run(0.2)  # ... that of 8 s
+    assert board.machine.resets == []
+    answer = told(verb.payload("reset", key=KEY, challenge=number), 3.5)
+    assert (answer[0], answer[1]) == (COMMAND["reset"], RESULT["done"])
+    assert [cause for _, cause in board.machine.resets] == ["software"]
     assert board.machine.violations == []
 
 

@@ -11,10 +11,26 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
-from firmware import MANY, Board, NrfBoard, Tap, image, messages, parts, readings, reports, set_up, status, tell
+from firmware import (
+    MANY,
+    QUIET_RATE_HZ,
+    SLOW_RATE_HZ,
+    Board,
+    NrfBoard,
+    Tap,
+    image,
+    messages,
+    parts,
+    readings,
+    reports,
+    set_up,
+    status,
+    tell,
+)
 from parts.flash import half_erased, half_programmed
 from unicorn import UC_HOOK_CODE, Uc
 from unicorn import arm_const as arm
@@ -136,7 +152,7 @@ def test_a_reset_during_the_self_test(when_us: float) -> None:
     board.run(3.0)
     assert status(board)["sensor_fault"] == SET_UP
     assert status(board)["sensor_state"] == RUNNING
-    assert set_up(board) == {0x34: 0x0006, 0x36: 15, 0x38: 0x0401}
+    assert set_up(board) == {0x34: 0x0006, 0x36: 9, 0x38: 0x0401}
     assert len(tap.pushed) > 100
     assert sound(board, None, 0)
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
@@ -353,7 +369,7 @@ def test_gap_of_a_minute_and_clock_error() -> None:
     board.sensor.silent = False
     board.run(12.0)
     gap = max(tap.skips)
-    assert gap > 60.0 * 102.4 / 0.98
+    assert gap > 60.0 * QUIET_RATE_HZ / 0.98
     assert sound(board, None, 0)
     off = tap.mistimed()
     tell("60 s gap", 1, int(off == 0), f"{gap} samples counted, the wait for the next try included")
@@ -386,7 +402,8 @@ def test_over_range_is_no_fault() -> None:
     assert board.sensor.resets == resets
     assert told["sensor_fault_count"] == 0
     assert int(told["sensor_diagnosis"]) & 0x10
-    assert max(tap.skips) == pytest.approx(102, abs=15)  # up to the reading of DIAG_STAT that clears it, 100 ms
+    # up to the reading of DIAG_STAT that clears it, 100 ms
+    assert max(tap.skips) == pytest.approx(QUIET_RATE_HZ, abs=0.15 * QUIET_RATE_HZ)
     assert sound(board, tap, 0)
     board.sensor.trouble = 0x10  # after ten seconds it is a fault, and so is an alarm of its own at once
     board.run(9.0)
@@ -438,7 +455,13 @@ def test_offset_registers_as_autonull_leaves_them() -> None:
 
 
 #: The gate: bank intervals of 80 samples, windows of 40; no report within a test.
-GATED = ("gated", "-DBOARD_REPORT_MS=3000000", True, 1.28)
+GATED: dict[str, Any] = {
+    "name": "gated",
+    "flags": "-DBOARD_REPORT_MS=3000000",
+    "quiet": True,
+    "bank_hz": 1.28,
+    "rate_hz": SLOW_RATE_HZ,
+}
 BLOCK = 80
 
 
@@ -450,7 +473,7 @@ def test_shocks_are_kept_out() -> None:
     trials, survived, struck, unseen, leaked = 2 * MANY, 0, 0, 0, 0
     for trial in range(trials):
         rng = random.Random(100 + trial)
-        board = Board(image(*GATED), seed=trial)
+        board = Board(image(**GATED), seed=trial)
         tap = Tap(board)
         shocks: list[Shock] = []
         for begin in (1600, 2600, 3600):
@@ -458,9 +481,9 @@ def test_shocks_are_kept_out() -> None:
             size = rng.uniform(1 / 3, 1) * rng.choice((-1, 1))
             shocks.append(Shock(start, start + (85 if gyro else 46), gyro, size))
         board.sensor.source = shaken(board.sensor.source, shocks)
-        board.run(0.4 + 1600 / 102.4)
+        board.run(0.4 + 1600 / SLOW_RATE_HZ)
         assert board.value("app.gate.measured") >= 30
-        board.run(3000 / 102.4)
+        board.run(3000 / SLOW_RATE_HZ)
         number = {tuple(readings([sample])[0].tolist()): index for index, _, sample in board.sensor.taken}
         first = number[tap.pushed[0][1]] - tap.pushed[0][0]
         ends = [first + last for last in tap.intervals]

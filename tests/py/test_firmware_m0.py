@@ -7,7 +7,20 @@ Truths: the samples that the sensor's model made; the sensor's registers; the ho
 from __future__ import annotations
 
 import pytest
-from firmware import MANY, NrfBoard, Tap, image, messages, parts, reports, set_up, status, tell
+from firmware import (
+    MANY,
+    QUIET_RATE_HZ,
+    SLOW_RATE_HZ,
+    NrfBoard,
+    Tap,
+    image,
+    messages,
+    parts,
+    reports,
+    set_up,
+    status,
+    tell,
+)
 from unicorn import UC_HOOK_CODE, Uc
 
 from selfcal.verbs import command as verb
@@ -17,10 +30,11 @@ KEY = bytes(range(16))
 GATE_OFF = "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0"
 RESULT = verb.codes("result")
 POWER_ON, SOFTWARE, WATCHDOG, FAULT = 1, 3, 4, 5
+ABSENT, FAILED = 1, 3  # sensor_fault, sensor_state
 
 
 def board(name: str = "plain", flags: str = GATE_OFF, **options: object) -> parts.NrfBoard:
-    """A board of the 102.4 Hz image, its channel open."""
+    """A board of the quiet image, its channel open."""
     made = NrfBoard(image(f"m0-{name}", flags, True, target="cortex-m0"), **options)
     made.run(0.1)
     made.usart.say(b"O\r")
@@ -39,7 +53,7 @@ def test_samples_and_telemetry() -> None:
     tap = Tap(made)
     made.run(4.0)
     assert well(made)
-    assert len(tap.pushed) > 350
+    assert len(tap.pushed) > 560
     assert tap.wrong() == 0
     assert tap.misplaced(0) == 0
     assert sum(tap.skips) == 0
@@ -48,6 +62,22 @@ def test_samples_and_telemetry() -> None:
     told = decoder.status
     assert (told["reset_cause"], told["clock"], told["sensor_state"]) == (POWER_ON, 1, 2)
     assert told["state_found"] == 0
+
+
+def test_a_status_does_not_wait_for_a_report() -> None:
+    """A report of six axes takes this core minutes and comes every ten: a sensor that is not there is told within ten
+    seconds all the same."""
+    made = board("alone", "-DBOARD_GATE=0", seed=3)
+    made.sensor.plug(False)
+    made.run(10.5)
+    assert well(made)
+    decoder, _ = reports(messages(made))
+    assert decoder.status["sensor_state"] == FAILED
+    assert decoder.status["sensor_fault"] == ABSENT
+    assert decoder.statistics.lost == decoder.statistics.damaged == 0
+    heard = len(made.frames)
+    made.run(10.0)
+    assert len(made.frames) == 2 * heard
 
 
 def test_samples_keep_their_places_over_a_save() -> None:
@@ -61,8 +91,8 @@ def test_samples_keep_their_places_over_a_save() -> None:
     assert tap.wrong() == 0
     assert tap.misplaced(0) == 0
     longest = max(tap.skips)
-    print(f"\na save costs {longest} samples of 102.4 a second")
-    assert longest < 2.0 * 102.4  # port.h: 2 s
+    print(f"\na save costs {longest} samples of {QUIET_RATE_HZ} a second")
+    assert longest < 2.0 * QUIET_RATE_HZ  # port.h: 2 s
     us, data = next((us, data) for us, (kind, data) in reversed(made.frames) if kind == 0x200 and data[4] & 0x3F == 0)
     assert int.from_bytes(data[:4], "little") == pytest.approx(us / 1e3, abs=50.0)
 
@@ -174,7 +204,7 @@ def test_offsets_are_written_and_kept() -> None:
 def test_a_reset_during_a_report() -> None:
     """The main loop is away for longer than the sensor's silence lasts: the samples' stamps tell."""
     flags = "-DBOARD_REPORT_MS=5000 -DBOARD_GATE=0"
-    made = NrfBoard(image("m0-busy", flags, True, 1.024, target="cortex-m0"), seed=5)
+    made = NrfBoard(image("m0-busy", flags, True, 1.024, target="cortex-m0", rate_hz=SLOW_RATE_HZ), seed=5)
     tap = Tap(made)
     while not (made.value("app.computing") and made.value("app.work.hypothesis") == 2):
         made.run(0.1)  # Gauss-Markov takes seconds
@@ -193,7 +223,7 @@ def test_a_reset_during_a_report() -> None:
 def test_a_whole_report_of_six_axes() -> None:
     """All laws on six axes at 16 MHz, minutes of work: the module stays up, and every axis arrives."""
     flags = "-DBOARD_REPORT_MS=20000 -DBOARD_GATE=0"
-    made = NrfBoard(image("m0-report", flags, True, 1.024, target="cortex-m0"), seed=5)
+    made = NrfBoard(image("m0-report", flags, True, 1.024, target="cortex-m0", rate_hz=SLOW_RATE_HZ), seed=5)
     made.run(0.1)
     made.usart.say(b"O\r")
     for _ in range(60):
