@@ -369,7 +369,7 @@ def table(bench: Bench) -> str:
     row("**whole image**, bytes", {t: MACHINES[t].image for t in targets})
     number("flash", "sizes", "firmware.flash")
     number("RAM of the variables", "sizes", "firmware.ram")
-    number("stack, worst case by the call graph, one interrupt upon it", "sizes", "firmware.stack")
+    number("stack, worst case by the call graph, interrupts upon it", "sizes", "firmware.stack")
     heading = ["", *(f"{target.capitalize().replace('-m', '-M')}" for target in targets)]
     width = max(len(title) for title, _ in rows)
     lines = [f"| {heading[0]:{width}} |" + "".join(f" {name:>13} |" for name in heading[1:])]
