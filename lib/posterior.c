@@ -633,10 +633,10 @@ static bool has_parameter(selfcal_law_t law, unsigned parameter) {
            (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && has_alpha(law));
 }
 
-/* What counts of sigma_v in a cell: the part of [delta_lo, delta_hi] about the height's peak that the limits leave, and how far below the
- * conditional mode that peak lies, in ln. Nothing is left unless from < to. */
+/* What counts of sigma_v in a cell: the part of [delta_lo, delta_hi] about the height's peak that the limits leave, and how far from the
+ * conditional mode and below it that peak lies, in ln. Nothing is left unless from < to. */
 typedef struct {
-    selfcal_real_t from, to, drop;
+    selfcal_real_t from, to, drop, peak;
     selfcal_real_t base; /* drop where N's limits leave a flank alone, which all cells see alike, or the limits leave little; else 0, and all
                           * of [delta_lo, delta_hi], of which parts do not count */
 } reach_t;
@@ -647,7 +647,7 @@ typedef struct {
 static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
-    reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0)};
+    reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0), R(0.0)};
     bool flank = false;
     for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
         const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
@@ -661,6 +661,7 @@ static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_valu
         reach.to = r_fmin(reach.to, hi + half[j]);
     }
     const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to), shape = sigma_shape(peak);
+    reach.peak = peak;
     reach.drop = n_eff * shape;
     if (!flank && reach.to - reach.from > R(0.3) * (work->delta_hi - work->delta_lo)) {
         reach.from = work->delta_lo;
@@ -708,7 +709,9 @@ static void step_scan(selfcal_work_t *work) {
         if (cell.profile > work->best) {
             work->best = cell.profile;
             work->drop[work->hypothesis] = reach.drop;
-            memcpy(work->best_ln, ln_value, sizeof ln_value);
+            for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+                work->best_ln[p] = ln_value[p] + (p == SELFCAL_ALPHA ? R(0.0) : reach.peak);
+            }
         }
         if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
             continue;
@@ -892,7 +895,8 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
             if (s->cut) {
                 const selfcal_real_t middle = ln[j];
                 w *= permitted(s->prior, &ln[j], s->width);
-                dev[j] = r_fma(ln[j] - middle, R(1.0) + dev[j], dev[j]);
+                const selfcal_real_t moved = ln[j] - middle; /* e^moved of no cell so wide that it falls to 0 */
+                dev[j] = r_fma(moved / (R(1.0) + r_fmax(-moved, R(0.0))), R(1.0) + dev[j], dev[j]);
             }
             /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its logarithm. */
             if (s->prior->uniform) {
