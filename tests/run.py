@@ -110,7 +110,7 @@ def c_test(program: Path) -> Count:
 
 def bench() -> Count:
     """Instruction counts and sizes against the committed ones: exact, so one test."""
-    code, output = run(["make", "--silent", "bench-counts"], TIMEOUT["bench"])
+    code, output = run([*MAKE, "bench-counts"], TIMEOUT["bench"])
     skipped = code == 0 and "NOT COMPARED" in output
     count = Count(skipped=1) if skipped else Count(passed=1) if code == 0 else Count(failed=1)
     print(f"{'SKIPPED' if skipped else 'ok    ' if code == 0 else 'FAILED'} bench-counts")

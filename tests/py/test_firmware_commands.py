@@ -287,8 +287,10 @@ def test_the_serial_line_loses_nothing_beside_the_sensor(baud: int, rate_hz: flo
     assert tap.wrong() == tap.misplaced(0) == 0
 
 
-@pytest.mark.parametrize(("baud", "corrected_ms", "bank_hz"), [(9600, 0, QUIET_BANK_HZ), (115_200, 20, BANK_HZ)])
-def test_the_answer_to_a_reset_leaves_before_it(baud: int, corrected_ms: int, bank_hz: float) -> None:
+@pytest.mark.parametrize(
+    ("baud", "corrected_ms", "bank_hz", "begun"), [(9600, 0, QUIET_BANK_HZ, 2.0), (115_200, 20, BANK_HZ, 4.0)]
+)
+def test_the_answer_to_a_reset_leaves_before_it(baud: int, corrected_ms: int, bank_hz: float, begun: float) -> None:
     """Behind a second of telemetry at 9600 baud, and on a line that corrected samples fill."""
     flags = f"-DBOARD_REPORT_MS=2000 -DAPP_CORRECTED_MS={corrected_ms} {verb.build_flag(KEY)}"
     flags += f" -DBOARD_CAN_KBITPS=0 -DBOARD_USART_BAUD={baud}"
@@ -306,11 +308,11 @@ def test_the_answer_to_a_reset_leaves_before_it(baud: int, corrected_ms: int, ba
 
     board.run(0.5)
     board.usart.say(b"O\r")
-    board.run(5.55)  # the status of 6 s has just begun
-    number = struct.unpack("<I", told(verb.payload("challenge"), 1.8)[:4])[0]
-    board.run(0.2)  # ... that of 8 s
+    board.run(begun - 0.5 + 0.05)  # a status has just begun
+    number = struct.unpack("<I", told(verb.payload("challenge"), 1.3)[:4])[0]
+    board.run(0.7)  # and the next one
     assert board.machine.resets == []
-    answer = told(verb.payload("reset", key=KEY, challenge=number), 3.5)
+    answer = told(verb.payload("reset", key=KEY, challenge=number), 1.5)
     assert (answer[0], answer[1]) == (COMMAND["reset"], RESULT["done"])
     assert [cause for _, cause in board.machine.resets] == ["software"]
     assert board.machine.violations == []
