@@ -232,6 +232,14 @@ def test_a_model_name_that_ends_a_comment_is_refused(tmp_path: Path, name: str) 
         Model.load(model)
 
 
+@pytest.mark.parametrize("name", ['g"x', "gx */", "g x", ""])
+def test_an_axis_name_goes_into_the_tables(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(Path(Model.load().path).read_text().replace("axes: [gx,", f"axes: [{name!r},"))
+    with pytest.raises(UserError, match=r"groups\.gyro\.axes: a name is of letters"):
+        Model.load(path)
+
+
 def test_what_the_grid_does_not_bear_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Steps fifteen times the white noise: rho lies beyond the last node."""
     rng = np.random.default_rng(1)

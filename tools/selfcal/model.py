@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,8 @@ RATIOS = ("spectral_ratio", "markov_ratio")
 RATIO_LIMITS = (1e-3, 1e3)
 #: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/posterior.c).
 WIDEST_BIAS = 1e8
+#: The largest number of any kind: its square is still a float.
+LARGEST = 1e18
 #: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
 #: Place of each parameter there; two share one where no law has both.
@@ -220,8 +223,10 @@ class _Reader:
     def number(self, value: Any, where: str, *, low: float = 0.0, strict: bool = True) -> float:
         try:
             number = float(value)  # YAML reads 1e-3 without a dot as text
-        except (TypeError, ValueError):
-            raise self.fail(where, f"must be a number, not {value!r}") from None
+        except (TypeError, ValueError, OverflowError):
+            raise self.fail(where, f"must be a number, not {value!r:.40}") from None
+        if LARGEST < abs(number) < math.inf:
+            raise self.fail(where, f"must be within +-{LARGEST:g}: the firmware computes in float")
         if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
             bound = "above" if strict else "of at least"
             raise self.fail(where, f"must be a finite number {bound} {low:g}, not {value!r}")
@@ -257,6 +262,8 @@ class _Reader:
         axes = self.entry(fields, "axes", where)
         if not isinstance(axes, list) or not axes or not all(isinstance(axis, str) for axis in axes):
             raise self.fail(f"{where}.axes", "must be a list of axis names")
+        if not all(re.fullmatch(r"\w[\w.-]*", axis) for axis in axes):
+            raise self.fail(f"{where}.axes", "a name is of letters, digits, '_', '.' and '-': the tables have it")
         names = ("bias", *PARAMETERS, *(name for law in laws for name in LAWS[law] if name not in PARAMETERS))
         known = ("bias", *PLACES)
         trees = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")

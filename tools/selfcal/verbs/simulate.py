@@ -16,6 +16,8 @@ from selfcal.errors import UserError
 from selfcal.model import LAWS, PARAMETERS, PLACES, Group, Model, Prior
 from selfcal.tables import bank_block
 
+#: A recording is made in memory: this many samples of six axes are 24 GB.
+SAMPLES_MAX = 500_000_000
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
 _DRAWS = 2**32
 
@@ -134,6 +136,8 @@ def _scene(model: Model, seed: int) -> _reference.Scene:
     scene.samples = round(duration_s * scene.rate_hz)
     if scene.samples < 2:
         raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold fewer than two samples")
+    if scene.samples > SAMPLES_MAX:
+        raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold more than {SAMPLES_MAX:g} samples")
     scene.block = max(1, round(model.sensor_rate_hz / scene.rate_hz))
     scene.filter_taps = model.filter_taps
     return scene
