@@ -282,9 +282,9 @@ class Machine:
         self.now_us += self._spent
         self._spent = 0.0
         self._events_due()
-        while not self._reset_wanted and not self.stopped and not self.uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
+        while not self._reset_wanted and not self.stopped:
             higher = [exception for exception in self._ready() if self.priority.get(exception, 0) < priority]
-            if not higher:
+            if not higher or self.uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
                 break
             self._pending.discard(higher[0])
             self._take(higher[0])

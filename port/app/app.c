@@ -437,7 +437,7 @@ static void obey(app_t *app, uint32_t now)
         }
     } else {
         app->restarting = true;
-        app->restart_ms = now;
+        app->restart_ms = app->port->time_ms(app->port->context); /* `now` may be of before a save */
     }
     answer(app, &app->answer[OF_ORDER], command, result);
 }
@@ -512,6 +512,9 @@ static bool advance(app_t *app)
         }
 #if APP_COMMANDS
         obey(app, now);
+        if (app->restarting) {
+            return true; /* its answer is next, and nothing else */
+        }
 #endif
         app->corrupt = app->corrupt || (due && selfcal_check(&app->bank) != SELFCAL_OK);
         if (app->corrupt) {
@@ -617,7 +620,10 @@ static bool begin_frames(app_t *app)
         return true;
     }
 #endif
-    (void)now;
+    if (app->module != NULL && app->stage != STAGE_NONE && now - app->told_ms >= STATUS_MS) { /* nor for a report's end */
+        tell_status(app, now);
+        return true;
+    }
     return false;
 }
 

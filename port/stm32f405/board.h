@@ -31,7 +31,7 @@ typedef struct {
 
 extern board_clock_t board_clock;
 
-/* 168 MHz from the 8 MHz crystal, from HSI if that does not start, HSI itself if the PLL does not lock; never waits
+/* 168 MHz from the crystal (BOARD_HSE_HZ), from HSI if that does not start, HSI itself if the PLL does not lock; never waits
  * longer than about 20 ms. */
 void clock_init(void);
 

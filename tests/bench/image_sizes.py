@@ -233,6 +233,9 @@ class Image:
         vectors = self.words("vectors")
         size, path = self.deepest(vectors[1] & ~1, calls)
         handlers = {word & ~1 for word in vectors[15:] if word}
+        unknown = set(giving_way) - {self.functions[handler].name for handler in handlers}
+        if unknown:
+            raise FirmwareError(f"giving_way: no vector leads to {', '.join(sorted(unknown))}")
         text = " > ".join(path)
         for level in (True, False):
             deepest = [

@@ -202,9 +202,12 @@ def test_offsets_are_written_and_kept() -> None:
 
 
 def test_a_reset_during_a_report() -> None:
-    """The main loop is away for longer than the sensor's silence lasts: the samples' stamps tell."""
+    """The main loop is away for longer than the sensor's silence lasts: the samples' stamps tell. And a status comes,
+    which does not wait for the report's end."""
     flags = "-DBOARD_REPORT_MS=5000 -DBOARD_GATE=0"
     made = NrfBoard(image("m0-busy", flags, True, 1.024, target="cortex-m0", rate_hz=SLOW_RATE_HZ), seed=5)
+    made.run(0.1)
+    made.usart.say(b"O\r")
     tap = Tap(made)
     while not (made.value("app.computing") and made.value("app.work.hypothesis") == 2):
         made.run(0.1)  # Gauss-Markov takes seconds
@@ -216,6 +219,13 @@ def test_a_reset_during_a_report() -> None:
     assert made.value("sensor.counters.faults") >= 1
     assert set_up(made) == settings
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
+    axis = made.value("app.stage")
+    made.run(10.0)
+    assert made.value("app.computing")
+    assert made.value("app.stage") == axis
+    decoder, found = reports(messages(made))
+    assert decoder.status["sensor_fault_count"] >= 1
+    assert not found
     assert well(made)
 
 
