@@ -19,7 +19,7 @@ BUILD = ROOT / "build"
 #: s; a suite that takes longer hangs.
 TIMEOUT = {"check": 900, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
 #: s, by kernel
-FUZZ_SECONDS = {"float": 15, "fixed16": 8, "fixed32": 8}
+FUZZ_SECONDS = {"float": 12, "fixed16": 6, "fixed32": 6}
 #: At once; the machine that this is to be quick on has two cores.
 WORKERS = 2
 MAKE = ("make", "--silent", "--keep-going", "--output-sync=target", f"--jobs={WORKERS}")

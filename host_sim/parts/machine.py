@@ -366,10 +366,9 @@ class Machine:
                 self._restart()
                 continue
             ready = self._ready()
-            masked = bool(uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1)
             if ready:
                 self._asleep = False
-                if not masked:
+                if not uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
                     self._pending.discard(ready[0])
                     self._take(ready[0])
                     continue
