@@ -584,8 +584,9 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
 /* True once an axis is retired. */
 bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
-/* `count` samples are missing. The prediction over the gap is exact, however long it is. A block with half or more of its
- * samples counts as their mean with its variance raised by block / used; one with fewer is dropped. */
+/* `count` samples are missing. The prediction over the gap is exact for up to 2^32 - 1 bank intervals (136 years at 1 Hz); a
+ * longer one is taken for that. A block with half or more of its samples counts as their mean with its variance raised by
+ * block / used; one with fewer is dropped. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
