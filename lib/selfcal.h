@@ -831,9 +831,10 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
 selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *self, uint8_t axis, uint8_t mask,
                                              selfcal_coefficients_t coefficients[], selfcal_report_t *report);
 
-/* One slice of it, below 61 000 instructions on a Cortex-M4F (72 000 under uniform priors) without regressors in use, else one node's least squares. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is
- * whole. It first runs the nodes over what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a
- * call that looks at the sums, it is SELFCAL_OVERTAKEN; begin anew. */
+/* One slice of it, below 61 000 instructions on a Cortex-M4F (72 000 under uniform priors) without regressors in use, else one
+ * node's least squares. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. It first runs the nodes over
+ * what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a call that looks at the sums, it is
+ * SELFCAL_OVERTAKEN; begin anew. */
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);
 
 /* All steps in a row. */

@@ -500,6 +500,12 @@ static void tell_status(app_t *app, uint32_t now)
     app->told_ms = now;
 }
 
+/* How the module is does not wait: not for a report that is far off, nor for the end of one. */
+static bool status_due(const app_t *app, uint32_t now)
+{
+    return app->module != NULL && now - app->told_ms >= STATUS_MS;
+}
+
 /* Begins a report when one is due, and goes from its status over the axes to its end. Only with all frames out. */
 static bool advance(app_t *app)
 {
@@ -529,7 +535,7 @@ static bool advance(app_t *app)
             tell(app);
             (void)selfcal_telemetry_status(&app->telemetry, counters, SELFCAL_FINISHED, app->report_number, now);
             return true;
-        } else if (app->module != NULL && now - app->told_ms >= STATUS_MS) { /* how it is does not wait for a report that is far off */
+        } else if (status_due(app, now)) {
             tell_status(app, now);
             return true;
         } else {
@@ -596,7 +602,7 @@ static void correct(app_t *app)
 }
 #endif
 
-/* Begins what does not wait for a report's end: the report worked out, an answer. Only with all frames out. */
+/* Begins what does not wait for a report's end: the report worked out, an answer, a status. Only with all frames out. */
 static bool begin_frames(app_t *app)
 {
     const uint32_t now = app->port->time_ms(app->port->context);
@@ -620,7 +626,7 @@ static bool begin_frames(app_t *app)
         return true;
     }
 #endif
-    if (app->module != NULL && app->stage != STAGE_NONE && now - app->told_ms >= STATUS_MS) { /* nor for a report's end */
+    if (app->stage != STAGE_NONE && status_due(app, now)) { /* between reports advance() looks: one may begin with it */
         tell_status(app, now);
         return true;
     }
