@@ -260,6 +260,7 @@ def test_a_temperature_that_is_not_there_is_said(tmp_path: Path) -> None:
         ("{name: a, kind: time, sd: {}}", "at least one group"),
         ("{name: a, kind: time, sd: {compass: 1}}", "unknown entry 'compass'"),
         ("{name: a, kind: time, sd: {gyro: 0}}", "must be a finite number above 0"),
+        ("{name: a */ b, kind: time, sd: {gyro: 1}}", "without '*/'"),
         ("{name: a, kind: time, sd: {gyro: 1e300}}", "must be within +-1e+18"),
         ("{name: a, kind: time, reference: 1e300, sd: {gyro: 1}}", "must be within +-1e+18"),
         (f"{{name: a, kind: time, sd: {{gyro: 1{400 * '0'}}}}}", "must be a number, not 1000000"),

@@ -285,6 +285,13 @@ class _Reader:
             correlation_time_s=correlation_time_s,
         )
 
+    def name(self, tree: Mapping[str, Any], where: str) -> str:
+        name = str(self.entry(tree, "name", where))
+        if not name.isprintable() or "*/" in name:
+            prefix = f"{where}." if where else ""
+            raise self.fail(f"{prefix}name", "must be one line, without '*/': it goes into a comment of the tables")
+        return name
+
     def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
         if not isinstance(tree, dict):
             raise self.fail(where, "must be a mapping")
@@ -309,7 +316,7 @@ class _Reader:
             if key in REGRESSORS[kind]
         }
         return Regressor(
-            name=str(self.entry(fields, "name", where)),
+            name=self.name(fields, where),
             kind=kind,
             unit=f"{unit}/s" if kind == "rate" else unit,
             sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
@@ -374,9 +381,7 @@ class _Reader:
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
-        name = str(self.entry(tree, "name", ""))
-        if not name.isprintable() or "*/" in name:
-            raise self.fail("name", "must be one line, without '*/': it goes into a comment of the tables")
+        name = self.name(tree, "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
