@@ -193,10 +193,14 @@ typedef struct {
     selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
 
-/* What a report takes of one node: ln of sigma_v's mode, profile ln-likelihood, the share of samples that went into the bias (and the
- * coefficients), and the sum of ln s. */
+/* sigma_v's mode at a node is found by turns, to this part of its square. */
+#define SELFCAL_MODE_TURNS 20U
+#define SELFCAL_MODE_LEFT R(1e-5)
+/* What a report takes of one node: ln of sigma_v's mode, profile ln-likelihood, the sum of ln s, and what half the curvature in ln sigma_v
+ * lacks of n: a sample for the bias and each coefficient that the data tell, none for those that their priors tell. */
 typedef struct {
-    selfcal_wide_t ln_sigma, profile, share, ln_s;
+    selfcal_wide_t ln_sigma, profile, ln_s;
+    selfcal_real_t share;
 } selfcal_field_t;
 
 /* forgetting.c, for a model that forgets. */
@@ -234,7 +238,7 @@ struct selfcal_regressors_code {
     /* Forgetting, of its own sums: the readings times `part`, the column "1" times `part_of_one`. */
     void (*fade)(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one);
     /* Of one node, with the regressors of a report in use; the residual is `least` at least. */
-    void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_field_t *field);
+    void (*field)(const selfcal_work_t *work, uint16_t index, selfcal_wide_t least, selfcal_field_t *field);
     /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);

@@ -2,14 +2,15 @@
  *
  * For one hypothesis the unknowns are (rho, alpha, sigma_v); the sums give ln p(Y | node, sigma_v) in closed form. With
  * t = ln sigma_v and t^ its mode at a node,
- *     ln p = profile(node) - n_eff (delta + e^(-2 delta)/2 - 1/2),   delta = t - t^,   t^ = ln(residual / n_eff) / 2,
+ *     ln p = profile(node) - n_eff (delta + e^(-2 delta)/2 - 1/2),   delta = t - t^,
  * so the shape in delta is one for all nodes, and only profile and t^ have to be interpolated between nodes, in ln rho and
  * ln alpha. Both follow from the innovations' variance. What that is expected to be, for data of the best of all nodes, has a
  * closed form (expected() below); it carries the terms of order n. Those of order sqrt(n) say by how much the data's spectrum
  * happens to differ from that one: this is fitted to the nodes of all laws (step_fit() below). A quintic spline takes what is left.
- * n_eff = n - w: the bias takes the share w = P0 A/(P0 A + sigma_v^2)
- * of one sample, 1 under a wide bias prior; w is taken at the best node (exact for w = 0 or 1, else first order in delta). With
- * regressors in use each coefficient takes such a share as well.
+ * Under the priors of the bias and of the coefficients, t^ has no closed form: it is found by turns, with
+ *     sigma_v^2 = (residual + noise) / (n - w),   w = P0 A/(P0 A + sigma_v^2),   noise = (1 - w)^2 A (x0^ - x0 prior)^2,
+ * w being the share of one sample that the bias takes, 1 under a wide prior. n_eff is half the curvature there, of the best node; the shape
+ * is exact for w = 0 or 1, else to the second order in delta. With regressors in use each coefficient takes such a share as well.
  *
  * The integral runs over cells (midpoint rule: for a smooth peak it converges faster than any power of the cell). First
  * passes find the box that holds the posterior, the last one sums. Priors enter per cell, limits by the part of the cell
@@ -154,7 +155,7 @@ static bool has_expectation(const selfcal_work_t *work) {
 
 /* What the expectation says of the two fields, the splines hold the rest; and of which filter. */
 typedef struct {
-    selfcal_real_t profile, ln_sigma;
+    selfcal_wide_t profile, ln_sigma;
     selfcal_real_t beta_sq, phi, p_sq, psi; /* |1 - phi e^(i omega)|^2 = beta_sq + phi distance, |1 - psi e^(i omega)|^2 = p_sq + psi distance */
     selfcal_real_t edge, level;             /* see lines and edges below */
     selfcal_real_t ln_v, per_v;             /* of the innovations' variance without lines and edges, ln and inverse */
@@ -214,35 +215,46 @@ static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfc
     if (truth->fitted) {
         ln_v += (selfcal_wide_t)r_log1p(r_fmax(fitted(truth, e) * e->per_v, R(-0.99)));
     }
-    e->profile = (selfcal_real_t)(-0.5 * work->bank->weight * (ln_v - (selfcal_wide_t)truth->ln_v));
-    e->ln_sigma = (selfcal_real_t)(0.5 * (ln_v - ln_s));
+    e->profile = -0.5 * work->bank->weight * (ln_v - (selfcal_wide_t)truth->ln_v);
+    e->ln_sigma = 0.5 * (ln_v - ln_s);
 }
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
 
-/* Of the hypothesis's node k, for the given n_eff. */
-static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_wide_t n_eff, selfcal_field_t *field) {
+/* Of the hypothesis's node k. */
+static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *field) {
     const selfcal_t *bank = work->bank;
     const uint16_t index = (uint16_t)(work->first_node + k);
     const selfcal_wide_t n = bank->weight;
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
-    const selfcal_wide_t p0 = sd * sd;
     /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior. */
-    const selfcal_wide_t floor_sd = 1e-9 * sd, least = n_eff * floor_sd * floor_sd;
+    const selfcal_wide_t floor_sd = 1e-9 * sd, least = floor_sd * floor_sd;
     if (work->mask != 0U) {
-        bank->model->regressors->code->field(work, index, n_eff, least, field);
+        bank->model->regressors->code->field(work, index, n * least, field);
         return;
     }
     selfcal_node_view_t v;
     selfcal_bank_view(bank, work->axis, index, &v);
-    const selfcal_wide_t residual = fmax(v.c - v.b * v.b / v.a, least);
-    const selfcal_wide_t var = residual / n_eff;
-    const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis);
-    field->ln_sigma = 0.5 * log(var);
+    const selfcal_wide_t var = fmax((v.c - v.b * v.b / v.a) / n, least); /* of the residual; the rest is in units of it */
+    const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis), known = v.a / var;
+    const selfcal_real_t beginning = (selfcal_real_t)bank->beginning, size = (selfcal_real_t)n;
+    const selfcal_real_t width = (selfcal_real_t)(sd * sd * known), missed = beginning * (selfcal_real_t)(miss * miss * known);
+    /* The mode: the bias takes a share of one sample; of how far it missed its prior, what that leaves is noise. */
+    selfcal_real_t ratio = R(1.0), before, rest, share, noise;
+    unsigned turns = SELFCAL_MODE_TURNS;
+    do {
+        before = ratio;
+        rest = ratio / (width + ratio);
+        share = R(1.0) - rest;
+        noise = missed * rest * rest;
+        ratio = (size + noise) / r_fma(-beginning, share, size);
+    } while (r_fabs(ratio - before) > SELFCAL_MODE_LEFT * ratio && --turns > 0U);
+    noise /= ratio;
+    field->ln_sigma = 0.5 * log(var * (selfcal_wide_t)ratio);
     field->ln_s = v.ln_s;
-    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field->ln_sigma) + v.ln_s + n_eff +
-                             bank->beginning * (log1p(p0 * v.a / var) + miss * miss / (var / v.a + p0)));
-    field->share = p0 * v.a / (p0 * v.a + var);
+    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field->ln_sigma + 1.0 / (selfcal_wide_t)ratio) + v.ln_s +
+                             (selfcal_wide_t)(missed * rest / ratio - beginning * r_log(rest)));
+    field->share = share * r_fma(beginning, share, noise + noise);
 }
 
 /* delta + e^(-2 delta)/2 - 1/2: two terms of delta's order leave one of delta^2; n_eff times what that costs in float is 2e-3 where n_eff
@@ -273,7 +285,7 @@ static void sigma_cells(selfcal_work_t *work, selfcal_real_t from, selfcal_real_
     }
     work->delta_from = from;
     work->delta_width = width;
-    const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
+    const selfcal_real_t n_eff = work->n_eff;
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
         const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width;
         work->delta_expm1[k] = r_expm1(delta);
@@ -322,12 +334,12 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
     const selfcal_wide_t n = work->bank->weight;
     if (work->at == 0U) {
         work->peak = (selfcal_wide_t)-INFINITY;
-        work->n_eff = n - (selfcal_wide_t)work->unknowns;
+        work->n_eff = (selfcal_real_t)n;
     }
     for (uint16_t k = part(work, step_nodes(work), nodes); k < work->at; k++) {
         work->hypothesis = place_of(work, k).hypothesis;
         selfcal_field_t field;
-        node_field(work, k, n - (selfcal_wide_t)work->unknowns, &field);
+        node_field(work, k, &field);
         if (hypothesis_of(work)->rho == NULL) {
             work->truth.ln_noise = (selfcal_real_t)(0.5 * field.ln_s / n);
         }
@@ -338,7 +350,7 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
         }
         if (field.profile > work->peak) {
             work->peak = field.profile;
-            work->n_eff = n - field.share;
+            work->n_eff = (selfcal_real_t)n - field.share;
             work->best_node = k;
         }
     }
@@ -350,10 +362,10 @@ static void step_values(selfcal_work_t *work) {
         const selfcal_place_t place = place_of(work, k);
         expectation_t e;
         selfcal_field_t exact;
-        node_field(work, k, work->n_eff, &exact);
+        node_field(work, k, &exact);
         expectation(work, place.ln_rho, place.ln_alpha, &e);
-        work->scratch.grid.field[0][k] = (selfcal_real_t)(exact.profile - work->peak - (selfcal_wide_t)e.profile);
-        work->scratch.grid.field[1][k] = (selfcal_real_t)(exact.ln_sigma - (selfcal_wide_t)e.ln_sigma);
+        work->scratch.grid.field[0][k] = (selfcal_real_t)(exact.profile - work->peak - e.profile);
+        work->scratch.grid.field[1][k] = (selfcal_real_t)(exact.ln_sigma - e.ln_sigma);
     }
 }
 
@@ -485,10 +497,10 @@ static void step_fit(selfcal_work_t *work) {
     expectation_t e;
     selfcal_field_t field;
     expectation(work, place.ln_rho, place.ln_alpha, &e);
-    node_field(work, k, work->n_eff, &field);
+    node_field(work, k, &field);
     /* As its filters settle an even record comes to 8 nats, and to 16 with some gaps; that much does not count as missed. */
-    const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - e.ln_sigma) + e.ln_v;
-    const selfcal_real_t off = (selfcal_real_t)(field.ln_sigma - (selfcal_wide_t)e.ln_sigma);
+    const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - (selfcal_real_t)e.ln_sigma) + e.ln_v;
+    const selfcal_wide_t off = field.ln_sigma - e.ln_sigma;
     truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
     if (at == 0U) {
         work->ln_sigma_off = off;
@@ -496,7 +508,7 @@ static void step_fit(selfcal_work_t *work) {
         truth->wide = (selfcal_real_t)work->bank->weight * e.ln_v > WIDE_BEYOND;
         set_lines(work);
     } else {
-        add_row(work, &e, off - work->ln_sigma_off, (selfcal_real_t)(work->peak - field.profile));
+        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), (selfcal_real_t)(work->peak - field.profile));
     }
 }
 
@@ -607,8 +619,8 @@ static void make_cell(const selfcal_work_t *work, uint16_t i, cell_t *cell) {
     }
     expectation_t e;
     expectation(work, cell->ln_rho, row->ln_alpha, &e);
-    cell->profile += e.profile;
-    cell->ln_sigma += e.ln_sigma;
+    cell->profile += (selfcal_real_t)e.profile;
+    cell->ln_sigma += (selfcal_real_t)e.ln_sigma;
 }
 
 /* Part of [*middle - width/2, *middle + width/2] that the prior's limits leave, whose middle *middle becomes. */
@@ -646,7 +658,7 @@ typedef struct {
  * the other side. Away from the mode the height falls by SIGMA_DEPTH sooner than about it (the shape is convex), at the peak's slope or faster. */
 static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_real_t n_eff = (selfcal_real_t)work->n_eff;
+    const selfcal_real_t n_eff = work->n_eff;
     reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0), R(0.0)};
     bool flank = false;
     for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
@@ -1397,8 +1409,8 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case SIGMA:
-        work->delta_lo = sigma_end((selfcal_real_t)work->n_eff, R(-1.0));
-        work->delta_hi = sigma_end((selfcal_real_t)work->n_eff, R(1.0));
+        work->delta_lo = sigma_end(work->n_eff, R(-1.0));
+        work->delta_hi = sigma_end(work->n_eff, R(1.0));
         work->delta_from = work->delta_hi; /* no cells yet */
         go_to(work, VALUES);
         break;

@@ -274,7 +274,9 @@ typedef struct {
 typedef struct {
     selfcal_wide_t ln_det;   /* ln det(1 + P0 A / sigma_v^2), P0 the covariance of all priors */
     selfcal_wide_t miss;     /* square of what the estimate misses the priors' mean by, over the sum of their covariances */
-    selfcal_wide_t share;    /* of samples that went into the unknowns: tr((A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2), 0 to order */
+    selfcal_wide_t share;    /* of samples that went into the unknowns: tr U, U = (A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2, 0 to order */
+    selfcal_wide_t noise;    /* part of `miss` that goes as 1/sigma_v^2: what the priors leave unexplained */
+    selfcal_wide_t bent;     /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
     selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
     selfcal_now_t now;
 } fit_t;
@@ -428,11 +430,14 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
     fit->now.mean = normal->node.drift;
     memcpy(fit->now.drift, normal->drift, sizeof fit->now.drift);
     selfcal_wide_t x0_off = 0.0;
+    selfcal_wide_t pulled[UNKNOWNS_MAX], taken[UNKNOWNS_MAX][UNKNOWNS_MAX];
+    fit->noise = 0.0;
     for (uint8_t i = 0; i < order; i++) {
-        for (uint8_t j = 0; j <= i; j++) {
-            fit->miss += (j < i ? 2.0 : 1.0) * shift[i] * normal->a[i][j] * shift[j] / variance;
+        pulled[i] = 0.0;
+        for (uint8_t j = 0; j < order; j++) {
+            pulled[i] += (j <= i ? normal->a[i][j] : normal->a[j][i]) * shift[j] / variance;
         }
-        fit->miss -= 2.0 * shift[i] * normal->rest[i] / variance;
+        fit->noise += shift[i] * (pulled[i] - 2.0 * normal->rest[i] / variance);
         const selfcal_wide_t off = from_prior[i] + shift[i];
         x0_off += i == 0U ? off : -off * normal->first[i];
         fit->miss += i == 0U ? 0.0 : off * off / (normal->sd[i] * normal->sd[i]);
@@ -442,10 +447,10 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
             fit->now.drift[t] -= fit->mean[i] * normal->lost[i][t];
         }
     }
-    fit->miss += x0_off * x0_off / p0;
+    fit->miss += x0_off * x0_off / p0 + fit->noise;
     /* Columns of G^-1. */
     memset(fit->now.own, 0, sizeof fit->now.own);
-    fit->share = 0.0;
+    fit->share = fit->bent = 0.0;
     for (uint8_t i = 0; i < order; i++) {
         selfcal_wide_t column[UNKNOWNS_MAX] = {0.0};
         column[i] = 1.0;
@@ -459,7 +464,15 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
                     fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] * normal->lost[j][u] / variance;
                 }
             }
-            fit->share += (j <= i ? normal->a[i][j] : normal->a[j][i]) * column[j] / variance;
+            fit->bent += 2.0 * pulled[i] * column[j] * pulled[j];
+            taken[i][j] = 0.0;
+            for (uint8_t k = 0; k < order; k++) {
+                taken[i][j] += column[k] * (j <= k ? normal->a[k][j] : normal->a[j][k]) / variance;
+            }
+        }
+        fit->share += taken[i][i];
+        for (uint8_t j = 0; j <= i; j++) {
+            fit->bent += (j < i ? 2.0 : 1.0) * taken[i][j] * taken[j][i];
         }
     }
 }
@@ -489,17 +502,24 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
 
 /* ---------------------------------------------------------------------------------------------------------- report */
 
-static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t n_eff, selfcal_wide_t least, selfcal_field_t *result) {
+static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t least, selfcal_field_t *result) {
+    const selfcal_wide_t n = work->bank->weight, beginning = work->bank->beginning;
     normal_t normal;
     fit_t fit;
     make_normal(work->bank, work->axis, index, work->mask, &normal);
-    const selfcal_wide_t variance = fmax(normal.residual, least) / n_eff;
-    make_fit(&normal, variance, &fit);
+    const selfcal_wide_t residual = fmax(normal.residual, least);
+    selfcal_wide_t variance = residual / (n - (selfcal_wide_t)work->unknowns), before;
+    unsigned turns = SELFCAL_MODE_TURNS;
+    do { /* as node_field() in posterior.c */
+        before = variance;
+        make_fit(&normal, variance, &fit);
+        variance = (residual + beginning * fit.noise * variance) / (n - beginning * fit.share);
+    } while (fabs(variance - before) > (selfcal_wide_t)SELFCAL_MODE_LEFT * variance && --turns > 0U);
     result->ln_sigma = 0.5 * log(variance);
     result->ln_s = normal.node.ln_s;
-    result->profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + 2.0 * result->ln_sigma) + normal.node.ln_s + n_eff +
-                              work->bank->beginning * (fit.ln_det + fit.miss));
-    result->share = fit.share;
+    result->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * result->ln_sigma) + normal.node.ln_s + residual / variance +
+                              beginning * (fit.ln_det + fit.miss));
+    result->share = (selfcal_real_t)(beginning * fit.bent);
 }
 
 /* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances over

@@ -781,11 +781,11 @@ typedef struct {
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     uint16_t best_node;      /* of all: the likeliest */
-    selfcal_real_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
+    selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
     selfcal_truth_t truth;
     /* of the hypothesis in hand */
     selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
-    selfcal_wide_t n_eff;    /* bank samples less the share of one that the bias took */
+    selfcal_real_t n_eff;    /* bank samples less those that bias and coefficients took */
     bool moved;              /* the box is to change after a pass */
     uint8_t cells;           /* a dimension: fewer in the search than in the sums */
     /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
