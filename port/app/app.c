@@ -197,6 +197,9 @@ static void give(app_t *app, const float reading[])
 {
 #if SELFCAL_MODEL_GATE
     if (app->gated) {
+        if (app->bank.retired != 0U) { /* also from the saved state */
+            leave_out_retired(app);
+        }
         const selfcal_motion_t before = app->gate.state;
         const selfcal_motion_t now = selfcal_gate_push(&app->gate, reading);
         learn_noise(app);
@@ -210,11 +213,6 @@ static void give(app_t *app, const float reading[])
     }
 #endif
     (void)selfcal_push(&app->bank, reading); /* what it rejects it counts */
-#if SELFCAL_MODEL_GATE
-    if (app->gated && app->bank.retired != 0U) {
-        leave_out_retired(app);
-    }
-#endif
 }
 
 #if APP_CORRECTED_MS

@@ -474,6 +474,22 @@ def test_corrected_samples_are_of_sound_samples() -> None:
     assert corrected(board, since) != []
 
 
+def test_a_retired_axis_shuts_no_gate_after_a_restart() -> None:
+    """gy is thrown from rail to rail for ever and is retired, at rest and in the saved state: the gate, which comes
+    before the state that is found, does not take it for motion for ever."""
+    board = Board(image(**ORDERS), seed=36)
+    board.run(3.0)
+    rest = board.sensor.source
+    board.sensor.source = lambda k: (rest(k)[0], 7000.0 * math.copysign(1.0, math.sin(k * k)), *rest(k)[2:])
+    board.run(16.0)
+    assert status(board)["axes_retired"] == 0b10
+    assert obey(board, "save", seconds=3.5) == [RESULT["done"]]
+    board.power_cycle()
+    board.run(6.0)
+    told = status(board)
+    assert (told["state_found"], told["axes_retired"], told["motion"]) == (1, 0b10, RESTING)
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_channel_that_stands_still_has_no_corrected_samples(moving: bool) -> None:
     """gx gives one reading for ever, `stuck_limit` is 1000: after 9.8 s none of it, at rest and while the module moves,

@@ -352,17 +352,24 @@ class Link:
 
     def open_again(self) -> None:
         """Open the channel of a serial line once more; on other buses nothing happens."""
+        self._order("open")
+
+    def close_channel(self) -> None:
+        """Close the channel of a serial line, not the line; on other buses nothing happens."""
+        self._order("close")
+
+    def _order(self, name: str) -> None:
         import can
         from can.interfaces.slcan import slcanBus
 
         try:
             if isinstance(self.bus, slcanBus):
-                self.bus.open()
+                getattr(self.bus, name)()
         except (OSError, can.CanError):
             self.closed = True
 
     def close(self) -> None:
-        """Close the channel; a line that is gone already is no error."""
+        """Close channel and line; one that is gone already is no error."""
         import can
 
         try:

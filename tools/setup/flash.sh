@@ -40,7 +40,7 @@ fi
 
 make --no-print-directory firmware || exit 1
 image=build/$target/selfcal
-echo "$flasher writes $image$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../' "build/$target/flags" 2>/dev/null)"
+echo "$flasher writes $image$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../; s/^ *\(.\)/ \1/' "build/$target/flags" 2>/dev/null)"
 case $flasher in
 openocd) exec openocd -f "$interface" -f "$chip" -c "program $image.elf verify reset exit" ;;
 st-flash) exec st-flash --reset write "$image.bin" 0x08000000 ;;

@@ -210,11 +210,22 @@ def run(
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
                 with open_bus("slcan", channel, bitrate=500000, sleep_after_open=0.0) as link:
                     finished = _watch(link, recording, history, target)
-            said = before + module.communicate(timeout=TIMEOUT_S)[0]
+                    link.close_channel()
+                    said = before + _ending(module)  # the emulator forgets what it holds of a line that is closed
+            else:
+                said = before + _ending(module)
         if module.returncode != 0 or not finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
             raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
     return history
+
+
+def _ending(module: subprocess.Popen[str]) -> str:
+    """What the firmware says from here on, its channel being closed."""
+    try:
+        return module.communicate(timeout=TIMEOUT_S)[0]
+    except subprocess.TimeoutExpired:
+        raise UserError(f"the firmware did not end within {TIMEOUT_S:g} s of its last frame") from None
 
 
 @contextmanager
