@@ -226,9 +226,9 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
     const selfcal_t *bank = work->bank;
     const uint16_t index = (uint16_t)(work->first_node + k);
     const selfcal_wide_t n = bank->weight;
-    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
-    /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior. */
-    const selfcal_wide_t floor_sd = 1e-9 * sd, least = floor_sd * floor_sd;
+    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, p0 = sd * sd;
+    /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior's N over the largest rho. */
+    const selfcal_wide_t least = 1e-28 * p0;
     if (work->mask != 0U) {
         bank->model->regressors->code->field(work, index, n * least, field);
         return;
@@ -238,8 +238,9 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
     const selfcal_wide_t var = fmax((v.c - v.b * v.b / v.a) / n, least); /* of the residual; the rest is in units of it */
     const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis), known = v.a / var;
     const selfcal_real_t beginning = (selfcal_real_t)bank->beginning, size = (selfcal_real_t)n;
-    const selfcal_real_t width = (selfcal_real_t)(sd * sd * known), missed = beginning * (selfcal_real_t)(miss * miss * known);
-    /* The mode: the bias takes a share of one sample; of how far it missed its prior, what that leaves is noise. */
+    const selfcal_real_t width = (selfcal_real_t)(p0 * known), missed = beginning * (selfcal_real_t)(miss * miss * known);
+    /* The mode: the bias takes a share of one sample; of how far it missed its prior, what that leaves is noise. (Beyond 10 sd of the prior
+     * there is another, where all of that is noise; this one says what the readings scatter by.) */
     selfcal_real_t ratio = R(1.0), before, rest, share, noise;
     unsigned turns = SELFCAL_MODE_TURNS;
     do {
@@ -250,9 +251,10 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
         ratio = (size + noise) / r_fma(-beginning, share, size);
     } while (r_fabs(ratio - before) > SELFCAL_MODE_LEFT * ratio && --turns > 0U);
     noise /= ratio;
-    field->ln_sigma = 0.5 * log(var * (selfcal_wide_t)ratio);
+    const selfcal_wide_t ln_var = log(var * (selfcal_wide_t)ratio);
+    field->ln_sigma = 0.5 * ln_var;
     field->ln_s = v.ln_s;
-    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * field->ln_sigma + 1.0 / (selfcal_wide_t)ratio) + v.ln_s +
+    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + ln_var + 1.0 / (selfcal_wide_t)ratio) + v.ln_s +
                              (selfcal_wide_t)(missed * rest / ratio - beginning * r_log(rest)));
     field->share = share * r_fma(beginning, share, noise + noise);
 }
@@ -334,7 +336,6 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
     const selfcal_wide_t n = work->bank->weight;
     if (work->at == 0U) {
         work->peak = (selfcal_wide_t)-INFINITY;
-        work->n_eff = (selfcal_real_t)n;
     }
     for (uint16_t k = part(work, step_nodes(work), nodes); k < work->at; k++) {
         work->hypothesis = place_of(work, k).hypothesis;

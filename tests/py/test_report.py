@@ -227,6 +227,25 @@ def test_limits_of_n_that_cut_the_posterior(n: int, low: float, high: float) -> 
             assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
 
 
+@pytest.mark.parametrize(("axis", "law"), [("ax", "random_walk"), ("gx", "constant")])
+def test_a_wide_bias_prior_costs_its_width_alone(axis: str, law: str) -> None:
+    """ln evidence less that under a narrower prior is the ln of the ratio of their widths, both being far wider than
+    what the record tells of the bias; up to 1e8 times N's minimum, the most that a model may have."""
+    group = MODEL.group_of(axis)
+    least = group.priors["N"].min
+    y = simulate_bank_samples(law, {"N": 1.2 * least, "K": 0.1 * least}, 1.0, 1000, 1)[0]
+    reports = []
+    for sd in (1e4 * least, 0.99e8 * least):
+        bank = Bank(tables_of(MODEL, axis=axis, bias_sd=sd))
+        push(bank, y)
+        reports.append(bank.report(0))
+    narrow, wide = reports
+    for one in narrow.log_evidence:
+        assert narrow.log_evidence[one] - wide.log_evidence[one] == pytest.approx(math.log(0.99e4), abs=0.01)
+        for name, found in narrow.parameters[one].items():
+            assert wide.parameters[one][name].mean == pytest.approx(found.mean, abs=0.01 * found.sd)
+
+
 @pytest.mark.parametrize("factor", [1.06, 1.2, 3.0])
 def test_noise_beyond_the_priors_is_no_drift(factor: float) -> None:
     """White noise above N's maximum by 9 sd and more of what the record tells lies outside the priors: it is not
