@@ -255,7 +255,7 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
     field->ln_sigma = 0.5 * ln_var;
     field->ln_s = v.ln_s;
     field->profile = -0.5 * (n * (SELFCAL_LN_2PI + ln_var + 1.0 / (selfcal_wide_t)ratio) + v.ln_s +
-                             (selfcal_wide_t)(missed * rest / ratio - beginning * r_log(rest)));
+                             (selfcal_wide_t)(missed / (width + ratio) - beginning * r_log(rest)));
     field->share = share * r_fma(beginning, share, noise + noise);
 }
 

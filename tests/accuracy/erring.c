@@ -110,6 +110,7 @@ int main(int argc, char **argv) {
     for (unsigned axis = 0; axis < AXES; axis++) {
         axes[axis] = selfcal_model.axis[0];
         axes[axis].range = 0.0F;
+        axes[axis].bias_sd = 400.0F; /* no further from its prior than it may be */
     }
     for (int k = 2; k < argc; k++) {
         const unsigned n = (unsigned)atoi(argv[k]);
