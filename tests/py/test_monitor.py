@@ -178,6 +178,19 @@ def test_view_of_what_the_grid_does_not_bear(monkeypatch: pytest.MonkeyPatch) ->
             assert ("not borne by the grid" in shown(view)) == said
 
 
+def test_view_tells_the_status_by_its_names() -> None:
+    """What is not 0 of it, choices by the DBC's names, axes by theirs."""
+    decoder = Decoder()
+    decoder.status.update(sensor_state=3.0, sensor_fault=1.0, sensor_fault_count=3.0, bus_off_count=0.0)
+    decoder.status.update(state=1.0, axes_retired=0b100010, offset_gx=0.25)
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        picture = shown(View(decoder, Link(bus), "test"))
+    assert "running" in picture
+    for said in ("state failed", "fault absent", "fault_count 3", "axes_retired gy,az", "offset_gx 0.25 deg/s"):
+        assert said in picture
+    assert "bus_off_count" not in picture
+
+
 def test_monitor_function_raises_user_errors() -> None:
     with pytest.raises(UserError, match="cannot open"):
         monitor(channel="/dev/no-such-device")

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from selfcal.model import LAWS, SUMS
-from selfcal.wire import OFF_GRID, AxisReport, Decoder, Link, signal_unit
+from selfcal.wire import OFF_GRID, AxisReport, Decoder, Link, signal_unit, status_text
 
 SHORT = {
     "constant": "const",
@@ -23,6 +23,10 @@ SHORT = {
     "moving_average": "r.w.+MA",
     "walk_and_markov": "r.w.+G-M",
 }
+#: Of the status, what is told elsewhere or to programs alone.
+UNTOLD = ("time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent")
+#: What the user has to do something about.
+TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 BAR = 6  # characters of a probability bar
 WIDE = 110  # columns of a terminal with room for the bars
@@ -30,7 +34,7 @@ NEW_LINE = "\n"
 
 
 class View:
-    """The last report of each axis, with its bank samples under its name, the module's state and the frame counts.
+    """The last report of each axis, with its bank samples under its name, the module's status and the frame counts.
 
     A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value, and
     what the module has no number for as `-`.
@@ -67,8 +71,18 @@ class View:
         if self._total_s is not None:
             parts.append(ProgressBar(self._total_s, min(time_s, self._total_s), width=WIDE // 2))
             parts.append(Text())
-        parts += [self._table(), Text(frame_counts(self._decoder, self._link), "dim")]
+        parts += [self._status(), self._table(), Text(frame_counts(self._decoder, self._link), "dim")]
         return Group(*parts)
+
+    def _status(self) -> Text:
+        """What the status says that is not 0, by its signals' names (GUIDE.md, What the status says)."""
+        said = Text()
+        for name, value in self._decoder.status.items():
+            if name not in UNTOLD and value != 0.0:
+                text = status_text(name, value)
+                trouble = TROUBLE.get(name) == text or name in ("sensor_fault", "axes_retired", "state_refused")
+                said.append(f"{name} {text}   ", "red" if trouble else "dim")
+        return said
 
     def _table(self) -> Table:
         wide = self._console.width >= WIDE

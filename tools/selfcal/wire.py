@@ -66,6 +66,16 @@ def signal_unit(axis: str, signal: str) -> str:
     return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name(signal).unit or ""
 
 
+def status_text(signal: str, value: float) -> str:
+    """A value of the status as the DBC names it, else the number with its unit; axes for a mask of them."""
+    entry = load_dbc().get_message_by_name("STATUS").get_signal_by_name(signal)
+    if entry.choices:
+        return str(entry.choices.get(int(value), f"{value:g}"))
+    if signal == "axes_retired":
+        return ",".join(axis for index, axis in enumerate(AXES) if int(value) >> index & 1)
+    return f"{int(value)}" if value == int(value) and not entry.unit else f"{value:g} {entry.unit or ''}".strip()
+
+
 def _crc_table() -> tuple[int, ...]:
     table = []
     for byte in range(256):
