@@ -62,6 +62,9 @@ enum { CHECKS_TRIED = 3 };
 #define BACKOFF_MIN_US 100000U
 #define BACKOFF_MAX_US 10000000U
 enum { PROVEN_SAMPLES = 1000 };
+/* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones are not taken: the
+ * sensor's clock is another. After a start none is taken before one that is in its place. */
+enum { OFF_RATE_TAKEN = 3 };
 
 enum { STEP_PULSE, STEP_BOOT, STEP_SELF_TEST };
 
@@ -476,6 +479,7 @@ static void start_on(adis16405_t *self, uint64_t now)
     expect(self, now);
     self->seen_us = now;
     self->checked_us = now;
+    self->off_rate = OFF_RATE_TAKEN;
     self->doubtful = false;
     self->equal = 0;
     self->unproven = CHANGES_ASKED;
@@ -576,6 +580,13 @@ static uint32_t periods(adis16405_t *self, uint64_t stamp)
     return count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
 }
 
+/* Whether `step` is an eighth of a period or more from the nearest whole number of them, one at least. */
+static bool off_grid(uint64_t step, uint64_t period)
+{
+    const uint64_t over = step < period ? 0U : (step - period) % period, off = over < period - over ? over : period - over;
+    return 8U * (step < period ? period - step : off) >= period;
+}
+
 bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing)
 {
     while (self->tail != self->head) {
@@ -592,6 +603,10 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         }
         const uint64_t step = stamp - self->seen_us, period = self->nominal_q8 >> 8, doubt = period + period / 2U;
         self->seen_us = stamp;
+        self->off_rate = off_grid(step, period) ? self->off_rate + 1U : 0U;
+        if (self->off_rate > OFF_RATE_TAKEN) {
+            continue;
+        }
         self->doubtful = self->doubtful || step > (DOUBT_US > doubt ? DOUBT_US : doubt) || step < period - period / 4U;
         if (self->doubtful && (!look_after(self, now) || self->doubtful)) {
             continue;

@@ -559,6 +559,27 @@ def test_clock_jitter() -> None:
     assert survived == trials
 
 
+@pytest.mark.parametrize(("target", "factor"), [("stm32f405", 2.0), ("stm32f405", 1.3), ("stm32f405", 0.8), ("cortex-m0", 1.3)])
+def test_another_rate_than_the_one_set(target: str, factor: float) -> None:
+    """The sensor's registers stand and its clock is another: that is a fault and not a stream of samples at wrong
+    times. Three are taken before it is seen, and once the clock is right again the module goes on."""
+    board = quiet(target, seed=7)
+    tap = Tap(board)
+    board.run(1.5)
+    right = board.sensor.period_us
+    taken = len(tap.pushed)
+    board.sensor.period_us = lambda: right() / factor
+    board.run(1.5)
+    told = status(board)
+    assert told["sensor_fault"] == NO_DATA
+    assert told["sensor_fault_count"] > 0
+    assert len(tap.pushed) - taken <= 4  # one may have been on its way
+    board.sensor.period_us = right
+    board.run(3.0)
+    assert status(board)["sensor_state"] == RUNNING
+    assert board.machine.violations == []
+
+
 def test_bus_off_and_back() -> None:
     """A bus with errors on every frame: bus-off, recovery by itself, frames again, samples never touched."""
     trials, survived = 3 * MANY, 0
