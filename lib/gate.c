@@ -304,7 +304,57 @@ static void measure(selfcal_gate_t *gate, const float scatter[], const float mea
 static void blind_window(selfcal_gate_t *gate) {
     gate->counters.blind++;
     gate->state = SELFCAL_MOVING;
-    gate->quiet = 0;
+    gate->quiet = gate->calm = 0;
+}
+
+/* What a chi-square variable of `nu` degrees of freedom exceeds once in 30 000 times: 4 sd of its cube root (Wilson & Hilferty). */
+static float seldom(float nu) {
+    const float variance = 2.0F / (9.0F * nu), root = 1.0F - variance + 4.0F * sqrtf(variance);
+    return nu * root * root * root;
+}
+
+/* Whether the noise has become another: by that which the gate started from, the most that there is at rest, `settle` windows in a row were
+ * quiet and on one level. The gate then starts from it anew. */
+static bool noise_is_another(selfcal_gate_t *gate, const float mean[], const float scatter[], selfcal_real_t inv_n) {
+    float t1 = 0.0F, t2 = 0.0F, axes = 0.0F;
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        if (present(gate, axis)) {
+            const float sigma = gate->config.sigma[axis], off = (mean[axis] - gate->calm_level.mean[axis]) / sigma;
+            t1 += scatter[axis] / sigma / sigma;
+            t2 += off * off;
+            axes += 1.0F;
+        }
+    }
+    const bool moved = gate->calm > 0U && !(t2 / (float)(inv_n + gate->calm_level.gamma) <= seldom(axes));
+    if (moved || !(t1 <= seldom(axes * (float)(gate->used - 1U)))) {
+        gate->calm = 0;
+        return false;
+    }
+    if (gate->calm == 0U) {
+        set_level(gate, &gate->calm_level, mean, inv_n);
+    } else {
+        merge(gate, &gate->calm_level, mean, inv_n);
+    }
+    gate->calm++;
+    if (gate->config.settle == 0U || gate->calm <= gate->config.settle) {
+        return false;
+    }
+    for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
+        if (present(gate, axis)) {
+            const selfcal_gate_noise_t white = {gate->config.sigma[axis], 1.0F, 1.0F, 1.0F};
+            gate->axis[axis] = white;
+        }
+        gate->sum_scatter[axis] = gate->sum_scatter_sq[axis] = gate->sum_level_sq[axis] = 0.0;
+    }
+    gate->measured = 0;
+    gate->work = WORK_BEGIN;
+    return true;
+}
+
+static void rest_at(selfcal_gate_t *gate, const selfcal_level_t *level) {
+    gate->rest = *level;
+    gate->rested = true;
+    gate->state = SELFCAL_RESTING;
 }
 
 static void judge(selfcal_gate_t *gate) {
@@ -336,7 +386,11 @@ static void judge(selfcal_gate_t *gate) {
         }
         gate->counters.alarms++;
         gate->state = SELFCAL_MOVING;
-        gate->quiet = 0; /* Not even the first of the quiet ones: picked for its odd mean, it would make a bad level. */
+        gate->quiet = gate->calm = 0; /* Not even the first of the quiet ones: picked for its odd mean, it would make a bad level. */
+        return;
+    }
+    if (noise_is_another(gate, mean, scatter, inv_n)) {
+        rest_at(gate, &gate->calm_level);
         return;
     }
     bool moved = false;
@@ -358,9 +412,7 @@ static void judge(selfcal_gate_t *gate) {
     const bool back = !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true) <= gate->rate_moved_above;
     const bool settled = gate->config.settle > 0U && gate->quiet > gate->config.settle;
     if (gate->quiet > gate->config.hold && (back || settled)) {
-        gate->rest = gate->found;
-        gate->rested = true;
-        gate->state = SELFCAL_RESTING;
+        rest_at(gate, &gate->found);
     }
 }
 

@@ -859,7 +859,7 @@ typedef struct {
     uint32_t window;   /* samples, 2 or more; a divisor of the bank's block, see selfcal_moving() */
     float false_alarm; /* probability that a window of rest is taken for motion, up to 0.1; 0: never, to measure the noise */
     uint32_t hold;     /* windows in a row, after a first one, that must be quiet and on one level before motion is over; 1 or more */
-    uint32_t settle;   /* likewise to take a new gyro level for rest; below `hold` it does nothing, 0: never */
+    uint32_t settle;   /* likewise to take a new gyro level, or more noise, for rest; below `hold` it does nothing, 0: never */
     uint32_t memory;   /* windows that the level at rest is averaged over, 1 or more; over as many the bias must not drift by more
                           than the noise of a window's mean. A rotation is found by its distance from that level. */
     float sigma[SELFCAL_AXES_MAX];  /* noise of one sample at rest: N sqrt(sampling rate); INFINITY leaves the axis out */
@@ -917,10 +917,10 @@ typedef struct {
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
     uint32_t position, used;
     bool blind;
-    /* levels: of the rest, and of the quiet windows since motion */
-    selfcal_level_t rest, found;
+    /* levels: of the rest, of the quiet windows since motion, and of those that are quiet by the noise the gate started from */
+    selfcal_level_t rest, found, calm_level;
     bool rested;
-    uint32_t quiet;
+    uint32_t quiet, calm;
     /* measured over whole windows of rest */
     uint64_t measured;
     selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
@@ -933,7 +933,8 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
  * late at most. The window is judged with its last sample. A sample that is no number ends rest at once.
  *   resting -> moving: one window that scatters too much or is off the level of the rest; a blind window.
  *   moving -> resting: `hold` windows after a first quiet one, all on one level, the gyros' that of the last rest. A gyro that
- *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro.
+ *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro. So is noise
+ *   that has grown beyond what was measured, up to what the gate started from: it then starts from that again.
  * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes). Thresholds are worked out a step
  * with each sample, below 10 000 instructions on a Cortex-M4F: up to 60 steps from the start on, 30 from a change of noise on. What is
  * not known at a window's end is worked out there: all of them where windows are shorter than that, and one, 70 000 instructions,

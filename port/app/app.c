@@ -168,6 +168,9 @@ static bool faulty(const app_t *app, const float reading[])
  * many. */
 static void learn_noise(app_t *app)
 {
+    if (app->gate.measured == 0U) { /* at the start, and when the noise has become another */
+        app->learn_at = SELFCAL_GATE_MEASURED_MIN;
+    }
     if (app->gate.measured < app->learn_at) {
         return;
     }

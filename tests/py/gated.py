@@ -40,6 +40,8 @@ class Learning:
     def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Samples [n, axes], not beyond the end of a window; whether each is at rest."""
         rest = np.frombuffer(self.gate.push(samples), np.uint8) == 1
+        if self.gate.last()["measured"] == 0:
+            self.learn_at = _library32.GATE_MEASURED_MIN
         if self.gate.last()["measured"] >= self.learn_at:
             self.learn_at *= 2
             for axis in range(self.axes):

@@ -18,6 +18,7 @@ from selfcal.model import Model
 from selfcal.tables import make_tables
 
 from conftest import shared_recording
+from gated import Learning
 
 Samples = NDArray[np.float32]
 
@@ -207,6 +208,47 @@ def test_a_slow_tilt_is_found_by_its_distance() -> None:
     rest = decisions(make(window, 1e-3, 3, memory=20), x, window)
     assert rest[3:100].mean() > 0.97
     assert rest[150:].mean() < 0.9
+
+
+def quiet_sensor(t: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """Six axes of an ADIS16405 at rest, deg/s and m/s^2, at the times t [n]."""
+    sigma = np.sqrt(102.4) * np.repeat([0.04, 0.006], 3)
+    return np.random.default_rng(seed).standard_normal((len(t), 6)) * sigma + [0.0, 0.0, 0.0, 0.0, 0.0, 9.8]
+
+
+def at_rest(readings: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """By the default model's gate, which learns its noise: of each window of 0.5 s, of six axes at 102.4 Hz."""
+    model = Model.load()
+    gate = Learning(model, make_tables(model, 102.4, tuple(model.axes)))
+    windows = len(readings) // gate.window
+    samples = readings[: windows * gate.window].astype(np.float32).reshape(windows, gate.window, -1)
+    return np.array([gate.push(np.ascontiguousarray(window))[-1] for window in samples])
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.1, 0.2])
+def test_a_slow_tilt_is_motion_to_its_end(rate: float) -> None:
+    """Of a minute at so many deg/s about x 8 s at most are taken for rest, until it is noticed: at 0.05 deg/s ay then is
+    off by 0.07 m/s^2, 8 sd of a window. On the way gravity does not stay where it was for `hold` windows."""
+    t = np.arange(0.0, 300.0, 1.0 / 102.4)
+    readings = quiet_sensor(t, 8)
+    readings[:, 0] += np.where((t > 120.0) & (t < 180.0), rate, 0.0)
+    angle = np.radians(np.clip(t - 120.0, 0.0, 60.0) * rate)
+    readings[:, 4] += 9.8 * np.sin(angle)
+    readings[:, 5] += 9.8 * (np.cos(angle) - 1.0)
+    rest = at_rest(readings)
+    assert rest[240:360].sum() <= 16
+    assert rest[420:].all()
+
+
+def test_noise_that_grows_is_believed_in_the_end() -> None:
+    """A third more than was learnt, within 10 minutes, and still half of what the model says there may be: not motion
+    for ever."""
+    t = np.arange(0.0, 2400.0, 1.0 / 102.4)
+    readings = quiet_sensor(t, 9)
+    readings = (readings - readings.mean(axis=0)) * (1.0 + np.clip((t - 120.0) / 600.0, 0.0, 1.0) / 3.0)[:, None]
+    rest = at_rest(readings)
+    assert rest[30:240].mean() > 0.95
+    assert rest[2880:].mean() > 0.95
 
 
 def test_a_shock_within_a_window() -> None:
