@@ -559,7 +559,9 @@ def test_clock_jitter() -> None:
     assert survived == trials
 
 
-@pytest.mark.parametrize(("target", "factor"), [("stm32f405", 2.0), ("stm32f405", 1.3), ("stm32f405", 0.8), ("cortex-m0", 1.3)])
+@pytest.mark.parametrize(
+    ("target", "factor"), [("stm32f405", 2.0), ("stm32f405", 1.3), ("stm32f405", 0.8), ("cortex-m0", 1.3)]
+)
 def test_another_rate_than_the_one_set(target: str, factor: float) -> None:
     """The sensor's registers stand and its clock is another: that is a fault and not a stream of samples at wrong
     times. Three are taken before it is seen, and once the clock is right again the module goes on."""

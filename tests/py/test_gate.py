@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from gated import Learning
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -18,7 +19,6 @@ from selfcal.model import Model
 from selfcal.tables import make_tables
 
 from conftest import shared_recording
-from gated import Learning
 
 Samples = NDArray[np.float32]
 
@@ -227,8 +227,8 @@ def at_rest(readings: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("rate", [0.05, 0.1, 0.2])
 def test_a_slow_tilt_is_motion_to_its_end(rate: float) -> None:
-    """Of a minute at so many deg/s about x 8 s at most are taken for rest, until it is noticed: at 0.05 deg/s ay then is
-    off by 0.07 m/s^2, 8 sd of a window. On the way gravity does not stay where it was for `hold` windows."""
+    """Of a minute at so many deg/s about x 8 s at most are taken for rest, until it is noticed: at 0.05 deg/s ay is off
+    by 0.07 m/s^2 by then, 8 sd of a window. On the way gravity does not stay where it was for `hold` windows."""
     t = np.arange(0.0, 300.0, 1.0 / 102.4)
     readings = quiet_sensor(t, 8)
     readings[:, 0] += np.where((t > 120.0) & (t < 180.0), rate, 0.0)
