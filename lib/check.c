@@ -31,6 +31,16 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
 /* Room for rounding in quantities that are bounded by 1 or by each other. */
 #define SLACK R(1e-5)
 
+static bool flags_are_bools(const selfcal_t *self) {
+#ifdef SELFCAL_FIXED
+    if (!is_bool(&self->step_floored)) {
+        return false;
+    }
+#endif
+    return is_bool(&self->batch[0].part) && is_bool(&self->batch[1].part) && is_bool(&self->started) && is_bool(&self->dropped) &&
+           is_bool(&self->in_gap);
+}
+
 /* False for NaN. */
 static bool within(selfcal_real_t value, selfcal_real_t lo, selfcal_real_t hi) {
     return value >= lo && value <= hi;
@@ -215,6 +225,9 @@ static bool terms_are_sound(const selfcal_t *self) {
 static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     const size_t j = kernel_node(self, i);
     const selfcal_node_t *node = &self->node[j];
+    if (!is_bool(&node->level)) {
+        return false;
+    }
     const selfcal_moving_t now = moving_of(node);
     if ((self->n > 0U || i < self->ran) && (now.c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
         return false;
@@ -263,7 +276,7 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
+    if (!flags_are_bools(self) || !memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
         !regressors_are_sound(self) || !terms_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }

@@ -54,6 +54,13 @@ static inline uint32_t float_bits(float value) {
     return bits;
 }
 
+/* Whether the byte is one that a bool has: to read another as a bool, from memory that was overwritten, is undefined. */
+static inline bool is_bool(const bool *flag) {
+    uint8_t byte;
+    memcpy(&byte, flag, sizeof byte);
+    return byte <= 1U;
+}
+
 #ifdef SELFCAL_FIXED
 /* value * 2^shift, rounded to nearest; held at +-INT32_MAX. Bit by bit: a tenth of what software floating point takes. */
 static inline int32_t to_fixed(float value, int shift) {

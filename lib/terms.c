@@ -423,7 +423,7 @@ bool selfcal_terms_sound(const selfcal_t *self) {
 #endif
     for (size_t k = 0; k < nodes; k++) {
         const selfcal_term_node_t *node = &terms->node[k];
-        if (!(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
+        if (!is_bool(&node->steady) || !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
             return false;
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {

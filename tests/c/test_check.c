@@ -167,6 +167,16 @@ static void each_broken_invariant_is_seen(void) {
 #endif
     BROKEN(bank.within[AXES - 1U] = -1.0);
     BROKEN(bank.within[0] = INFINITY);
+    /* bytes that are no bool */
+    BROKEN(memset(&bank.started, 2, 1));
+    BROKEN(memset(&bank.dropped, 0x80, 1));
+    BROKEN(memset(&bank.in_gap, 255, 1));
+    BROKEN(memset(&gathered->part, 2, 1));
+    BROKEN(memset(&waits->part, 254, 1));
+    BROKEN(memset(&node[level].level, 3, 1));
+#ifdef SELFCAL_FIXED
+    BROKEN(memset(&bank.step_floored, 2, 1));
+#endif
     /* counts that do not fit */
     BROKEN(bank.counters.samples = 0);
     BROKEN(bank.counters.samples = bank.within_dof);
