@@ -117,7 +117,6 @@ typedef struct {
     uint64_t diagnosis_us; /* when it was read last */
     /* main loop, of the samples */
     uint64_t seen_us;      /* stamp of the last reading taken from the queue */
-    uint32_t off_rate;     /* readings in a row whose distance in time from the one before is no whole number of periods */
     uint64_t checked_us;   /* when the settings were read last */
     uint64_t last_us;      /* stamp of the last sample delivered */
     bool doubtful;         /* none is delivered until the settings have been found to stand */
@@ -128,6 +127,7 @@ typedef struct {
     uint8_t marks;         /* resets that left MARK */
     bool based;            /* `base` is known */
     int16_t last[ADIS16405_AXES];
+    uint32_t off_rate;     /* readings in a row whose distance in time from the one before is no whole number of periods */
     uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
     uint64_t progress_us;  /* when a sample was delivered last, or the run began */
