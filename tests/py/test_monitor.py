@@ -191,6 +191,23 @@ def test_view_tells_the_status_by_its_names() -> None:
     assert "bus_off_count" not in picture
 
 
+def test_view_of_a_module_that_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are told with their age; those of before a restart are shown no more."""
+    monkeypatch.setenv("COLUMNS", "200")
+    decoder = Decoder()
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "test")
+        decoder.time_ms = 700_000
+        view.show([AxisReport("gx", 600.0, True, {"count": 601.0, "bias_mean": 0.25})])
+        assert "0.25 ±" in shown(view)
+        assert "100 s ago" in shown(view)
+        decoder.time_ms = 10_000
+        assert "0.25 ±" not in shown(view)
+        decoder.time_ms = 20_000
+        view.show([AxisReport("gx", 20.0, True, {"count": 19.0, "bias_mean": 0.5})])
+        assert "0.5 ±" in shown(view)
+
+
 def test_monitor_function_raises_user_errors() -> None:
     with pytest.raises(UserError, match="cannot open"):
         monitor(channel="/dev/no-such-device")

@@ -37,7 +37,7 @@ class View:
     """The last report of each axis, with its bank samples under its name, the module's status and the frame counts.
 
     A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value, and
-    what the module has no number for as `-`.
+    what the module has no number for as `-`. A module that has started anew has reported nothing yet.
     """
 
     def __init__(self, decoder: Decoder, link: Link, title: str, total_s: float | None = None) -> None:
@@ -46,11 +46,13 @@ class View:
         self._title = title
         self._total_s = total_s
         self._last: dict[str, AxisReport] = {}
+        self._time_s = 0.0  # of the module, when it was looked at last
         self._console = Console(stderr=True)
         self._live = Live(get_renderable=self.renderable, console=self._console, refresh_per_second=4, transient=True)
 
     def show(self, reports: Sequence[AxisReport]) -> None:
         """Take new reports."""
+        self._now()
         for report in reports:
             self._last[report.axis] = report
 
@@ -65,7 +67,7 @@ class View:
 
     def renderable(self) -> RenderableType:
         """What is to be seen now."""
-        time_s = self._decoder.time_ms / 1000.0
+        time_s = self._now()
         state = {1.0: "running", 2.0: "finished"}.get(self._decoder.status.get("state", 0.0), "waiting for the module")
         parts: list[RenderableType] = [Text(f"{self._title}   module time {time_s:.1f} s   {state}", "bold")]
         if self._total_s is not None:
@@ -73,6 +75,14 @@ class View:
             parts.append(Text())
         parts += [self._status(), self._table(), Text(frame_counts(self._decoder, self._link), "dim")]
         return Group(*parts)
+
+    def _now(self) -> float:
+        """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
+        time_s = self._decoder.time_ms / 1000.0
+        if time_s < self._time_s:
+            self._last.clear()
+        self._time_s = time_s
+        return time_s
 
     def _status(self) -> Text:
         """What the status says that is not 0, by its signals' names (GUIDE.md, What the status says)."""
@@ -97,12 +107,13 @@ class View:
         for axis, report in self._last.items():
             health = " ".join(name for name in HEALTH if report.values.get(name))
             mean, sd = _number(report, "bias_mean", "%.5g"), _number(report, "bias_sd", "%.2g")
+            age = f"{NEW_LINE}{max(0.0, self._time_s - report.time_s):.0f} s ago "
             bias = f"{mean}{' ' if wide else NEW_LINE}± {sd} {signal_unit(axis, 'bias_mean')}"
             table.add_row(
                 f"{axis}{NEW_LINE}{_number(report, 'count', '%.0f')}",
                 *(_bar(report, f"{law}_probability", wide) for law in laws),
                 _parameters(report),
-                Text.assemble(bias, (f"{NEW_LINE}{health}" if health else "", "red")),
+                Text.assemble(bias, (age, "dim"), (health, "red")),
             )
         return table
 
