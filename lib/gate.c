@@ -101,6 +101,10 @@ static bool step_quantile(selfcal_quantile_t *q) {
     return q->at != AT_END;
 }
 
+/* By how much the distances T2 of many windows from a level may be greater in all than noise has them, beside 4 sd: the level's noise is
+ * measured to 10 % on six axes and 30 windows. */
+#define OFF_MOST 1.25F
+
 /* An axis of infinite sigma is left out. */
 static bool present(const selfcal_gate_t *gate, uint8_t axis) {
     return isfinite(gate->axis[axis].sigma);
@@ -261,13 +265,15 @@ selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis,
     return SELFCAL_OK;
 }
 
-/* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only. */
-static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n, const selfcal_level_t *level, bool rates) {
+/* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only; `times`: by how much an axis's variance is
+ * greater than was measured, NULL: by nothing. */
+static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n, const selfcal_level_t *level, bool rates,
+                      const float times[]) {
     float sum = 0.0F;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         if (present(gate, axis) && (gate->config.is_rate[axis] || !rates)) {
             const float off = (mean[axis] - level->mean[axis]) / gate->axis[axis].sigma;
-            sum += off * off / gate->axis[axis].level;
+            sum += off * off / (times != NULL ? gate->axis[axis].level * times[axis] : gate->axis[axis].level);
         }
     }
     return sum / (float)(inv_n + level->gamma);
@@ -300,11 +306,16 @@ static void measure(selfcal_gate_t *gate, const float scatter[], const float mea
     gate->measured++;
 }
 
-/* A window has nothing to go by: too few samples, or one that is no number. */
+/* Rest ends, for want of samples to tell: if the next window is one of that rest, it goes on with that. */
+static void look_away(selfcal_gate_t *gate) {
+    gate->unseen = gate->unseen || gate->state == SELFCAL_RESTING;
+    gate->state = SELFCAL_MOVING;
+}
+
+/* A window has nothing to go by: too few samples, or one that is no number. It neither is one of those in a row nor ends them. */
 static void blind_window(selfcal_gate_t *gate) {
     gate->counters.blind++;
-    gate->state = SELFCAL_MOVING;
-    gate->quiet = gate->calm = 0;
+    look_away(gate);
 }
 
 /* What a chi-square variable of `nu` degrees of freedom exceeds once in 30 000 times: 4 sd of its cube root (Wilson & Hilferty). */
@@ -313,32 +324,61 @@ static float seldom(float nu) {
     return nu * root * root * root;
 }
 
-/* Whether the noise has become another: by that which the gate started from, the most that there is at rest, `settle` windows in a row were
- * quiet and on one level. The gate then starts from it anew. */
-static bool noise_is_another(selfcal_gate_t *gate, const float mean[], const float scatter[], selfcal_real_t inv_n) {
-    float t1 = 0.0F, t2 = 0.0F, axes = 0.0F;
+/* Whether windows are too far off a level in all, though none of them is: a rotation or a swing that is too slow for one window. `sum`: of
+ * their T2, chi-square with `nu` degrees of freedom but for `scale`. Never, without a rate of false alarms. */
+static bool off_in_all(const selfcal_gate_t *gate, float sum, float nu, float scale) {
+    return gate->judged_axes > 0U && !(sum <= OFF_MOST * scale * seldom(nu));
+}
+
+/* The same of the windows at rest: a sum that forgets, T2 weighing (1 - 1/m)^k after k windows with m = `memory`, has the mean m and the
+ * variance 2 m^2/(2 m - 1) per axis: that of m/(2 m - 1) chi-square with 2 m - 1 degrees of freedom. */
+static bool drifts_off(selfcal_gate_t *gate) {
+    const float memory = (float)gate->config.memory, twice = 2.0F * memory - 1.0F;
+    gate->off_sum += gate->t2 - gate->off_sum / memory;
+    return off_in_all(gate, gate->off_sum, twice * (float)gate->judged_axes, memory / twice);
+}
+
+/* The windows since motion that are on one level: calm are those that scatter no more than the noise that the gate started from, the most
+ * that there is at rest; quiet are the last of them that do not by the noise that was measured since. How far means may be off a level
+ * goes by the noise measured, and where windows scatter more, by as much more: a slow swing is no level because the
+ * model's noise would cover it. */
+static void follow(selfcal_gate_t *gate, const float mean[], const float scatter[], selfcal_real_t inv_n, bool shaken) {
+    const float memory = (float)gate->config.memory, weight = (float)gate->calm + 1.0F;
+    float bound = 0.0F, axes = 0.0F, times[SELFCAL_AXES_MAX] = {0.0F};
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         if (present(gate, axis)) {
-            const float sigma = gate->config.sigma[axis], off = (mean[axis] - gate->calm_level.mean[axis]) / sigma;
-            t1 += scatter[axis] / sigma / sigma;
-            t2 += off * off;
+            const selfcal_gate_noise_t *noise = &gate->axis[axis];
+            const float ratio = scatter[axis] / noise->sigma / noise->sigma / noise->within / (float)(gate->used - 1U);
+            gate->grown[axis] += (ratio - gate->grown[axis]) / (weight < memory ? weight : memory);
+            times[axis] = gate->grown[axis] > 1.0F ? gate->grown[axis] : 1.0F;
+            bound += scatter[axis] / gate->config.sigma[axis] / gate->config.sigma[axis];
             axes += 1.0F;
         }
     }
-    const bool moved = gate->calm > 0U && !(t2 / (float)(inv_n + gate->calm_level.gamma) <= seldom(axes));
-    if (moved || !(t1 <= seldom(axes * (float)(gate->used - 1U)))) {
-        gate->calm = 0;
-        return false;
+    bool moved = false;
+    if (gate->calm > 0U) {
+        gate->t2 = distance(gate, mean, inv_n, &gate->found, false, times);
+        gate->off_sum += gate->t2;
+        moved = !(gate->t2 <= gate->moved_above);
+        gate->counters.moved += moved;
+    }
+    if (moved || (shaken && !(bound <= seldom(axes * (float)(gate->used - 1U)))) ||
+        (gate->calm > 0U && off_in_all(gate, gate->off_sum, axes * (float)gate->calm, 1.0F))) {
+        gate->calm = gate->quiet = 0;
+        return;
     }
     if (gate->calm == 0U) {
-        set_level(gate, &gate->calm_level, mean, inv_n);
+        set_level(gate, &gate->found, mean, inv_n);
+        gate->off_sum = 0.0F;
     } else {
-        merge(gate, &gate->calm_level, mean, inv_n);
+        merge(gate, &gate->found, mean, inv_n);
     }
     gate->calm++;
-    if (gate->config.settle == 0U || gate->calm <= gate->config.settle) {
-        return false;
-    }
+    gate->quiet = shaken ? 0U : gate->quiet + 1U;
+}
+
+/* The noise has become another: the gate starts from the model's again. */
+static void start_noise(selfcal_gate_t *gate) {
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         if (present(gate, axis)) {
             const selfcal_gate_noise_t white = {gate->config.sigma[axis], 1.0F, 1.0F, 1.0F};
@@ -348,13 +388,6 @@ static bool noise_is_another(selfcal_gate_t *gate, const float mean[], const flo
     }
     gate->measured = 0;
     gate->work = WORK_BEGIN;
-    return true;
-}
-
-static void rest_at(selfcal_gate_t *gate, const selfcal_level_t *level) {
-    gate->rest = *level;
-    gate->rested = true;
-    gate->state = SELFCAL_RESTING;
 }
 
 static void judge(selfcal_gate_t *gate) {
@@ -373,47 +406,38 @@ static void judge(selfcal_gate_t *gate) {
     const bool shaken = !(t1 <= gate->shaken_above);
     gate->t1 = t1;
     gate->counters.shaken += shaken;
-    if (gate->state == SELFCAL_RESTING) {
-        gate->t2 = distance(gate, mean, inv_n, &gate->rest, false);
-        const bool moved = !(gate->t2 <= gate->moved_above);
+    if (gate->state == SELFCAL_RESTING || gate->unseen) {
+        gate->t2 = distance(gate, mean, inv_n, &gate->rest, false, NULL);
+        const bool moved = !(gate->t2 <= gate->moved_above) || drifts_off(gate);
         gate->counters.moved += moved;
+        gate->unseen = false;
         if (!shaken && !moved) {
             if (n == gate->config.window) {
                 measure(gate, scatter, mean, inv_n);
             }
             merge(gate, &gate->rest, mean, inv_n);
+            gate->state = SELFCAL_RESTING;
             return;
         }
         gate->counters.alarms++;
         gate->state = SELFCAL_MOVING;
-        gate->quiet = gate->calm = 0; /* Not even the first of the quiet ones: picked for its odd mean, it would make a bad level. */
+        gate->calm = gate->quiet = 0; /* Not even the first of the calm ones: picked for its odd mean, it would make a bad level. */
         return;
     }
-    if (noise_is_another(gate, mean, scatter, inv_n)) {
-        rest_at(gate, &gate->calm_level);
+    follow(gate, mean, scatter, inv_n, shaken);
+    const uint32_t hold = gate->config.hold, settle = gate->config.settle;
+    const bool back =
+        !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true, NULL) <= gate->rate_moved_above;
+    const bool settled = settle >= hold && gate->calm > settle;
+    if (settled && gate->quiet < gate->calm) {
+        start_noise(gate);
+    } else if (!settled && !(gate->quiet > hold && back)) {
         return;
     }
-    bool moved = false;
-    if (gate->quiet > 0U) {
-        gate->t2 = distance(gate, mean, inv_n, &gate->found, false);
-        moved = !(gate->t2 <= gate->moved_above);
-        gate->counters.moved += moved;
-    }
-    if (shaken || moved) {
-        gate->quiet = 0;
-        return;
-    }
-    if (gate->quiet == 0U) {
-        set_level(gate, &gate->found, mean, inv_n);
-    } else {
-        merge(gate, &gate->found, mean, inv_n);
-    }
-    gate->quiet++;
-    const bool back = !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true) <= gate->rate_moved_above;
-    const bool settled = gate->config.settle > 0U && gate->quiet > gate->config.settle;
-    if (gate->quiet > gate->config.hold && (back || settled)) {
-        rest_at(gate, &gate->found);
-    }
+    gate->rest = gate->found;
+    gate->rested = true;
+    gate->off_sum = (float)gate->config.memory * (float)gate->judged_axes; /* its mean */
+    gate->state = SELFCAL_RESTING;
 }
 
 static void close_window(selfcal_gate_t *gate) {
@@ -444,8 +468,7 @@ selfcal_motion_t selfcal_gate_push(selfcal_gate_t *gate, const float sample[]) {
     }
     if (!sound) {
         gate->blind = true;
-        gate->state = SELFCAL_MOVING;
-        gate->quiet = 0;
+        look_away(gate);
     } else {
         for (uint8_t axis = 0; axis < axes; axis++) {
             const float value = present(gate, axis) ? sample[axis] - gate->origin[axis] : 0.0F;

@@ -917,10 +917,13 @@ typedef struct {
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
     uint32_t position, used;
     bool blind;
-    /* levels: of the rest, of the quiet windows since motion, and of those that are quiet by the noise the gate started from */
-    selfcal_level_t rest, found, calm_level;
-    bool rested;
+    /* levels: of the rest, and of the windows in a row since motion, calm by the noise the gate started from, the last ones quiet by
+     * that measured */
+    selfcal_level_t rest, found;
+    bool rested, unseen;
     uint32_t quiet, calm;
+    float off_sum;                  /* of T2 over those windows; at rest one that forgets */
+    float grown[SELFCAL_AXES_MAX];  /* their mean square about the mean over that of the noise measured */
     /* measured over whole windows of rest */
     uint64_t measured;
     selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
@@ -932,9 +935,11 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
 /* One sample of every axis. Returns the state: that of the last whole window, so with a sample's last window, known one window
  * late at most. The window is judged with its last sample. A sample that is no number ends rest at once.
  *   resting -> moving: one window that scatters too much or is off the level of the rest; a blind window.
- *   moving -> resting: `hold` windows after a first quiet one, all on one level, the gyros' that of the last rest. A gyro that
+ *   moving -> resting: the first window after blind ones, if it is one of the rest before. Else `hold` windows after a first quiet one,
+ *   all on one level, the gyros' that of the last rest. A gyro that
  *   stays off for `settle` windows is believed to have a new bias: a rotation at a constant rate is nothing else to a gyro. So is noise
- *   that has grown beyond what was measured, up to what the gate started from: it then starts from that again.
+ *   that has grown beyond what was measured, up to what the gate started from: it then starts from that again. Blind windows are none of
+ *   those in a row and do not end them.
  * A false alarm so costs hold + 2 windows (the odd one, a first quiet one, `hold` more). O(axes). Thresholds are worked out a step
  * with each sample, below 10 000 instructions on a Cortex-M4F: up to 60 steps from the start on, 30 from a change of noise on. What is
  * not known at a window's end is worked out there: all of them where windows are shorter than that, and one, 70 000 instructions,

@@ -63,7 +63,8 @@ enum { CHECKS_TRIED = 3 };
 #define BACKOFF_MAX_US 10000000U
 enum { PROVEN_SAMPLES = 1000 };
 /* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones are not taken: the
- * sensor's clock is another. After a start none is taken before one that is in its place. */
+ * sensor's clock is another. After a start none is taken before one that is in its place. Steps beyond two periods and a half tell
+ * nothing: the 5 % that the clock may be off add up. */
 enum { OFF_RATE_TAKEN = 3 };
 
 enum { STEP_PULSE, STEP_BOOT, STEP_SELF_TEST };
@@ -580,11 +581,11 @@ static uint32_t periods(adis16405_t *self, uint64_t stamp)
     return count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
 }
 
-/* Whether `step` is an eighth of a period or more from the nearest whole number of them, one at least. */
+/* Whether `step` is an eighth of a period or more from one and from two of them. */
 static bool off_grid(uint64_t step, uint64_t period)
 {
-    const uint64_t over = step < period ? 0U : (step - period) % period, off = over < period - over ? over : period - over;
-    return 8U * (step < period ? period - step : off) >= period;
+    const uint64_t right = 2U * step < 3U * period ? period : 2U * period;
+    return 8U * (step < right ? right - step : step - right) >= period;
 }
 
 bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing)
@@ -603,7 +604,9 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
         }
         const uint64_t step = stamp - self->seen_us, period = self->nominal_q8 >> 8, doubt = period + period / 2U;
         self->seen_us = stamp;
-        self->off_rate = off_grid(step, period) ? self->off_rate + 1U : 0U;
+        if (2U * step < 5U * period) {
+            self->off_rate = off_grid(step, period) ? self->off_rate + 1U : 0U;
+        }
         if (self->off_rate > OFF_RATE_TAKEN) {
             continue;
         }

@@ -666,14 +666,19 @@ static uint32_t dear_windows(const app_t *app)
 #endif
 }
 
+/* Whether one more sample cannot overtake a report under way. */
+static bool has_room(const app_t *app)
+{
+    return !app->computing || selfcal_room(&app->bank) > 0U || app->bank.position + 1U < app->bank.block;
+}
+
 bool app_step(app_t *app)
 {
-    /* Samples go on during a report, until one more could overtake it: then they wait in the port's queue. On a slow core
-     * several come during one slice. */
+    /* Samples go on during a report, as long as there is room for them beside its sums: then they wait in the port's queue. On a slow
+     * core several come during one slice. */
     const uint32_t dear = dear_windows(app);
     bool busy = false;
-    for (unsigned taken = 0; taken < SAMPLES_A_TURN && (!app->computing || selfcal_room(&app->bank) > 0U) && take_sample(app);
-         taken++) {
+    for (unsigned taken = 0; taken < SAMPLES_A_TURN && has_room(app) && take_sample(app); taken++) {
         busy = true;
     }
     /* Such a sample and a slice do not add up in one turn; but a report is not put off twice in a row. */

@@ -105,7 +105,7 @@ def test_replay_with_the_gate_keeps_motion_out(tmp_path: Path, capfd: pytest.Cap
     for missing, sample in zip(moved.missing_before, samples.astype(np.float32), strict=True):
         host.feed(int(missing), sample)
     assert not any(host.used[1505:1600])
-    assert sum(host.used) > 5930 - 100 - 60  # but the shaking, and 12 windows of 5: at the start, after it and the gap
+    assert sum(host.used) > 5930 - 100 - 190  # the shaking, 38 windows of 5: 17 at start and after it, 3 at the gap
     assert_same(document, {name: host.bank.report(index) for index, name in enumerate(axes)})
     assert document["axes"]["gx"]["adequate"] is None
     sigma = document["axes"]["gx"]["parameters"]["constant"]["N"]["mean"]
@@ -136,7 +136,7 @@ def test_the_shocks_of_run_4_do_not_reach_the_bank() -> None:
             bank.raw.skip(tables.block)
     for first, last in ((404_537, 404_621), (514_615, 514_660)):
         assert not whole[(first - start) // tables.block : (last - start) // tables.block + 1].any()
-    assert whole.mean() > 0.98  # accelerometers feel the building (test_gate.py)
+    assert whole.mean() > 0.96  # accelerometers feel the building some 40 times (test_gate.py), 9 s each
     found = replay(recording.path, report_every=20_000.0, gate=True)
     truth = {name: bank.report(index) for index, name in enumerate(axes)}
     assert_same(found, truth, lambda name: factor(model.group_of(name).unit, recording.columns[name].unit))
