@@ -498,7 +498,7 @@ typedef struct {
 #define SELFCAL_TERMS_SIZE(nodes, axes, p) ((size_t)0U)
 #endif
 
-/* Private but for reading `position` and `block`; declared here so that the caller can place it. */
+/* Private but for reading `position`, `used` and `block`; declared here so that the caller can place it. */
 typedef struct {
     const selfcal_model_t *model;
 #if SELFCAL_TERMS_MAX > 1

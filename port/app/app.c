@@ -666,10 +666,12 @@ static uint32_t dear_windows(const app_t *app)
 #endif
 }
 
-/* Whether one more sample cannot overtake a report under way. */
+/* Whether one more sample cannot overtake a report under way, nor a gap before it: where there is room for no bank sample, an interval
+ * less than half of whose samples are usable ends without one. */
 static bool has_room(const app_t *app)
 {
-    return !app->computing || selfcal_room(&app->bank) > 0U || app->bank.position + 1U < app->bank.block;
+    const uint32_t block = app->bank.block, used = app->bank.used + 1U;
+    return !app->computing || selfcal_room(&app->bank) > 0U || used < block - used;
 }
 
 bool app_step(app_t *app)
