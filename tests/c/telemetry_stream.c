@@ -1,6 +1,9 @@
 /* Frames of random reports, with the numbers that went in, for tests/py/test_wire.py. Not a test of its own.
  *
- *     telemetry_stream SEED REPORTS HYPOTHESES
+ *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS
+ *
+ * As a slow module would that takes SLOW_MS for each axis: an axis's report is begun when that of the last is out, with the
+ * status every STATUS_MS between. 0: all at once.
  *
  * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
 #include "selfcal.h"
@@ -11,7 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { AXES = 6 };
+enum { AXES = 6, STATUS_MS = 10000 };
 
 static const char *const law_name[] = {"constant", "random_walk", "gauss_markov"};
 static const char *const parameter_name[] = {"N", "K", "sigma_m", "alpha"};
@@ -99,12 +102,13 @@ int main(int argc, char **argv)
     static const char *const axis_name[AXES] = {"az", "gx", "ay", "gz", "ax", "gy"};
     static const char *const message[AXES] = {"AZ", "GX", "AY", "GZ", "AX", "GY"};
     static const selfcal_law_t order[] = {SELFCAL_RANDOM_WALK, SELFCAL_GAUSS_MARKOV, SELFCAL_CONSTANT};
-    if (argc != 4) {
+    if (argc != 5) {
         return 2;
     }
     state = (uint32_t)strtoul(argv[1], NULL, 10) * 2654435769U + 1U;
     const unsigned long reports = strtoul(argv[2], NULL, 10);
     const uint8_t hypotheses = (uint8_t)strtoul(argv[3], NULL, 10);
+    const uint32_t slow_ms = (uint32_t)strtoul(argv[4], NULL, 10);
 
     selfcal_axis_t axis[AXES];
     memset(axis, 0, sizeof axis);
@@ -126,7 +130,7 @@ int main(int argc, char **argv)
     static selfcal_telemetry_t telemetry;
     require(selfcal_telemetry_init(&telemetry, &model, axis_name));
     for (unsigned long number = 1; number <= reports; number++) {
-        const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U); /* wraps within the stream */
+        const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U + (number - 1U) * AXES * slow_ms); /* wraps within the stream */
         selfcal_counters_t counters;
         memset(&counters, 0, sizeof counters);
         counters.samples = told_count("STATUS", "samples", random32());
@@ -187,8 +191,9 @@ int main(int argc, char **argv)
             memset(&report, 0, sizeof report);
             report.axis = a;
             report.n = told_count(message[a], "count", random32());
-            (void)told_count(message[a], "time_ms", time_ms);
-            (void)told_count(message[a], "end_time_ms", time_ms % 16777216U);
+            const uint32_t begun_ms = time_ms + a * slow_ms;
+            (void)told_count(message[a], "time_ms", begun_ms);
+            (void)told_count(message[a], "end_time_ms", begun_ms % 16777216U);
             (void)told_count(message[a], "not_finite", counters.not_finite[a]);
             (void)told_count(message[a], "saturated", counters.saturated[a]);
             (void)told_count(message[a], "stuck", counters.stuck[a]);
@@ -199,7 +204,13 @@ int main(int argc, char **argv)
             for (uint8_t k = 0; k < hypotheses; k++) {
                 random_posterior(&report.hypothesis[k], message[a], (int)order[k]);
             }
-            require(selfcal_telemetry_report(&telemetry, &report, &counters, time_ms));
+            for (uint32_t after = STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
+                if (after > a * slow_ms) {
+                    require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));
+                    send_all(&telemetry);
+                }
+            }
+            require(selfcal_telemetry_report(&telemetry, &report, &counters, begun_ms));
             send_all(&telemetry);
         }
     }

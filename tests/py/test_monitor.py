@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -206,6 +207,19 @@ def test_view_of_a_module_that_starts_anew(monkeypatch: pytest.MonkeyPatch) -> N
         decoder.time_ms = 20_000
         view.show([AxisReport("gx", 20.0, True, {"count": 19.0, "bias_mean": 0.5})])
         assert "0.5 ±" in shown(view)
+
+
+def test_view_keeps_all_axes_of_a_slow_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports that are begun one after the other, with the status between."""
+    monkeypatch.setenv("COLUMNS", "200")
+    decoder = Decoder()
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "test")
+        for line in lines(stream(21, 2, slow_ms=12_000)):
+            view.show(decoder.feed(message(line)))
+        picture = shown(view)
+    assert re.findall(r"^([ag][xyz]) ", picture, re.MULTILINE) == ["az", "gx", "ay", "gz", "ax", "gy"]
+    assert re.findall(r"\b(\d+) s ago", picture) == ["70", "58", "46", "34", "22", "10"]
 
 
 def test_monitor_function_raises_user_errors() -> None:

@@ -178,6 +178,23 @@ def test_reports_arrive_whole_and_in_time_past_the_wrap() -> None:
     assert decoder.status["state"] == 2
 
 
+def test_reports_of_a_slow_module_keep_their_time() -> None:
+    """A Cortex-M0 takes 12 s for an axis's report, and tells its status meanwhile: no restart, and no later time."""
+    slow_ms = 12_000
+    sent = stream(21, 3, slow_ms=slow_ms)
+    decoder = Decoder(from_start=True)
+    reports: list[AxisReport] = []
+    for line in lines(sent):
+        before_ms = decoder.time_ms
+        reports += decoder.feed(message(line))
+        assert decoder.time_ms >= before_ms
+    assert len(reports) == 18
+    for index, report in enumerate(reports):
+        cycle = index // len(AXES)
+        assert report.complete
+        assert report.time_s == (4294940000 + 1500 * (cycle + 1) + slow_ms * index) / 1000
+
+
 def test_result_is_what_went_in() -> None:
     sent = stream(5, 1)
     (report, *_) = feed(Decoder(), lines(sent))

@@ -39,9 +39,9 @@ def _program() -> Path:
 
 
 @lru_cache(maxsize=4)
-def stream(seed: int, reports: int, hypotheses: int = 3) -> tuple[Sent, ...]:
-    """All that the C code sends for `reports` random reports of six axes."""
-    command = [str(_program()), str(seed), str(reports), str(hypotheses)]
+def stream(seed: int, reports: int, hypotheses: int = 3, slow_ms: int = 0) -> tuple[Sent, ...]:
+    """All that the C code sends for `reports` random reports of six axes, of which each takes `slow_ms`."""
+    command = [str(_program()), str(seed), str(reports), str(hypotheses), str(slow_ms)]
     text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     sent: list[Sent] = []
     truth: dict[str, dict[str, float]] = {}
@@ -56,7 +56,7 @@ def stream(seed: int, reports: int, hypotheses: int = 3) -> tuple[Sent, ...]:
                 int(rest[1:4], 16)
             ]
             if message != last:
-                sent.append(Sent(message, truth.pop(message), []))
+                sent.append(Sent(message, truth.pop(message, {}), []))  # none: a status between the reports
                 last = message
             sent[-1].lines.append(rest)
     return tuple(sent)

@@ -30,7 +30,7 @@ IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
-BACK_MS = 5000  # a corrected sample may be so much older than what was sent before it
+BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
 RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter
 
 
@@ -187,7 +187,7 @@ class Decoder:
         self.corrected: dict[str, float] = {}
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
-        #: Module time of the last opening or status frame, unwrapped, ms.
+        #: The latest module time that a frame has told, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
         self.finished = False
@@ -237,8 +237,9 @@ class Decoder:
             return []
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
+        told_ms = self.time_ms
         if "time_ms" in values:
-            self._advance(int(values["time_ms"]))
+            told_ms = self._advance(int(values["time_ms"]), 0 if definition.name == STATUS else BACK_MS)
         if definition.name == STATUS:
             self.status.update(values)
             if "frames_sent" in values:
@@ -250,7 +251,8 @@ class Decoder:
         if definition.name in (CORRECTED, ANSWER):
             (self.corrected if definition.name == CORRECTED else self.answer).update(values)
             return self.flush()
-        return self._assemble(definition.name.lower(), item, jump, second, values)
+        begun_ms = told_ms if "time_ms" in values else self._begun(second)
+        return self._assemble(definition.name.lower(), item, jump, second, begun_ms / 1000.0, values)
 
     def flush(self) -> list[AxisReport]:
         """Close the report under way, incomplete, for the end of a stream."""
@@ -286,11 +288,18 @@ class Decoder:
                 return
         self._origin = frames_sent + 1 - self._sent  # first of this stream, or the module has started anew
 
-    def _advance(self, time_ms: int) -> None:
-        ahead = (time_ms - self.time_ms + BACK_MS) % 2**32 - BACK_MS
-        self.time_ms = self.time_ms + max(0, ahead) if ahead < 2**31 else time_ms  # else the module has started anew
+    def _advance(self, time_ms: int, back_ms: int) -> int:
+        """Unwrapped module time of a frame, which may lie `back_ms` before others, else the module starts anew."""
+        ahead = (time_ms - self.time_ms + 2**31) % 2**32 - 2**31
+        if ahead < -min(back_ms, self.time_ms):
+            self.time_ms = time_ms
+            return time_ms
+        self.time_ms += max(0, ahead)
+        return self.time_ms + min(0, ahead)
 
-    def _assemble(self, axis: str, item: int, jump: int, second: int, values: dict[str, float]) -> list[AxisReport]:
+    def _assemble(
+        self, axis: str, item: int, jump: int, second: int, begun_s: float, values: dict[str, float]
+    ) -> list[AxisReport]:
         """Add a frame to its report. Frames of a report follow each other in ascending item order, so a jump of the
         counter must not exceed that of the item."""
         closed: list[AxisReport] = []
@@ -299,7 +308,7 @@ class Decoder:
             closed = self.flush()
             report = None
         if report is None:
-            report = self._open = _Open(axis, second, self._begun(second, values), item)
+            report = self._open = _Open(axis, second, begun_s, item)
         report.item = item
         report.frames += 1
         report.values.update(values)
@@ -311,12 +320,11 @@ class Decoder:
                 closed.append(_report(report, complete=complete))
         return closed
 
-    def _begun(self, second: int, values: dict[str, float]) -> float:
-        time_ms = self.time_ms
-        if "time_ms" not in values:
-            wrapped = time_ms % 2**32
-            time_ms += 1000 * ((second - wrapped // 1000) % 256) - wrapped % 1000
-        return time_ms / 1000.0
+    def _begun(self, second: int) -> int:
+        """Module time of a frame that tells its second alone, modulo 256: the nearest to what is known."""
+        wrapped = self.time_ms % 2**32
+        ahead = (second - wrapped // 1000 + 128) % 256 - 128
+        return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
 
 
 def _report(report: _Open, *, complete: bool) -> AxisReport:
