@@ -27,6 +27,8 @@ enum { GATHER, TRUTH, FIT, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BO
 
 /* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
 #define DEPTH R(20.0)
+/* The sums' cells, narrower than the search's, may find so much more than its peak, which moments are counted from; or they begin anew. */
+#define HIGHER R(3.0)
 /* The search ends when a pass shrinks the box by less than this in both dimensions, and no cell at its border counts. Else it grows there. */
 #define SHRINK R(0.7)
 #define GROWTH R(0.25)
@@ -703,6 +705,29 @@ static void begin_pass(selfcal_work_t *work) {
     }
 }
 
+/* Whether what the limits leave of a cell counts beside the best. One that lies more than `by` higher becomes the best; the sums begin anew
+ * then. */
+static bool counts(selfcal_work_t *work, const selfcal_real_t ln_value[], const reach_t *reach, selfcal_real_t profile, selfcal_real_t by) {
+    const selfcal_real_t height = profile - reach->drop;
+    if (!(reach->from < reach->to) || !(height > work->best - DEPTH)) { /* nor NaN */
+        return false;
+    }
+    if (height > work->best + by) {
+        work->best = height;
+        work->drop[work->hypothesis] = reach->drop;
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            work->best_ln[p] = ln_value[p] + reach->peak;
+        }
+        work->best_ln[SELFCAL_ALPHA] = ln_value[SELFCAL_ALPHA];
+        if (work->stage == SUM) {
+            work->stage = BOX;
+            work->at = 0;
+            return false;
+        }
+    }
+    return true;
+}
+
 static void step_scan(selfcal_work_t *work) {
     if (work->at == 0U) {
         make_row(work);
@@ -715,18 +740,7 @@ static void step_scan(selfcal_work_t *work) {
         cell_parameters(work, &cell, ln_value);
         selfcal_real_t half[2] = {R(0.0), R(0.5) * work->width[0]};
         const reach_t reach = reach_of(work, ln_value, half);
-        cell.profile -= reach.drop;
-        if (!(reach.from < reach.to) || !(cell.profile > (selfcal_real_t)-INFINITY)) {
-            continue;
-        }
-        if (cell.profile > work->best) {
-            work->best = cell.profile;
-            work->drop[work->hypothesis] = reach.drop;
-            for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-                work->best_ln[p] = ln_value[p] + (p == SELFCAL_ALPHA ? R(0.0) : reach.peak);
-            }
-        }
-        if (!(cell.profile >= work->best - DEPTH)) { /* nor NaN */
+        if (!counts(work, ln_value, &reach, cell.profile, R(0.0))) {
             continue;
         }
         const selfcal_real_t middle[2] = {cell.ln_rho, row->ln_alpha};
@@ -870,8 +884,8 @@ typedef struct {
     spread_t spread;
 } side_t;
 
-/* `fall`: change of ln sigma_v's mode from one side of the cell to the other; `height` at that mode, in ln. */
-static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t height, selfcal_real_t density, selfcal_real_t fall) {
+/* `fall`: change of ln sigma_v's mode from one side of the cell to the other; `profile`: ln height at that mode. */
+static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t profile, selfcal_real_t density, selfcal_real_t fall) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
     /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
@@ -879,10 +893,10 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(work->width[0] + fall)};
     const reach_t reach = reach_of(work, ln_value, half);
     moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
-    if (!(reach.from < reach.to) || !(height - reach.drop >= -DEPTH)) { /* nor NaN */
+    if (!counts(work, ln_value, &reach, profile, HIGHER)) {
         return sum;
     }
-    height = r_exp(r_fmin(height - reach.base, DEPTH)) * density;
+    const selfcal_real_t height = r_exp(profile - work->best - reach.base) * density;
     sigma_cells(work, reach.from, reach.to, reach.base);
     const selfcal_real_t width = work->delta_width;
     side_t side[2];
@@ -964,7 +978,7 @@ static void step_sum(selfcal_work_t *work) {
         cell_parameters(work, &cell, ln_value);
         const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
         const selfcal_real_t width = work->delta_width;
-        const moments_t sum = sum_cell(work, ln_value, cell.profile - work->best, alpha_density, fall);
+        const moments_t sum = sum_cell(work, ln_value, cell.profile, alpha_density, fall);
         if (work->delta_width != width) { /* sigma_v's cells were laid anew, for more than a cell's sums */
             work->at = (uint16_t)(i + 1U);
         }
