@@ -231,9 +231,9 @@ static void place_nodes(selfcal_t *self) {
             const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
-            /* Where the drift hides the white noise a deviation beyond the last node may still count. */
-            const bool both = is_sum(hypothesis->law) && hypothesis->law == SELFCAL_WALK_AND_MARKOV;
-            const selfcal_real_t above = markov || both ? R(1.25) : R(0.5);
+            /* Where the drift hides the white noise a deviation beyond the last node may still count. A sum's likelihood, off which the
+             * report takes no expectation, must be level there. */
+            const selfcal_real_t above = is_sum(hypothesis->law) ? R(3.0) : markov ? R(1.25) : R(0.5);
             ln_range_t ln_sigma = sigma[axis];
             if (is_sum(hypothesis->law) && hypothesis->law == SELFCAL_MOVING_AVERAGE) {
                 ln_sigma.hi -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_max);
