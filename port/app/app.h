@@ -24,6 +24,9 @@
 #ifndef APP_CORRECTED_MS
 #define APP_CORRECTED_MS 0
 #endif
+#if APP_CORRECTED_MS < 0
+#error "APP_CORRECTED_MS: milliseconds, 0 for none"
+#endif
 
 /* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: commands are taken (command.h).
  * Without it nothing that comes by the wire is looked at but the opening and closing of an SLCAN channel. */

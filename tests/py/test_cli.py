@@ -98,6 +98,20 @@ def test_a_gate_that_codegen_leaves_out_is_named(tmp_path: Path) -> None:
         assert f"#define SELFCAL_MODEL_GATE {gate}\n" in (tmp_path / "made" / "selfcal_model.h").read_text()
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: " + 3000 * "[", "model.yaml: not a model file: nested too deep"),
+        ("a: [", "model.yaml: line 1: not valid YAML"),
+        ("[]", "model.yaml: not a model file"),
+    ],
+    ids=["deep", "open", "list"],
+)
+def test_what_is_no_model_file(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "model.yaml").write_text(text)
+    assert one_error("codegen", "model.yaml", "-o", "made", cwd=tmp_path).startswith(said)
+
+
 BAD = {
     "empty": ("", "bad.csv: the file is empty"),
     "header only": ("t[s],gx[deg/s]\n", "bad.csv: line 1: there is a header but no rows"),

@@ -262,6 +262,8 @@ def test_a_temperature_that_is_not_there_is_said(tmp_path: Path) -> None:
         ("{name: a, kind: time, sd: {gyro: 0}}", "must be a finite number above 0"),
         ("{name: a */ b, kind: time, sd: {gyro: 1}}", "without '*/'"),
         ("{name: a, kind: time, sd: {gyro: 1e300}}", "must be within +-1e+18"),
+        ("{name: a, kind: time, sd: {gyro: 1e-300}}", "must be 0, or 1e-20 and more"),
+        ("{name: a, kind: time, reference: .inf, sd: {gyro: 1}}", "must be a finite number, not inf"),
         ("{name: a, kind: time, reference: 1e300, sd: {gyro: 1}}", "must be within +-1e+18"),
         (f"{{name: a, kind: time, sd: {{gyro: 1{400 * '0'}}}}}", "must be a number, not 1000000"),
         ("{name: a, kind: time, sd: {gyro: 1}, probability: 1}", "must be below 1"),

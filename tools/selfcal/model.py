@@ -42,6 +42,8 @@ RATIO_LIMITS = (1e-3, 1e3)
 WIDEST_BIAS = 1e8
 #: The largest number of any kind: its square is still a float.
 LARGEST = 1e18
+#: The smallest but 0: below what any prior may reach.
+SMALLEST = 1e-20
 #: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
 #: Place of each parameter there; two share one where no law has both.
@@ -197,6 +199,8 @@ class _Reader:
             raise UserError(f"{self.path}: not a text file") from error
         try:
             tree = yaml.load(text, Loader=_Loader)  # a safe loader
+        except RecursionError:
+            raise UserError(f"{self.path}: not a model file: nested too deep") from None
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             line = f"line {mark.line + 1}: " if mark is not None else ""
@@ -227,9 +231,11 @@ class _Reader:
             raise self.fail(where, f"must be a number, not {value!r:.40}") from None
         if LARGEST < abs(number) < math.inf:
             raise self.fail(where, f"must be within +-{LARGEST:g}: the firmware computes in float")
+        if 0.0 < abs(number) < SMALLEST:
+            raise self.fail(where, f"must be 0, or {SMALLEST:g} and more: the firmware computes in float")
         if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
-            bound = "above" if strict else "of at least"
-            raise self.fail(where, f"must be a finite number {bound} {low:g}, not {value!r}")
+            bound = "" if low == -math.inf else f" above {low:g}" if strict else f" of at least {low:g}"
+            raise self.fail(where, f"must be a finite number{bound}, not {value!r}")
         return number
 
     def count(self, value: Any, where: str, low: int, high: int = 2**31 - 1) -> int:
@@ -393,7 +399,10 @@ class _Reader:
         groups_tree = self.entry(tree, "groups", "")
         if not isinstance(groups_tree, dict) or not groups_tree:
             raise self.fail("groups", "must be a mapping of at least one group")
-        groups = tuple(self.group(str(name), fields, weights, time) for name, fields in groups_tree.items())
+        for key in groups_tree:
+            if not isinstance(key, str):
+                raise self.fail("groups", f"a group's name must be text, not {key!r}")
+        groups = tuple(self.group(name, fields, weights, time) for name, fields in groups_tree.items())
         axes = [axis for group in groups for axis in group.axes]
         for axis in axes:
             if axes.count(axis) > 1:
