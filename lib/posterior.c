@@ -706,26 +706,36 @@ static void begin_pass(selfcal_work_t *work) {
 }
 
 /* Whether what the limits leave of a cell counts beside the best. One that lies more than `by` higher becomes the best; the sums begin anew
- * then. */
+ * then. In the search by its middle alone: where the likelihood is steep a wide cell's part within the limits does not keep what the
+ * middle beyond them promises. */
 static bool counts(selfcal_work_t *work, const selfcal_real_t ln_value[], const reach_t *reach, selfcal_real_t profile, selfcal_real_t by) {
-    const selfcal_real_t height = profile - reach->drop;
+    selfcal_real_t height = profile - reach->drop;
     if (!(reach->from < reach->to) || !(height > work->best - DEPTH)) { /* nor NaN */
         return false;
     }
     if (height > work->best + by) {
-        work->best = height;
-        work->drop[work->hypothesis] = reach->drop;
-        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            work->best_ln[p] = ln_value[p] + reach->peak;
-        }
-        work->best_ln[SELFCAL_ALPHA] = ln_value[SELFCAL_ALPHA];
+        selfcal_real_t drop = reach->drop, peak = reach->peak;
         if (work->stage == SUM) {
             work->stage = BOX;
             work->at = 0;
-            return false;
+        } else {
+            selfcal_real_t half[2] = {R(0.0), R(0.0)};
+            const reach_t middle = reach_of(work, ln_value, half);
+            drop = middle.drop;
+            peak = middle.peak;
+            height = profile - drop;
+            if (!(height > work->best)) {
+                return true;
+            }
         }
+        work->best = height;
+        work->drop[work->hypothesis] = drop;
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            work->best_ln[p] = ln_value[p] + peak;
+        }
+        work->best_ln[SELFCAL_ALPHA] = ln_value[SELFCAL_ALPHA];
     }
-    return true;
+    return work->stage != BOX;
 }
 
 static void step_scan(selfcal_work_t *work) {
@@ -813,7 +823,7 @@ static bool too_coarse(const selfcal_work_t *work) {
 static void begin_sum(selfcal_work_t *work) {
     work->row = 0;
     work->at = 0;
-    work->mass = 0.0;
+    work->mass = work->mass_sq = 0.0;
     work->off_grid = too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0; /* then all of the mass counts as off the grid */
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
@@ -869,10 +879,10 @@ static void deposit(const spread_t *spread, selfcal_real_t middle, selfcal_real_
     }
 }
 
-/* What a cell adds to the sums, sigma_v integrated: its mass, and first and second moments of N and of the drift parameter about the
- * best cell, relative. */
+/* What a cell adds to the sums, sigma_v integrated: its mass, the same times sigma_v^2 over that of the mode, and first and second
+ * moments of N and of the drift parameter about the best cell, relative. */
 typedef struct {
-    selfcal_real_t mass, first[2], second[2];
+    selfcal_real_t mass, mass_sq, first[2], second[2];
 } moments_t;
 
 /* N or the drift parameter in a cell. */
@@ -892,7 +902,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
      * noise, sigma_v falls as rho rises and their product stands still. */
     selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(work->width[0] + fall)};
     const reach_t reach = reach_of(work, ln_value, half);
-    moments_t sum = {R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
+    moments_t sum = {R(0.0), R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     if (!counts(work, ln_value, &reach, profile, HIGHER)) {
         return sum;
     }
@@ -934,6 +944,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
             continue;
         }
         sum.mass += w;
+        sum.mass_sq = r_fma(w * (R(1.0) + e), R(1.0) + e, sum.mass_sq);
         for (unsigned j = 0; j < sides; j++) {
             const selfcal_real_t weighed = w * dev[j];
             sum.first[j] += weighed;
@@ -960,7 +971,7 @@ static void step_sum(selfcal_work_t *work) {
     }
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_real_t alpha_density = prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL ? r_exp(row->ln_alpha) : R(1.0);
-    selfcal_wide_t part_mass = 0.0;
+    selfcal_real_t part_mass = R(0.0), part_mass_sq = R(0.0);
     uint16_t i = part(work, STEP_SUMMED_CELLS, (uint16_t)(last + 1U));
     cell_t before, cell, after;
     make_cell(work, i, &after);
@@ -982,30 +993,32 @@ static void step_sum(selfcal_work_t *work) {
         if (work->delta_width != width) { /* sigma_v's cells were laid anew, for more than a cell's sums */
             work->at = (uint16_t)(i + 1U);
         }
-        part_mass += (selfcal_wide_t)sum.mass;
+        part_mass += sum.mass;
+        part_mass_sq += sum.mass_sq;
         work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
         for (unsigned j = 0; j < 2U; j++) { /* zero without a drift */
             work->first[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.first[j];
             work->second[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.second[j];
         }
-        const selfcal_real_t mass_sq = sum.mass + R(2.0) * sum.first[0] + sum.second[0]; /* times (N / best N)^2 */
         for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
             const selfcal_real_t basis = has_drift ? work->scratch.grid.basis[i][k] : R(1.0);
             const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
             weight[at] += sum.mass * basis;
-            weight_sq[at] += mass_sq * basis;
+            weight_sq[at] += sum.mass_sq * basis;
         }
     }
-    if (!(part_mass > 0.0)) {
+    if (!(part_mass > R(0.0))) {
         return;
     }
-    work->mass += part_mass;
+    work->mass += (selfcal_wide_t)part_mass;
+    work->mass_sq += (selfcal_wide_t)part_mass_sq;
     if (hypothesis->alpha != NULL) {
         const selfcal_wide_t dev = expm1((selfcal_wide_t)row->ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);
         const spread_t spread = spread_over(work, SELFCAL_ALPHA, work->width[1]);
-        work->first[SELFCAL_ALPHA] += part_mass * dev;
-        work->second[SELFCAL_ALPHA] += part_mass * dev * dev;
-        deposit(&spread, row->ln_alpha, (selfcal_real_t)part_mass);
+        const selfcal_wide_t weighed = (selfcal_wide_t)part_mass * dev;
+        work->first[SELFCAL_ALPHA] += weighed;
+        work->second[SELFCAL_ALPHA] += weighed * dev;
+        deposit(&spread, row->ln_alpha, part_mass);
     }
     for (uint16_t j = 0; j < rows; j++) {
         for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
@@ -1104,22 +1117,25 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
 }
 #endif
 
-/* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance, which goes with
- * sigma_v^2. How far the bias prior pulls at a node is taken at the posterior mean of sigma_v^2: nothing under a wide prior. */
+/* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance.
+ * That goes with sigma_v^2, and so does how far the bias prior pulls, by a node's conditional mode: where the drift may hide the white
+ * noise one sigma_v for all nodes would be off by decades, and rho^2 alone change too much from node to node. */
 static void step_bias(selfcal_work_t *work) {
-    const selfcal_wide_t best_sq = (selfcal_wide_t)(r_exp(R(2.0) * work->best_ln[SELFCAL_N]) / (selfcal_real_t)work->bank->model->dt_s);
-    const selfcal_wide_t first = work->first[SELFCAL_N] / work->mass, second = work->second[SELFCAL_N] / work->mass;
-    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd;
-    const selfcal_wide_t mean_sq = best_sq * (1.0 + 2.0 * first + second), prior_precision = mean_sq / (sd * sd);
+    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, mean_sq = work->mass_sq / work->mass;
     const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
     const bool begins = work->at == 0U;
     for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
         selfcal_node_view_t v;
         selfcal_now_t now;
+        selfcal_field_t field;
         selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
+        node_field(work, k, &field);
+        const selfcal_wide_t mode_sq = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)field.ln_sigma), sigma_sq = mode_sq * mean_sq;
+        const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * mode_sq;
         if (work->mask != 0U) {
-            work->bank->model->regressors->code->now(work, k, mean_sq, &now);
+            work->bank->model->regressors->code->now(work, k, sigma_sq, &now);
         } else {
+            const selfcal_wide_t prior_precision = sigma_sq / (sd * sd);
             const selfcal_wide_t variance = 1.0 / (v.a + prior_precision), lost = 1.0 - v.bias_left;
             const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
             now.mean = v.drift + x0 * v.bias_left;
@@ -1140,12 +1156,11 @@ static void step_bias(selfcal_work_t *work) {
         work->bias_weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
         work->bias_first += weighed;
         work->bias_second += weighed * off;
-        work->bias_own += (selfcal_wide_t)work->scratch.grid.spline[1][k] * (v.drift_var + now.own[0]);
+        work->bias_own += own * (v.drift_var + now.own[0]);
         if (has_decay(v.law)) {
             /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
              * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
             selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-            const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * best_sq;
             selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
             selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
             size_t terms = 1;
@@ -1175,13 +1190,12 @@ static void step_bias(selfcal_work_t *work) {
             }
         }
     }
-    work->bias_scale = best_sq;
 }
 
 static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
     const selfcal_wide_t mean = work->bias_first / work->bias_weight;
     const selfcal_wide_t scatter = work->bias_second / work->bias_weight - mean * mean;
-    const selfcal_wide_t own = work->bias_own * work->bias_scale / work->mass;
+    const selfcal_wide_t own = work->bias_own / work->mass;
     posterior->bias_mean = (float)(work->bias_about + mean + selfcal_offset(work->bank, work->axis));
     posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
     for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {

@@ -522,8 +522,7 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t lea
     result->share = (selfcal_real_t)(beginning * fit.bent);
 }
 
-/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances over
- * sigma_v^2. */
+/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances. */
 static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *result) {
     normal_t normal;
     fit_t fit;
@@ -540,7 +539,7 @@ static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance,
         const selfcal_wide_t off = fit.mean[i] - (selfcal_wide_t)of->mean[r];
         of->first[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
         of->second[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off * off;
-        of->own[r] += (selfcal_wide_t)work->scratch.grid.spline[1][k] * fit.var[i] / variance;
+        of->own[r] += (selfcal_wide_t)work->scratch.grid.spline[1][k] * fit.var[i];
     }
 }
 
@@ -550,7 +549,7 @@ static void finish(const selfcal_work_t *work) {
         if (((unsigned)work->mask >> r & 1U) != 0U) {
             const selfcal_wide_t mean = of->first[r] / work->bias_weight;
             const selfcal_wide_t scatter = of->second[r] / work->bias_weight - mean * mean;
-            of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->own[r] * work->bias_scale / work->mass, 0.0));
+            of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->own[r] / work->mass_sq, 0.0));
             of->mean[r] = (float)((selfcal_wide_t)of->mean[r] + mean);
         }
     }

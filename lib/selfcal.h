@@ -808,14 +808,14 @@ typedef struct {
             /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
             selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
             selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
-            /* ... as they are, and with sigma_v^2 over that of the best cell */
+            /* ... as they are, and with sigma_v^2 over that of its conditional mode */
             selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
             selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM + 2]; /* a mass that ends at the last bin's end reaches beyond it */
             selfcal_cell_row_t row;
         } grid;
     } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
-    selfcal_wide_t bias_own, bias_scale;                             /* its variance at the nodes, over bias_scale */
+    selfcal_wide_t bias_own, mass_sq;                                /* its variance at the nodes; mass with sigma_v^2 over that of the mode */
     /* sums of selfcal_decay_t over the nodes of each alpha */
     selfcal_wide_t bias_decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_work_t;
