@@ -1124,7 +1124,7 @@ static void step_bias(selfcal_work_t *work) {
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, mean_sq = work->mass_sq / work->mass;
     const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
     const bool begins = work->at == 0U;
-    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
+    for (uint16_t k = part(work, 1U, nodes_of(work)); k < work->at; k++) {
         selfcal_node_view_t v;
         selfcal_now_t now;
         selfcal_field_t field;
