@@ -586,7 +586,8 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
 /* `count` samples are missing. The prediction over the gap is exact for up to 2^32 - 1 bank intervals (136 years at 1 Hz); a
  * longer one is taken for that. A block with half or more of its samples counts as their mean with its variance raised by
- * block / used; one with fewer is dropped. */
+ * block / used (a moving average's: that of its own e_i); one with fewer is dropped. Before the first sample they are counted alone: the
+ * first block begins with it. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
