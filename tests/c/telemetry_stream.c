@@ -204,11 +204,9 @@ int main(int argc, char **argv)
             for (uint8_t k = 0; k < hypotheses; k++) {
                 random_posterior(&report.hypothesis[k], message[a], (int)order[k]);
             }
-            for (uint32_t after = STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
-                if (after > a * slow_ms) {
-                    require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));
-                    send_all(&telemetry);
-                }
+            for (uint32_t after = (a * slow_ms / STATUS_MS + 1U) * STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
+                require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));
+                send_all(&telemetry);
             }
             require(selfcal_telemetry_report(&telemetry, &report, &counters, begun_ms));
             send_all(&telemetry);

@@ -237,9 +237,10 @@ class Decoder:
             return []
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
-        told_ms = self.time_ms
         if "time_ms" in values:
             told_ms = self._advance(int(values["time_ms"]), 0 if definition.name == STATUS else BACK_MS)
+        else:
+            told_ms = self._begun(second)
         if definition.name == STATUS:
             self.status.update(values)
             if "frames_sent" in values:
@@ -251,8 +252,7 @@ class Decoder:
         if definition.name in (CORRECTED, ANSWER):
             (self.corrected if definition.name == CORRECTED else self.answer).update(values)
             return self.flush()
-        begun_ms = told_ms if "time_ms" in values else self._begun(second)
-        return self._assemble(definition.name.lower(), item, jump, second, begun_ms / 1000.0, values)
+        return self._assemble(definition.name.lower(), item, jump, second, told_ms / 1000.0, values)
 
     def flush(self) -> list[AxisReport]:
         """Close the report under way, incomplete, for the end of a stream."""
@@ -290,7 +290,7 @@ class Decoder:
 
     def _advance(self, time_ms: int, back_ms: int) -> int:
         """Unwrapped module time of a frame, which may lie `back_ms` before others, else the module starts anew."""
-        ahead = (time_ms - self.time_ms + 2**31) % 2**32 - 2**31
+        ahead = _ahead(time_ms, self.time_ms, 2**32)
         if ahead < -min(back_ms, self.time_ms):
             self.time_ms = time_ms
             return time_ms
@@ -323,8 +323,13 @@ class Decoder:
     def _begun(self, second: int) -> int:
         """Module time of a frame that tells its second alone, modulo 256: the nearest to what is known."""
         wrapped = self.time_ms % 2**32
-        ahead = (second - wrapped // 1000 + 128) % 256 - 128
+        ahead = _ahead(second, wrapped // 1000, 256)
         return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
+
+
+def _ahead(told: int, known: int, modulus: int) -> int:
+    """How far `told`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
+    return (told - known + modulus // 2) % modulus - modulus // 2
 
 
 def _report(report: _Open, *, complete: bool) -> AxisReport:
