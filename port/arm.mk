@@ -19,7 +19,7 @@ ARM_SMALL := -fno-move-loop-invariants -fno-tree-loop-im -fno-tree-tail-merge -f
 ARM_FAST := %/averager.c %/averager_fixed.c %/kernel_fixed.c %/kernel_float.c
 arm_fast = $(filter $(if $(findstring KERNEL_M4F,$(1)),$(filter-out %/kernel_float.c,$(ARM_FAST)),$(ARM_FAST)),$(2))
 # arm_objects FLAGS,SOURCES: objects of the sources (absolute paths) in the working directory.
-arm_objects = arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1) -c $(call arm_fast,$(1),$(2)) && \
+arm_objects = $(if $(call arm_fast,$(1),$(2)),arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1) -c $(call arm_fast,$(1),$(2)) &&) \
 	arm-none-eabi-gcc -Os $(ARM_SMALL) $(ARM_COMPILE) $(1) -c $(filter-out $(call arm_fast,$(1),$(2)),$(2))
 
 # What a replayed recording needs of the application: the board's sensor, with rates of its own, is left out.
