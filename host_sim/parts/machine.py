@@ -7,12 +7,15 @@ priority (a lower number) alone.
 
 from __future__ import annotations
 
+import ctypes
 import heapq
 import itertools
+import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import unicorn.arm_const as arm
 from elftools.elf.elffile import ELFFile
@@ -26,6 +29,9 @@ from unicorn.unicorn_const import (
     UC_MODE_MCLASS,
     UC_MODE_THUMB,
 )
+
+if TYPE_CHECKING:
+    from unicorn.unicorn_py3.unicorn import UcContext
 
 SRAM = 0x20000000
 
@@ -56,6 +62,7 @@ NRF51822 = Core(arm.UC_CPU_ARM_CORTEX_M0, 0, 0x40000, 0x8000, 16.0, 150, 2400, 2
 HANDLER_MOST = 400_000  # instructions a handler may take
 ACCESS_US = 0.03  # a peripheral access, about 5 cycles
 WFI = b"\x30\xbf"
+SPIN_LOOP = bytes.fromhex("0138 fdd1")  # subs r0, #1; bne to it
 
 EXC_HARD_FAULT, EXC_SYSTICK, EXC_IRQ0 = 3, 15, 16
 
@@ -120,6 +127,9 @@ class Machine:
         self._spent = 0.0  # us of peripheral accesses within the slice
         self.on_reset: Callable[[str], None] = lambda cause: None
         self.uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
+        self._contexts: list[UcContext] = []  # to be used again
+        self._value = ctypes.c_uint64()
+        self._pointer = ctypes.byref(self._value)
         self.uc.ctl_set_cpu_model(core.cpu)
         self.uc.mem_map(core.flash, core.flash_bytes)
         self.uc.mem_map(SRAM, core.sram_bytes)
@@ -129,10 +139,11 @@ class Machine:
         self._load(elf)
         self.uc.hook_add(UC_HOOK_INTR, self._interrupt_hook)
         spin = self.symbols["clock_spin_us"] & ~1
+        self._spin = spin + bytes(self.uc.mem_read(spin, 64)).index(SPIN_LOOP)
         self.uc.hook_add(UC_HOOK_CODE, self._spin_hook, None, spin, spin)
         if core.turn:
             self.uc.hook_add(UC_HOOK_BLOCK, self._turn_hook, None, spin, spin + 2)
-        self._pages: dict[int, list[Part]] = {}
+        self._pages: dict[int, list[tuple[Part, int, int]]] = {}  # and from where to where
 
     def _load(self, path: Path) -> None:
         with path.open("rb") as file:
@@ -149,7 +160,7 @@ class Machine:
         """Power on: once, when every part is there."""
         for part in self.parts:
             for page in range(part.base & ~0xFFF, part.base + part.size, 0x1000):
-                self._pages.setdefault(page, []).append(part)
+                self._pages.setdefault(page, []).append((part, part.base, part.base + part.size))
         for page in self._pages:
             self.uc.mmio_map(page, 0x1000, self._mmio_read, page, self._mmio_write, page)
         self._restart()
@@ -166,10 +177,10 @@ class Machine:
     def _mmio_read(self, uc: Uc, offset: int, size: int, page: int) -> int:
         address = page + offset
         self._spent += ACCESS_US
-        for part in self._pages[page]:
-            if part.base <= address < part.base + part.size:
+        for part, base, end in self._pages[page]:
+            if base <= address < end:
                 try:
-                    return part.read(address - part.base) & 0xFFFFFFFF
+                    return part.read(address - base) & 0xFFFFFFFF
                 except KeyError:
                     break
         self.violations.append(f"read of {address:#x}, which no model has")
@@ -178,10 +189,10 @@ class Machine:
     def _mmio_write(self, uc: Uc, offset: int, size: int, value: int, page: int) -> None:
         address = page + offset
         self._spent += ACCESS_US
-        for part in self._pages[page]:
-            if part.base <= address < part.base + part.size:
+        for part, base, end in self._pages[page]:
+            if base <= address < end:
                 try:
-                    part.write(address - part.base, value & 0xFFFFFFFF)
+                    part.write(address - base, value & 0xFFFFFFFF)
                     return
                 except KeyError:
                     break
@@ -242,6 +253,11 @@ class Machine:
         if self._in_handler:
             self._spent += self.core.turn / self.hclk_mhz
 
+    def _register(self, number: int) -> int:
+        """Of the core. Uc.reg_read() without its search for the register's class, which takes most of its time."""
+        self.uc._do_reg_read(number, self._pointer)  # type: ignore[attr-defined]
+        return self._value.value
+
     def _vector(self, exception: int) -> int:
         return int.from_bytes(self.uc.mem_read(self.core.flash + 4 * exception, 4), "little")
 
@@ -249,33 +265,51 @@ class Machine:
         """Run a handler to its end. Registers are put back whole; the frame's room on the stack is taken (PM0214
         2.3.7)."""
         uc = self.uc
-        context = uc.context_save()
+        if not self._contexts:
+            self._contexts.append(uc.context_save())
+        context = self._contexts.pop()
+        uc.context_update(context)
         outer, priority = self._in_handler, self.priority.get(exception, 0)
-        uc.reg_write(arm.UC_ARM_REG_SP, (uc.reg_read(arm.UC_ARM_REG_SP) - 104) & ~7)
+        uc.reg_write(arm.UC_ARM_REG_SP, (self._register(arm.UC_ARM_REG_SP) - 104) & ~7)
         uc.reg_write(arm.UC_ARM_REG_LR, 0xFFFFFFF9)
         self._exception_return = False
         self._in_handler = True
         address = self._vector(exception)
-        for _ in range(HANDLER_MOST // self.core.fine):
-            self._run(address, self.core.fine)
+        left = HANDLER_MOST
+        while left > 0:
+            count = self._stretch(address, priority)
+            self._run(address, count)
             if self._exception_return:
                 break
             if self._reset_wanted or self.stopped:
                 return
-            self._spent += self.core.fine / self.hclk_mhz
-            if priority > 0:
+            self._spent += count / self.hclk_mhz
+            left -= count
+            if priority > 0 and (self._pending or self._next_us() <= self.time_us):
                 self._preempt(priority)
                 if self._reset_wanted or self.stopped:
                     return
-            address = uc.reg_read(arm.UC_ARM_REG_PC)
+            address = self._register(arm.UC_ARM_REG_PC)
         else:
             self.violations.append(
                 f"handler of exception {exception} did not return within {HANDLER_MOST} instructions"
             )
         self._in_handler = outer
         uc.context_restore(context)
+        self._contexts.append(context)
         self._exception_return = False
         self._spent += 0.3  # entry and exit
+
+    def _stretch(self, address: int, priority: int) -> int:
+        """Instructions of a handler to run in one go: in the delay's loop to its end, or to the next event if that may
+        bring what breaks in; elsewhere a few."""
+        within = address - self._spin
+        if within not in (0, 2):
+            return self.core.fine
+        turns = float(min(self._register(arm.UC_ARM_REG_R0), HANDLER_MOST))
+        if priority > 0:
+            turns = min(turns, 1 + (self._next_us() - self.time_us) * self.hclk_mhz / (2 + self.core.turn))
+        return max(2, 2 * int(turns) + within // 2)
 
     def _preempt(self, priority: int) -> None:
         """Between two stretches of a handler: what is due, and the handlers that break into this one."""
@@ -284,7 +318,7 @@ class Machine:
         self._events_due()
         while not self._reset_wanted and not self.stopped:
             higher = [exception for exception in self._ready() if self.priority.get(exception, 0) < priority]
-            if not higher or self.uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
+            if not higher or self._register(arm.UC_ARM_REG_PRIMASK) & 1:
                 break
             self._pending.discard(higher[0])
             self._take(higher[0])
@@ -345,7 +379,7 @@ class Machine:
     def _next_us(self) -> float:
         while self._events and self._events[0][2].call is None:
             heapq.heappop(self._events)
-        return self._events[0][0] if self._events else float("inf")
+        return self._events[0][0] if self._events else math.inf
 
     def _ready(self) -> list[int]:
         """What may be taken, first things first (PM0214 2.3.5)."""
@@ -365,10 +399,10 @@ class Machine:
                 self.on_reset(cause)
                 self._restart()
                 continue
-            ready = self._ready()
+            ready = self._ready() if self._pending else []
             if ready:
                 self._asleep = False
-                if not uc.reg_read(arm.UC_ARM_REG_PRIMASK) & 1:
+                if not self._register(arm.UC_ARM_REG_PRIMASK) & 1:
                     self._pending.discard(ready[0])
                     self._take(ready[0])
                     continue
@@ -377,8 +411,8 @@ class Machine:
                 continue
             span = min(self._next_us(), until_us) - self.now_us
             count = 20 if ready else max(1, min(self._slice, int(span * self.hclk_mhz)))
-            self._run(uc.reg_read(arm.UC_ARM_REG_PC), count)
-            pc = uc.reg_read(arm.UC_ARM_REG_PC)
+            self._run(self._register(arm.UC_ARM_REG_PC), count)
+            pc = self._register(arm.UC_ARM_REG_PC)
             if self._reset_wanted or self.stopped:
                 continue
             if bytes(uc.mem_read(pc - 2, 2)) == WFI:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 
 from .machine import EXC_IRQ0, Event, Machine, Part
@@ -145,9 +146,9 @@ class Dma2(Part):
         rx, tx = self.streams[self.RX], self.streams[self.TX]
         self.end = None
         uc = self.machine.uc
-        for position in range(self.count):
-            out = int.from_bytes(uc.mem_read(tx[0x0C] + 2 * position, 2), "little")
-            uc.mem_write(rx[0x0C] + 2 * position, self.spi.exchange(out, self.machine.time_us).to_bytes(2, "little"))
+        out = struct.iter_unpack("<H", uc.mem_read(tx[0x0C], 2 * self.count))
+        words = [self.spi.exchange(word, self.machine.time_us) for (word,) in out]
+        uc.mem_write(rx[0x0C], struct.pack(f"<{self.count}H", *words))
         for stream in (rx, tx):
             stream[0x04] -= self.count
             stream[0x00] &= ~1

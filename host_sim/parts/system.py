@@ -265,12 +265,12 @@ class Gpio(Part):
         self.base = base
         super().__init__(machine)
         self.on_output: Callable[[int, bool], None] = lambda pin, level: None
-        self.odr = 0
+        self.odr = self._outputs = 0  # a bit a pin
 
     def reset(self) -> None:
         """Inputs. Outputs let go: the lines are pulled up outside."""
         self.registers = {0x00: 0, 0x04: 0, 0x08: 0, 0x0C: 0, 0x20: 0, 0x24: 0}
-        self.odr = 0
+        self.odr = self._outputs = 0
 
     def mode(self, pin: int) -> int:
         """0 input, 1 output, 2 alternate function, 3 analogue."""
@@ -282,7 +282,7 @@ class Gpio(Part):
 
     def level(self, pin: int) -> bool:
         """Of an output; lines that nobody drives are pulled up."""
-        return bool(self.odr >> pin & 1) if self.mode(pin) == 1 else True
+        return bool((self.odr | ~self._outputs) >> pin & 1)
 
     def read(self, offset: int) -> int:
         """Configuration and ODR."""
@@ -290,17 +290,19 @@ class Gpio(Part):
 
     def write(self, offset: int, value: int) -> None:
         """Configuration, ODR, BSRR."""
-        before = [self.level(pin) for pin in range(16)]
+        before = self.odr | ~self._outputs
         if offset == 0x18:
             self.odr = self.odr & ~(value >> 16) | value & 0xFFFF
         elif offset == 0x14:
             self.odr = value & 0xFFFF
         elif offset in self.registers:
             self.registers[offset] = value
+            self._outputs = sum((self.mode(pin) == 1) << pin for pin in range(16))
         else:
             raise KeyError(offset)
+        changed = (before ^ (self.odr | ~self._outputs)) & 0xFFFF
         for pin in range(16):
-            if self.level(pin) != before[pin]:
+            if changed >> pin & 1:
                 self.on_output(pin, self.level(pin))
 
 
