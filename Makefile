@@ -239,7 +239,7 @@ $(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/ben
 
 # ------------------------------------------------------------------------------------------------------------- checks
 
-CHECKS := check-gcc check-clang check-arm check-c++ check-tidy check-tokens check-ruff check-mypy
+CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-ruff check-mypy
 .PHONY: $(CHECKS)
 check: setup
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
