@@ -320,6 +320,19 @@ def test_a_corrected_sample_holds_nothing_of_the_one_before() -> None:
     assert (decoder.statistics.received, decoder.statistics.refused) == (6, 0)
 
 
+def test_a_corrected_sample_takes_nothing_of_the_next_whose_first_frame_is_lost() -> None:
+    """Samples at 2000 and 2100 ms whose readings are 1 and 2; the loss of any frame, and of any two in a row."""
+    samples = [[(0, 2000), (1, 0x3F800000), (2, 0x3F800000)], [(0, 2100), (1, 0x40000000), (2, 0x40000000)]]
+    sent = list(enumerate(frame for sample in samples for frame in sample))
+    for lost in ({first, second} for first in range(6) for second in (first, first + 1)):
+        decoder = Decoder()
+        for counter, (item, value) in sent:
+            if counter not in lost:
+                decoder.feed(corrected_frame(counter, item, value))
+                readings = {decoder.corrected[name] for name in decoder.corrected if name != "time_ms"}
+                assert readings <= {{2000.0: 1.0, 2100.0: 2.0}.get(decoder.corrected.get("time_ms", 0.0))}
+
+
 def test_repeated_and_late_frames_are_refused() -> None:
     all_lines = lines(stream(1, 2))
     decoder = Decoder(from_start=True)

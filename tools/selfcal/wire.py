@@ -183,8 +183,9 @@ class Decoder:
         self.statistics = Statistics()
         #: Last value of each status signal.
         self.status: dict[str, float] = {}
-        #: Signals of the last corrected sample, as far as they have come.
+        #: Signals of the last corrected sample, as far as they have come without a loss.
         self.corrected: dict[str, float] = {}
+        self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
         #: The latest module time that a frame has told, unwrapped, ms. It goes back only if the module starts anew.
@@ -235,6 +236,7 @@ class Decoder:
         if jump == 0:
             self.statistics.refused += 1
             return []
+        self._corrects = self._corrects and jump == 1  # the frame that opens the next sample may be among the lost
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
@@ -247,10 +249,15 @@ class Decoder:
                 self._exact(int(values["frames_sent"]))
                 self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
             return self.flush()
-        if definition.name == CORRECTED and "time_ms" in values:
-            self.corrected = {}  # a new set: an axis that is no longer sent has no part in it
-        if definition.name in (CORRECTED, ANSWER):
-            (self.corrected if definition.name == CORRECTED else self.answer).update(values)
+        if definition.name == CORRECTED:
+            if "time_ms" in values:
+                self.corrected = {}  # an axis that is no longer sent has no part in it
+                self._corrects = True
+            if self._corrects:
+                self.corrected.update(values)
+            return self.flush()
+        if definition.name == ANSWER:
+            self.answer.update(values)
             return self.flush()
         return self._assemble(definition.name.lower(), item, jump, second, told_ms / 1000.0, values)
 
