@@ -203,11 +203,13 @@ typedef struct {
 /* sigma_v's mode at a node is found by turns, to this part of its square. */
 #define SELFCAL_MODE_TURNS 20U
 #define SELFCAL_MODE_LEFT R(1e-5)
-/* What a report takes of one node: ln of sigma_v's mode, profile ln-likelihood, the sum of ln s, and what half the curvature in ln sigma_v
- * lacks of n: a sample for the bias and each coefficient that the data tell, none for those that their priors tell. */
+/* What a report takes of one node: its view; ln of sigma_v's mode, profile ln-likelihood; what half the curvature in ln sigma_v lacks of n: a
+ * sample for the bias and each coefficient that the data tell, none for those that their priors tell; and the mode of sigma_v^2 over what the
+ * readings scatter by. */
 typedef struct {
-    selfcal_wide_t ln_sigma, profile, ln_s;
-    selfcal_real_t share;
+    selfcal_node_view_t node;
+    selfcal_wide_t ln_sigma, profile;
+    selfcal_real_t share, ratio;
 } selfcal_field_t;
 
 /* forgetting.c, for a model that forgets. */
@@ -283,6 +285,10 @@ void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread
 size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis);
 void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
 #endif
+
+/* selfcal_push_with() but for its arguments' check, or for a sample taken in motion, without regressors: some of the work that waits, a judgement
+ * of the axes, and the sample into its block or passed by. A bit for each axis that it found at fault. */
+uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving);
 
 /* Regressors that an axis has, a bit each. */
 uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);

@@ -235,10 +235,10 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
         bank->model->regressors->code->field(work, index, n * least, field);
         return;
     }
-    selfcal_node_view_t v;
-    selfcal_bank_view(bank, work->axis, index, &v);
-    const selfcal_wide_t var = fmax((v.c - v.b * v.b / v.a) / n, least); /* of the residual; the rest is in units of it */
-    const selfcal_wide_t miss = v.b / v.a + selfcal_bank_from_prior(bank, work->axis), known = v.a / var;
+    const selfcal_node_view_t *v = &field->node;
+    selfcal_bank_view(bank, work->axis, index, &field->node);
+    const selfcal_wide_t var = fmax((v->c - v->b * v->b / v->a) / n, least); /* of the residual; the rest is in units of it */
+    const selfcal_wide_t miss = v->b / v->a + selfcal_bank_from_prior(bank, work->axis), known = v->a / var;
     const selfcal_real_t beginning = (selfcal_real_t)bank->beginning, size = (selfcal_real_t)n;
     const selfcal_real_t width = (selfcal_real_t)(p0 * known), missed = beginning * (selfcal_real_t)(miss * miss * known);
     /* The mode: the bias takes a share of one sample; of how far it missed its prior, what that leaves is noise. (Beyond 10 sd of the prior
@@ -255,8 +255,8 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
     noise /= ratio;
     const selfcal_wide_t ln_var = log(var * (selfcal_wide_t)ratio);
     field->ln_sigma = 0.5 * ln_var;
-    field->ln_s = v.ln_s;
-    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + ln_var + 1.0 / (selfcal_wide_t)ratio) + v.ln_s +
+    field->ratio = ratio;
+    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + ln_var + 1.0 / (selfcal_wide_t)ratio) + v->ln_s +
                              (selfcal_wide_t)(missed / (width + ratio) - beginning * r_log(rest)));
     field->share = share * r_fma(beginning, share, noise + noise);
 }
@@ -344,7 +344,7 @@ static void step_peak(selfcal_work_t *work, uint16_t nodes) {
         selfcal_field_t field;
         node_field(work, k, &field);
         if (hypothesis_of(work)->rho == NULL) {
-            work->truth.ln_noise = (selfcal_real_t)(0.5 * field.ln_s / n);
+            work->truth.ln_noise = (selfcal_real_t)(0.5 * field.node.ln_s / n);
         }
         if (has_expectation(work)) {
             work->truth.pair = work->truth.pair || hypothesis_of(work)->alpha != NULL;
@@ -503,8 +503,9 @@ static void step_fit(selfcal_work_t *work) {
     node_field(work, k, &field);
     /* As its filters settle an even record comes to 8 nats, and to 16 with some gaps; that much does not count as missed. */
     const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - (selfcal_real_t)e.ln_sigma) + e.ln_v;
-    const selfcal_wide_t off = field.ln_sigma - e.ln_sigma;
-    truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
+    /* What the priors of bias and coefficients add is no function of psi. */
+    const selfcal_wide_t off = field.ln_sigma - (selfcal_wide_t)(R(0.5) * r_log(field.ratio)) - e.ln_sigma;
+    truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.node.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
     if (at == 0U) {
         work->ln_sigma_off = off;
         truth->ln_v = e.ln_v; /* any that is near will do */
@@ -1123,71 +1124,68 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
 static void step_bias(selfcal_work_t *work) {
     const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, mean_sq = work->mass_sq / work->mass;
     const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
-    const bool begins = work->at == 0U;
-    for (uint16_t k = part(work, 1U, nodes_of(work)); k < work->at; k++) {
-        selfcal_node_view_t v;
-        selfcal_now_t now;
-        selfcal_field_t field;
-        selfcal_bank_view(work->bank, work->axis, (uint16_t)(work->first_node + k), &v);
-        node_field(work, k, &field);
-        const selfcal_wide_t mode_sq = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)field.ln_sigma), sigma_sq = mode_sq * mean_sq;
-        const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * mode_sq;
-        if (work->mask != 0U) {
-            work->bank->model->regressors->code->now(work, k, sigma_sq, &now);
-        } else {
-            const selfcal_wide_t prior_precision = sigma_sq / (sd * sd);
-            const selfcal_wide_t variance = 1.0 / (v.a + prior_precision), lost = 1.0 - v.bias_left;
-            const selfcal_wide_t x0 = (v.b - offset * prior_precision) * variance;
-            now.mean = v.drift + x0 * v.bias_left;
-            now.drift[0] = now.mean - x0;
-            now.own[0] = v.bias_left * v.bias_left * variance;
-            now.own[1] = v.bias_left * lost * variance;
-            now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
+    const uint16_t k = work->at++;
+    selfcal_now_t now;
+    selfcal_field_t field;
+    node_field(work, k, &field);
+    const selfcal_node_view_t *v = &field.node;
+    const selfcal_wide_t mode_sq = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)field.ln_sigma), sigma_sq = mode_sq * mean_sq;
+    const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * mode_sq;
+    if (work->mask != 0U) {
+        work->bank->model->regressors->code->now(work, k, sigma_sq, &now);
+    } else {
+        const selfcal_wide_t prior_precision = sigma_sq / (sd * sd);
+        const selfcal_wide_t variance = 1.0 / (v->a + prior_precision), lost = 1.0 - v->bias_left;
+        const selfcal_wide_t x0 = (v->b - offset * prior_precision) * variance;
+        now.mean = v->drift + x0 * v->bias_left;
+        now.drift[0] = now.mean - x0;
+        now.own[0] = v->bias_left * v->bias_left * variance;
+        now.own[1] = v->bias_left * lost * variance;
+        now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
 #if SELFCAL_TERMS_MAX > 1
-            if (is_sum(v.law)) {
-                now_terms(work, k, x0, variance, v.bias_left, &now);
-            }
+        if (is_sum(v->law)) {
+            now_terms(work, k, x0, variance, v->bias_left, &now);
+        }
 #endif
-        }
-        if (begins && k == 0U) {
-            work->bias_about = now.mean;
-        }
-        const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
-        work->bias_weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
-        work->bias_first += weighed;
-        work->bias_second += weighed * off;
-        work->bias_own += own * (v.drift_var + now.own[0]);
-        if (has_decay(v.law)) {
-            /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
-             * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
-            selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-            selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v.ln_rho);
-            selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v.drift_var};
-            size_t terms = 1;
+    }
+    if (k == 0U) {
+        work->bias_about = now.mean;
+    }
+    const selfcal_wide_t off = now.mean - work->bias_about, weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+    work->bias_weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
+    work->bias_first += weighed;
+    work->bias_second += weighed * off;
+    work->bias_own += own * (v->drift_var + now.own[0]);
+    if (has_decay(v->law)) {
+        /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
+         * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
+        selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
+        selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v->ln_rho);
+        selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
+        size_t terms = 1;
 #if SELFCAL_TERMS_MAX > 1
-            if (is_sum(v.law)) {
-                terms = SELFCAL_TERMS_MAX;
-                stationary *= v.law == SELFCAL_FLICKER ? SELFCAL_FLICKER_TERM
-                                                       : exp(2.0 * v.ln_alpha) * (selfcal_wide_t)hypothesis_of(work)->correlation_time_s /
-                                                             (selfcal_wide_t)work->bank->model->dt_s; /* of the term that decays */
-                selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
-            }
+        if (is_sum(v->law)) {
+            terms = SELFCAL_TERMS_MAX;
+            stationary *= v->law == SELFCAL_FLICKER ? SELFCAL_FLICKER_TERM
+                                                   : exp(2.0 * v->ln_alpha) * (selfcal_wide_t)hypothesis_of(work)->correlation_time_s /
+                                                         (selfcal_wide_t)work->bank->model->dt_s; /* of the term that decays */
+            selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
+        }
 #endif
-            for (size_t a = 0; a < terms; a++) {
-                const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now.drift[a];
-                selfcal_wide_t with_all = 0.0;
-                for (size_t b = 0; b < terms; b++) {
-                    const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
-                    with_all += spread[pair];
-                    if (b <= a) {
-                        decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
-                            own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
-                            weighed_fall * now.drift[b];
-                    }
+        for (size_t a = 0; a < terms; a++) {
+            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now.drift[a];
+            selfcal_wide_t with_all = 0.0;
+            for (size_t b = 0; b < terms; b++) {
+                const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
+                with_all += spread[pair];
+                if (b <= a) {
+                    decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
+                        own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
+                        weighed_fall * now.drift[b];
                 }
-                decay[a] += weighed_fall;
-                decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now.own[1 + a]) - weighed_fall * off);
             }
+            decay[a] += weighed_fall;
+            decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now.own[1 + a]) - weighed_fall * off);
         }
     }
 }

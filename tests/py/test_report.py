@@ -227,6 +227,33 @@ def test_limits_of_n_that_cut_the_posterior(n: int, low: float, high: float) -> 
             assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
 
 
+@pytest.mark.parametrize("off", [0.0, 4.0, 5.0, 6.0, 8.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_bias_far_from_its_prior_beside_a_law_that_may_explain_it(off: float, seed: int) -> None:
+    """Against direct integration, `off` prior deviations: how far the bias misses its prior is noise where the drift is
+    small, drift where it is not, and so no function of the spectrum that all nodes see of the data."""
+    limits = {"K": (0.004, 0.012), "sigma_m": (0.54, 1.03), "alpha": (0.002, 0.057)}
+    tables = tables_of(MODEL, bias_sd=0.2)
+    places = {PLACES[name]: (math.log(low), math.log(high)) for name, (low, high) in limits.items()}
+    axis = replace(
+        tables.axes[0],
+        ln_min=tuple(places.get(i, (old, 0.0))[0] for i, old in enumerate(tables.axes[0].ln_min)),
+        ln_max=tuple(places.get(i, (0.0, old))[1] for i, old in enumerate(tables.axes[0].ln_max)),
+    )
+    y = simulate_bank_samples("random_walk", {"N": 0.05, "K": 0.007, "bias": off * 0.2}, 1.0, 82, seed)[0]
+    bank = Bank(replace(tables, axes=(axis,)))
+    push(bank, y)
+    report = bank.report(0)
+    evidence, mean, sd = constant_by_integration(y, axis)
+    truth = {"constant": (evidence, {"N": (mean, sd)}), "random_walk": walk_by_integration(y, axis)}
+    for name, (expected, moments) in truth.items():
+        assert abs(report.log_evidence[name] - expected) <= REPORT_LIMIT[0]
+        for parameter, (m, s) in moments.items():
+            found = report.parameters[name][parameter]
+            assert abs(found.mean - m) <= REPORT_LIMIT[1] * s
+            assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
+
+
 @pytest.mark.parametrize(("axis", "law"), [("ax", "random_walk"), ("gx", "constant")])
 def test_a_wide_bias_prior_costs_its_width_alone(axis: str, law: str) -> None:
     """ln evidence less that under a narrower prior is the ln of the ratio of their widths, both being far wider than
