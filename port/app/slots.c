@@ -67,12 +67,25 @@ static uint32_t find(const slots_t *self, bool older)
     return good[0] ? 0U : good[1] ? 1U : NONE;
 }
 
+/* Nothing was written there since the last erase. */
+static bool blank(const slots_t *self, uint32_t slot)
+{
+    const uint8_t *byte = start_of(self, slot);
+    size_t erased = 0;
+    while (erased < SLOTS_HEADER_BYTES && byte[erased] == 0xFFU) {
+        erased++;
+    }
+    return erased == SLOTS_HEADER_BYTES;
+}
+
+/* Where no slot has a header and one has what is left of it, that is a state of no bytes: to be refused, not to be passed over. */
 const void *slots_stored(void *context, bool older, size_t *length)
 {
     const slots_t *self = context;
     const uint32_t slot = find(self, older);
     if (slot == NONE) {
-        return NULL;
+        *length = 0;
+        return older || (blank(self, 0) && blank(self, 1)) ? NULL : start_of(self, 0);
     }
     *length = header_of(self, slot).length;
     return start_of(self, slot) + SLOTS_HEADER_BYTES;

@@ -215,6 +215,20 @@ static void the_sequence_wraps(void)
     TEST_ASSERT_EQUAL(1, stored(true));
 }
 
+/* A slot that was written and has no whole header is a state to be refused; an erased one is none. */
+static void what_is_left_of_a_header_is_told_from_an_erased_slot(void)
+{
+    size_t length = 1;
+    TEST_ASSERT_NULL(slots_stored(&slots, false, &length));
+    TEST_ASSERT_TRUE(save(1, 100));
+    flash.bytes[(size_t)slots.slot * STRIDE + 5U] ^= 1U;
+    TEST_ASSERT_NOT_NULL(slots_stored(&slots, false, &length));
+    TEST_ASSERT_EQUAL(0, length);
+    TEST_ASSERT_NULL(slots_stored(&slots, true, &length));
+    TEST_ASSERT_TRUE(save(2, 100));
+    TEST_ASSERT_EQUAL(2, stored(false));
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -227,5 +241,6 @@ int main(void)
     RUN_TEST(with_one_state_or_none_there_is_no_older_one_to_keep);
     RUN_TEST(a_state_longer_than_a_slot_is_refused);
     RUN_TEST(the_sequence_wraps);
+    RUN_TEST(what_is_left_of_a_header_is_told_from_an_erased_slot);
     return UNITY_END();
 }
