@@ -81,6 +81,9 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
     self->model = model;
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         uint8_t found = 0;
+        if (axis_name[axis] == NULL) {
+            return SELFCAL_BAD_ARGUMENT;
+        }
         while (found < SELFCAL_FRAME_AXES && strcmp(axis_name[axis], message_table[found].name) != 0) {
             found++;
         }

@@ -272,6 +272,7 @@ static void test_bad_arguments_and_models_are_refused(void)
 {
     static const char *const unknown[] = {"ay", "mx"};
     static const char *const twice[] = {"gx", "gx"};
+    static const char *const none[] = {"gx", NULL};
     static const selfcal_hypothesis_t same[] = {{SELFCAL_CONSTANT, 0.0F, NULL, NULL}, {SELFCAL_CONSTANT, 0.0F, NULL, NULL}};
     static const selfcal_model_t same_law = {1, 1.0F, 1, 2, 2, 2, axis_table, same, NULL, NULL};
     selfcal_telemetry_t other;
@@ -281,6 +282,7 @@ static void test_bad_arguments_and_models_are_refused(void)
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_init(NULL, &full, names));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_init(&other, NULL, names));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_init(&other, &full, NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_init(&other, &full, none));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_report(&telemetry, NULL, &counters, 0));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_report(&telemetry, &report, NULL, 0));
     report.axis = 2;
