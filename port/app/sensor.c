@@ -6,6 +6,7 @@ typedef char the_rate_can_be_read[(int)SELFCAL_MODEL_RATE_HZ < 1000 ? 1 : -1];
 static const int the_sensor_makes_the_rate = 1 / ADIS16405_HAS_RATE(SELFCAL_MODEL_RATE_HZ);
 
 static adis16405_t sensor;
+static volatile bool listening;             /* a sensor that was not reset with the processor is ready before the driver is */
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 
 bool sensor_init(const adis16405_bus_t *bus)
@@ -18,12 +19,15 @@ bool sensor_init(const adis16405_bus_t *bus)
         channel[axis] = (uint8_t)at;
     }
     const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
-    return the_sensor_makes_the_rate != 0 && adis16405_init(&sensor, bus, &config);
+    listening = the_sensor_makes_the_rate != 0 && adis16405_init(&sensor, bus, &config);
+    return listening;
 }
 
 void sensor_ready(void)
 {
-    adis16405_ready(&sensor);
+    if (listening) {
+        adis16405_ready(&sensor);
+    }
 }
 
 void sensor_burst(const uint16_t words[ADIS16405_BURST_WORDS], bool whole)

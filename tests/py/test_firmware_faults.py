@@ -32,6 +32,7 @@ from firmware import (
     tell,
 )
 from parts.flash import half_erased, half_programmed
+from parts.machine import EXC_IRQ0
 from unicorn import UC_HOOK_CODE, Uc
 from unicorn import arm_const as arm
 
@@ -214,6 +215,28 @@ def test_a_reset_while_samples_wait() -> None:
     assert len(tap.pushed) > before + 90
     assert sound(board, None, 0)
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_sensor_is_ready_before_its_driver(target: str) -> None:
+    """After a reset of the processor alone the sensor goes on: a sample may be ready while the driver is set up."""
+    board = quiet(target, 8)
+    board.run(2.0)
+    early = 0
+
+    def ready(uc: Uc, address: int, size: int, data: object) -> None:
+        nonlocal early
+        early += 1
+        board.machine.pend(EXC_IRQ0 + 6)  # EXTI0 and GPIOTE
+
+    place = board.machine.symbols["adis16405_init"] & ~1
+    board.machine.uc.hook_add(UC_HOOK_CODE, ready, None, place, place)
+    board.machine.reset("software")
+    board.run(3.0)
+    assert early == 1
+    assert [cause for _, cause in board.machine.resets] == ["software"]
+    assert not board.machine.faults
+    assert board.value("sensor.state") == 1
 
 
 def test_altered_settings_are_found() -> None:
