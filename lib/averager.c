@@ -278,14 +278,7 @@ static bool nodes_are_due(const selfcal_t *self) {
            (uint64_t)self->block * SELFCAL_BATCH < (uint64_t)2U * SELFCAL_PUSH_EVERY * self->model->nodes;
 }
 
-selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
-    return selfcal_push_with(self, sample, NULL);
-}
-
-selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]) {
-    if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
-        return SELFCAL_BAD_ARGUMENT;
-    }
+uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving) {
     if (nodes_are_due(self)) {
         (void)selfcal_bank_run(self, self->push_nodes);
     }
@@ -293,10 +286,10 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
     const uint32_t live = ((1U << axes) - 1U) & ~self->retired;
     const uint32_t bad = faults(self, sample) & live;
     retire(self, bad, live);
-    const bool known = self->columns == NULL || self->model->regressors->code->usable(self, regressors);
-    if (bad != 0U || !known || self->dropped) {
+    const bool known = moving || self->columns == NULL || self->model->regressors->code->usable(self, regressors);
+    if (bad != 0U || !known || moving || self->dropped) {
         pass(self, 1U);
-        return SELFCAL_OK;
+        return bad;
     }
     self->in_gap = false;
     if (!self->started) {
@@ -315,6 +308,18 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
     if (self->position == self->block) {
         close_block(self);
     }
+    return 0U;
+}
+
+selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
+    return selfcal_push_with(self, sample, NULL);
+}
+
+selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const float regressors[]) {
+    if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    (void)selfcal_take(self, sample, regressors, false);
     return SELFCAL_OK;
 }
 

@@ -241,6 +241,16 @@ selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const se
     return SELFCAL_OK;
 }
 
+selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]) {
+    if (sample == NULL || selfcal_moving(self) != SELFCAL_OK) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (selfcal_take(self, sample, NULL, true) == 0U) {
+        self->counters.missing += self->counters.missing < UINT64_MAX ? 1U : 0U;
+    }
+    return SELFCAL_OK;
+}
+
 void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount) {
     SELFCAL_ASSERT(gate != NULL && axis < gate->config.axes && isfinite(amount));
     gate->origin[axis] += amount; /* 0 before the first sample, which then sets it */

@@ -591,10 +591,14 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress: it yields no value, and what is pushed until its end counts as missing.
- * Nothing happens at the start of an interval. With the gate, every sample goes to selfcal_gate_push() first; if it said resting
- * before this sample and says so with it, the sample goes to selfcal_push(), else selfcal_moving() and selfcal_skip(1). So no
- * window of motion reaches back into an interval that is already closed, provided that the block is a multiple of the window. */
+ * Nothing happens at the start of an interval. */
 selfcal_status_t selfcal_moving(selfcal_t *self);
+
+/* A sample taken in motion: it is looked at for faults, which count, and retire an axis, as with selfcal_push(); one without counts as
+ * missing. For the rest as selfcal_moving() and selfcal_skip(1). With the gate, every sample goes to selfcal_gate_push() first; if
+ * it said resting before this sample and says so with it, the sample goes to selfcal_push(), else it goes here. So no window
+ * of motion reaches back into an interval that is already closed, provided that the block is a multiple of the window. */
+selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]);
 
 /* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
  * yields no value. `variance_ratio`: white-noise variance of a whole block's mean over what it is for the model's block at the
@@ -834,8 +838,8 @@ selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *se
 
 /* One slice of it, below 61 000 instructions on a Cortex-M4F (72 000 under uniform priors) without regressors in use, else one
  * node's least squares. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. It first runs the nodes over
- * what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or a call that looks at the sums, it is
- * SELFCAL_OVERTAKEN; begin anew. */
+ * what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or fewer and a call that looks at the sums,
+ * it is SELFCAL_OVERTAKEN; begin anew. After SELFCAL_OK or that, SELFCAL_BAD_ARGUMENT: no report is under way. */
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report);
 
 /* All steps in a row. */
@@ -954,7 +958,8 @@ selfcal_motion_t selfcal_gate_skip(selfcal_gate_t *gate, uint64_t count);
  * is not above 0, or a factor that is infinite. */
 selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise);
 
-/* The sensor itself adds `amount` (unit) to the readings of an axis from the next sample on, see selfcal_shift(): no motion. */
+/* The sensor itself adds `amount` (unit) to the readings of an axis from the next sample on, see selfcal_shift(): no motion. An axis that the
+ * gate has not, or an amount that is not finite, is a bug (SELFCAL_ASSERT). */
 void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount);
 
 /* The noise as measured over the whole windows of rest so far, for selfcal_gate_noise(): run with false_alarm 0 while the sensor

@@ -149,7 +149,7 @@ static void save(app_t *app, uint32_t now)
     }
 }
 
-#if SELFCAL_MODEL_GATE || APP_CORRECTED_MS
+#if APP_CORRECTED_MS
 /* Whether the bank will keep this sample out for a fault of the sensor's, which it then counts. */
 static bool faulty(const app_t *app, const float reading[])
 {
@@ -195,7 +195,7 @@ static void leave_out_retired(app_t *app)
 }
 #endif
 
-/* By the rule at selfcal_moving(). */
+/* By the rule at selfcal_push_moving(). */
 static void give(app_t *app, const float reading[])
 {
 #if SELFCAL_MODEL_GATE
@@ -207,11 +207,8 @@ static void give(app_t *app, const float reading[])
         const selfcal_motion_t now = selfcal_gate_push(&app->gate, reading);
         learn_noise(app);
         if (before == SELFCAL_MOVING || now == SELFCAL_MOVING) {
-            (void)selfcal_moving(&app->bank);
-            if (!faulty(app, reading)) {
-                (void)selfcal_skip(&app->bank, 1U);
-                return;
-            }
+            (void)selfcal_push_moving(&app->bank, reading);
+            return;
         }
     }
 #endif
@@ -219,19 +216,10 @@ static void give(app_t *app, const float reading[])
 }
 
 #if APP_CORRECTED_MS
-/* Counts how many readings in a row are alike: the bank does not while the module moves. */
-static void count_same(app_t *app, const float reading[])
-{
-    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        const uint32_t before = reading[axis] == app->reading[axis] ? app->same[axis] : 0U;
-        app->same[axis] = before < UINT32_MAX ? before + 1U : before;
-    }
-}
-
 static bool stuck(const app_t *app, uint8_t axis)
 {
     const uint32_t limit = selfcal_model.axis[axis].stuck_limit;
-    return limit > 0U && app->same[axis] >= limit;
+    return limit > 0U && app->bank.equal[axis] >= limit;
 }
 #endif
 
@@ -252,7 +240,6 @@ static bool take_sample(app_t *app)
         app->fresh = true;
 #if APP_CORRECTED_MS
         app->passed += (uint64_t)missing + 1U;
-        count_same(app, reading);
         memcpy(app->reading, reading, sizeof reading);
         app->reading_ms = app->port->time_ms(app->port->context);
         app->newer = true;

@@ -82,7 +82,6 @@ typedef struct {
     selfcal_report_t last_report[SELFCAL_MODEL_AXES];
     bool has_report[SELFCAL_MODEL_AXES];
     float reading[SELFCAL_MODEL_AXES]; /* the newest */
-    uint32_t same[SELFCAL_MODEL_AXES]; /* readings in a row that equal it, itself among them */
     uint32_t reading_ms;
     bool newer;            /* than what was last looked at for a corrected sample */
     selfcal_corrected_t corrected;

@@ -332,6 +332,53 @@ static void only_an_axis_that_starves_the_others_is_retired(void) {
 
 /* Readings that the sensor shifts, in the middle of a block and between two, against the same unshifted ones with the block lost: on a
  * lattice on which no sum rounds every report is the same to the bit, but for the bias, which has moved by that. Kept by a snapshot. */
+/* One in three samples beyond the range, as in a swing, or all of them: in motion as at rest the axis is judged by the sound ones too. */
+static void motion_retires_only_an_axis_that_is_mostly_at_fault(void) {
+    for (unsigned every = 1; every <= 3U; every += 2U) {
+        setUp();
+        for (unsigned i = 0; i < (SELFCAL_RETIRE_BLOCKS + 10U) * 3U * BLOCK; i++) {
+            float sample[AXES];
+            rest_sample(sample);
+            if (i % every == 0U) {
+                sample[DEAD] = -300.0F;
+            }
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push_moving(&bank, sample));
+        }
+        TEST_ASSERT_EQUAL(every == 1U, selfcal_retired(&bank, DEAD));
+    }
+}
+
+/* To the bank a sample in motion is one that is missing, whatever it holds. */
+static void a_sample_in_motion_passes_by(void) {
+    init_other();
+    for (unsigned i = 0; i < 300U * BLOCK; i++) {
+        float sample[AXES], rest[AXES];
+        rest_sample(sample);
+        without_dead(sample, rest);
+        const bool moves = i < 7U || i % 137U < 25U;
+        if (moves) {
+            sample[i % AXES] = i % 5U == 0U ? 300.0F : 50.0F;
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push_moving(&bank, sample));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_moving(&other));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_skip(&other, 1));
+        } else {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&other, rest));
+        }
+    }
+    others_equal();
+    const selfcal_counters_t *mine = selfcal_counters(&bank), *its = selfcal_counters(&other);
+    uint64_t saturated = 0;
+    for (unsigned axis = 0; axis < AXES; axis++) {
+        saturated += mine->saturated[axis];
+    }
+    TEST_ASSERT_TRUE(saturated > 0U);
+    TEST_ASSERT_TRUE(its->missing == mine->missing + saturated);
+    TEST_ASSERT_TRUE(its->samples == mine->samples && its->blocks_moving == mine->blocks_moving && its->blocks_moving > 10U);
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(NULL, &axes[0].range));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(&bank, NULL));
+}
+
 static void a_shift_by_the_sensor_moves_the_bias_alone(void) {
     const float amount[2] = {-4.375F, 1.0F / 64.0F};
     float shifted[AXES] = {0.0F};
@@ -479,6 +526,8 @@ int main(void) {
     RUN_TEST(huge_samples_cannot_overflow_a_sum);
     RUN_TEST(a_dead_axis_is_retired_and_the_others_go_on);
     RUN_TEST(only_an_axis_that_starves_the_others_is_retired);
+    RUN_TEST(motion_retires_only_an_axis_that_is_mostly_at_fault);
+    RUN_TEST(a_sample_in_motion_passes_by);
     RUN_TEST(a_shift_by_the_sensor_moves_the_bias_alone);
     RUN_TEST(motion_drops_the_block_in_progress);
     RUN_TEST(a_change_of_rate_changes_the_weight_alone);

@@ -455,6 +455,18 @@ static void moving(void) {
     }
 }
 
+static void push_in_motion(input_t *in) {
+    float sample[SELFCAL_AXES_MAX];
+    for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
+        sample[axis] = axis < model.axes ? any_float(in) : NAN;
+    }
+    moved = true;
+    HOLDS(selfcal_push_moving(&bank.self, sample) == SELFCAL_OK);
+    if (twinned) {
+        HOLDS(selfcal_push_moving(&twin.self, sample) == SELFCAL_OK);
+    }
+}
+
 static void shift(input_t *in) {
     const uint8_t which = byte(in);
     const float amount = (which & 0x80U) != 0U ? any_float(in) : moderate(in);
@@ -772,6 +784,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
         case 17: look_at_gate(&in); break;
         case 18: set_values(&in); break;
         case 19: shift(&in); break;
+        case 20: push_in_motion(&in); break;
         default: push_moderate(&in); break;
         }
         check_counters();

@@ -50,7 +50,7 @@ class Learning:
 
 
 class Gated:
-    """The library on the host behind the model's gate, by the rule at selfcal_moving(): what the application does."""
+    """The library on the host behind the model's gate, by the rule at selfcal_push_moving(), as the application is."""
 
     def __init__(self, model: Model, rate_hz: float, axes: tuple[str, ...], target: str = "host") -> None:
         tables = make_tables(model, rate_hz, axes, target)
@@ -72,6 +72,5 @@ class Gated:
         if self.used[-1]:
             self.bank.push(sample[None, :])
         else:
-            self.bank.raw.moving()
-            self.bank.raw.skip(1)
+            self.bank.raw.push_moving(sample[None, :])
         self.resting = now

@@ -304,7 +304,7 @@ def test_a_shock_within_a_window() -> None:
 
 
 def test_the_bank_gets_no_sample_of_a_window_with_motion() -> None:
-    """Gate and bank in step, a sample at a time, as selfcal_moving() says: every sum is that of a bank which was told
+    """Gate and bank in step, a sample at a time, as selfcal_push_moving() says: every sum is that of a bank told
     that the intervals with a moving window are missing. Shocks lie at all places of the windows and intervals."""
     window, block = 10, 50
     tables = make_tables(Model.load(), float(block), ("gx",), bank_rate_hz=1.0)
@@ -319,8 +319,7 @@ def test_the_bank_gets_no_sample_of_a_window_with_motion() -> None:
         if before and now:
             bank.push(sample[None, :])
         else:
-            bank.raw.moving()
-            bank.raw.skip(1)
+            bank.raw.push_moving(sample[None, :])
         rest.append(bool(before and now))
         before = now
     first = rest.index(True)

@@ -89,7 +89,7 @@ def assert_same(
 
 def test_replay_with_the_gate_keeps_motion_out(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """10 s of shaking and 7 s missing: the firmware's result is that of gate and bank by the rule at
-    selfcal_moving()."""
+    selfcal_push_moving()."""
     part_of_shipped(tmp_path / "part.npz")
     part = load(tmp_path / "part.npz")
     axes = Model.load().axes

@@ -110,6 +110,12 @@ public:
 
     void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
     void moving() { check(selfcal_moving(&bank_)); }
+    void push_moving(const Rows &samples) {
+        if (samples.shape(1) != axes_.size())
+            throw std::invalid_argument("samples must be [n, axes]");
+        for (size_t i = 0; i < samples.shape(0); i++)
+            check(selfcal_push_moving(&bank_, samples.data() + i * axes_.size()));
+    }
     void rate(uint32_t block, float variance_ratio) { check(selfcal_rate(&bank_, block, variance_ratio)); }
 
     bool retired(uint8_t axis) const {
@@ -402,6 +408,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
+        .def("push_moving", &Bank::push_moving)
         .def("rate", &Bank::rate)
         .def("retired", &Bank::retired)
         .def("report", &Bank::report, nb::arg("axis"), nb::arg("mask") = 0)
