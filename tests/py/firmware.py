@@ -121,8 +121,8 @@ def readings(samples: list[tuple[int, ...]]) -> NDArray[np.float32]:
 
 class Tap:
     """What the application gives to the library: every selfcal_push() with its place on the sensor's count of samples,
-    found by what selfcal_push() and selfcal_skip() have been given before. With a gate also what came to that, `seen`:
-    samples missing, and the sample. Watches only."""
+    found by what that, selfcal_push_moving() and selfcal_skip() have been given before. With a gate also what came to
+    that, `seen`: samples missing, and the sample. Watches only."""
 
     def __init__(self, board: parts.Board) -> None:
         self.board = board
@@ -134,6 +134,7 @@ class Tap:
         self._missing = 0
         hooks = {
             "selfcal_push": self._push,
+            "selfcal_push_moving": self._move,
             "selfcal_skip": self._skip,
             "selfcal_gate_push": self._see,
             "selfcal_gate_skip": self._miss,
@@ -147,6 +148,10 @@ class Tap:
         self.place += 1
         sample = np.frombuffer(bytes(uc.mem_read(uc.reg_read(arm.UC_ARM_REG_R1), 24)), dtype="<f4")
         self.pushed.append((self.place, tuple(sample.tolist())))
+
+    def _move(self, uc: Uc, address: int, size: int, data: object) -> None:
+        self.place += 1
+        self.skips.append(1)
 
     def _see(self, uc: Uc, address: int, size: int, data: object) -> None:
         sample = np.frombuffer(bytes(uc.mem_read(uc.reg_read(arm.UC_ARM_REG_R1), 24)), dtype="<f4")
