@@ -241,6 +241,7 @@ selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const se
     return SELFCAL_OK;
 }
 
+/* Here, with what is compiled for size: only a gate calls for it, and the averager is for speed (port/arm.mk). */
 selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]) {
     if (sample == NULL || selfcal_moving(self) != SELFCAL_OK) {
         return SELFCAL_BAD_ARGUMENT;

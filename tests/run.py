@@ -20,6 +20,7 @@ BUILD = ROOT / "build"
 TIMEOUT = {"check": 1800, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
 #: s, by kernel
 FUZZ_SECONDS = {"float": 12, "fixed16": 6, "fixed32": 6}
+#: What the suites after the checks run.
 BUILT = ("c-tests", "bench-images", "firmware-images", *(f"build/fuzz/{kernel}/fuzz_api" for kernel in FUZZ_SECONDS))
 #: At once; the machine that this is to be quick on has two cores.
 WORKERS = 2

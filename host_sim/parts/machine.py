@@ -139,7 +139,8 @@ class Machine:
         self._load(elf)
         self.uc.hook_add(UC_HOOK_INTR, self._interrupt_hook)
         spin = self.symbols["clock_spin_us"] & ~1
-        self._spin = spin + bytes(self.uc.mem_read(spin, 64)).index(SPIN_LOOP)
+        loop = bytes(self.uc.mem_read(spin, 64)).find(SPIN_LOOP)
+        self._spin = spin + loop if loop >= 0 else None  # another compiler's: in short stretches, as the rest
         self.uc.hook_add(UC_HOOK_CODE, self._spin_hook, None, spin, spin)
         if core.turn:
             self.uc.hook_add(UC_HOOK_BLOCK, self._turn_hook, None, spin, spin + 2)
@@ -239,14 +240,14 @@ class Machine:
     # exceptions
 
     def _interrupt_hook(self, uc: Uc, number: int, data: object) -> None:
-        if uc.reg_read(arm.UC_ARM_REG_PC) >= 0xFFFFFF00:
+        if self._register(arm.UC_ARM_REG_PC) >= 0xFFFFFF00:
             self._exception_return = True
         uc.emu_stop()
 
     def _spin_hook(self, uc: Uc, address: int, size: int, data: object) -> None:
         """Outside handlers, time within a slice is not known: there the firmware's delay is taken at its word."""
         if not self._in_handler:
-            self._spent += uc.reg_read(arm.UC_ARM_REG_R0)
+            self._spent += self._register(arm.UC_ARM_REG_R0)
 
     def _turn_hook(self, uc: Uc, address: int, size: int, data: object) -> None:
         """A turn of the delay."""
@@ -255,7 +256,7 @@ class Machine:
 
     def _register(self, number: int) -> int:
         """Of the core. Uc.reg_read() without its search for the register's class, which takes most of its time."""
-        self.uc._do_reg_read(number, self._pointer)  # type: ignore[attr-defined]
+        self.uc._do_reg_read(number, self._pointer)  # type: ignore[attr-defined]  # not in its exported type
         return self._value.value
 
     def _vector(self, exception: int) -> int:
@@ -303,7 +304,7 @@ class Machine:
     def _stretch(self, address: int, priority: int) -> int:
         """Instructions of a handler to run in one go: in the delay's loop to its end, or to the next event if that may
         bring what breaks in; elsewhere a few."""
-        within = address - self._spin
+        within = -1 if self._spin is None else address - self._spin
         if within not in (0, 2):
             return self.core.fine
         turns = float(min(self._register(arm.UC_ARM_REG_R0), HANDLER_MOST))
@@ -329,11 +330,11 @@ class Machine:
     def _fault(self, error: UcError) -> None:
         """HardFault, with the frame that its handler looks at."""
         uc = self.uc
-        pc = uc.reg_read(arm.UC_ARM_REG_PC)
+        pc = self._register(arm.UC_ARM_REG_PC)
         self.faults.append((pc, str(error)))
-        stack = (uc.reg_read(arm.UC_ARM_REG_SP) - 32) & ~7
-        values = [uc.reg_read(r) for r in (arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R1, arm.UC_ARM_REG_R2, arm.UC_ARM_REG_R3)]
-        values += [uc.reg_read(r) for r in (arm.UC_ARM_REG_R12, arm.UC_ARM_REG_LR)] + [pc, 0x01000000]
+        stack = (self._register(arm.UC_ARM_REG_SP) - 32) & ~7
+        framed = (*range(arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R0 + 4), arm.UC_ARM_REG_R12, arm.UC_ARM_REG_LR)
+        values = [*(self._register(number) for number in framed), pc, 0x01000000]
         if stack - SRAM in range(self.core.sram_bytes - 32):
             uc.mem_write(stack, b"".join(value.to_bytes(4, "little") for value in values))
         uc.reg_write(arm.UC_ARM_REG_SP, stack)

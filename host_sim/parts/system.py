@@ -282,7 +282,11 @@ class Gpio(Part):
 
     def level(self, pin: int) -> bool:
         """Of an output; lines that nobody drives are pulled up."""
-        return bool((self.odr | ~self._outputs) >> pin & 1)
+        return bool(self._levels >> pin & 1)
+
+    @property
+    def _levels(self) -> int:
+        return self.odr | ~self._outputs
 
     def read(self, offset: int) -> int:
         """Configuration and ODR."""
@@ -290,7 +294,7 @@ class Gpio(Part):
 
     def write(self, offset: int, value: int) -> None:
         """Configuration, ODR, BSRR."""
-        before = self.odr | ~self._outputs
+        before = self._levels
         if offset == 0x18:
             self.odr = self.odr & ~(value >> 16) | value & 0xFFFF
         elif offset == 0x14:
@@ -300,7 +304,7 @@ class Gpio(Part):
             self._outputs = sum((self.mode(pin) == 1) << pin for pin in range(16))
         else:
             raise KeyError(offset)
-        changed = (before ^ (self.odr | ~self._outputs)) & 0xFFFF
+        changed = (before ^ self._levels) & 0xFFFF
         for pin in range(16):
             if changed >> pin & 1:
                 self.on_output(pin, self.level(pin))

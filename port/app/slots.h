@@ -31,7 +31,7 @@ typedef struct {
 /* The following are callbacks of port_module_t; `context` is a slots_t with its `memory` set. */
 
 /* The newest state whose save reached its end, or NULL; `older`: the one before it. Whether it is still what was written its own
- * checksum tells. */
+ * checksum tells. If there is none, but a slot that was written and has no whole header, a state of length 0, for start-up to refuse. */
 const void *slots_stored(void *context, bool older, size_t *length);
 
 /* A save: begin erases the slot of the older state, put appends, end writes the header if the state is `whole`. Until the header's last

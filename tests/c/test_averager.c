@@ -330,8 +330,6 @@ static void only_an_axis_that_starves_the_others_is_retired(void) {
     TEST_ASSERT_EQUAL(1, !selfcal_retired(&bank, 3) + !selfcal_retired(&bank, 4) + !selfcal_retired(&bank, 5));
 }
 
-/* Readings that the sensor shifts, in the middle of a block and between two, against the same unshifted ones with the block lost: on a
- * lattice on which no sum rounds every report is the same to the bit, but for the bias, which has moved by that. Kept by a snapshot. */
 /* One in three samples beyond the range, as in a swing, or all of them: in motion as at rest the axis is judged by the sound ones too. */
 static void motion_retires_only_an_axis_that_is_mostly_at_fault(void) {
     for (unsigned every = 1; every <= 3U; every += 2U) {
@@ -379,6 +377,8 @@ static void a_sample_in_motion_passes_by(void) {
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(&bank, NULL));
 }
 
+/* Readings that the sensor shifts, in the middle of a block and between two, against the same unshifted ones with the block lost: on a
+ * lattice on which no sum rounds every report is the same to the bit, but for the bias, which has moved by that. Kept by a snapshot. */
 static void a_shift_by_the_sensor_moves_the_bias_alone(void) {
     const float amount[2] = {-4.375F, 1.0F / 64.0F};
     float shifted[AXES] = {0.0F};

@@ -407,11 +407,15 @@ static void push_moderate(input_t *in) {
     push(sample);
 }
 
-static void push_any(input_t *in) {
-    float sample[SELFCAL_AXES_MAX];
+static void any_sample(input_t *in, float sample[]) {
     for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
         sample[axis] = axis < model.axes ? any_float(in) : NAN;
     }
+}
+
+static void push_any(input_t *in) {
+    float sample[SELFCAL_AXES_MAX];
+    any_sample(in, sample);
     push(sample);
 }
 
@@ -457,9 +461,7 @@ static void moving(void) {
 
 static void push_in_motion(input_t *in) {
     float sample[SELFCAL_AXES_MAX];
-    for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
-        sample[axis] = axis < model.axes ? any_float(in) : NAN;
-    }
+    any_sample(in, sample);
     moved = true;
     HOLDS(selfcal_push_moving(&bank.self, sample) == SELFCAL_OK);
     if (twinned) {

@@ -21,7 +21,7 @@ from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import PLACES
 from selfcal.recording import load
-from selfcal.tables import AxisTable, make_tables
+from selfcal.tables import AxisTable, Tables, make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
@@ -189,6 +189,30 @@ def test_priors_that_say_as_much_as_the_record(
     assert (worst <= limit).all()
 
 
+def with_limits(tables: Tables, **limits: tuple[float, float]) -> Tables:
+    """The axis with these (min, max) of the parameters named."""
+    axis = tables.axes[0]
+    ln_min, ln_max = list(axis.ln_min), list(axis.ln_max)
+    for name, (low, high) in limits.items():
+        ln_min[PLACES[name]], ln_max[PLACES[name]] = math.log(low), math.log(high)
+    return replace(tables, axes=(replace(axis, ln_min=tuple(ln_min), ln_max=tuple(ln_max)),))
+
+
+def hold_by_integration(y: Floats, tables: Tables) -> None:
+    """The report's constant and random walk, in the company of the other laws, against direct integration."""
+    bank = Bank(tables)
+    push(bank, y)
+    report = bank.report(0)
+    evidence, mean, sd = constant_by_integration(y, tables.axes[0])
+    truth = {"constant": (evidence, {"N": (mean, sd)}), "random_walk": walk_by_integration(y, tables.axes[0])}
+    for name, (expected, moments) in truth.items():
+        assert abs(report.log_evidence[name] - expected) <= REPORT_LIMIT[0]
+        for parameter, (m, s) in moments.items():
+            found = report.parameters[name][parameter]
+            assert abs(found.mean - m) <= REPORT_LIMIT[1] * s
+            assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
+
+
 @pytest.mark.parametrize(
     ("n", "low", "high"),
     [
@@ -207,24 +231,7 @@ def test_limits_of_n_that_cut_the_posterior(n: int, low: float, high: float) -> 
     law = "random_walk" if n > 30 else "constant"
     values = {"N": 0.03, "K": 3e-4} if n > 30 else {"N": 0.03}
     y = simulate_bank_samples(law, values, 1.0, n, n)[0]
-    tables = tables_of(MODEL)
-    places = {PLACES["N"]: (math.log(0.03 * low), math.log(0.03 * high))}
-    axis = replace(
-        tables.axes[0],
-        ln_min=tuple(places.get(i, (old, 0.0))[0] for i, old in enumerate(tables.axes[0].ln_min)),
-        ln_max=tuple(places.get(i, (0.0, old))[1] for i, old in enumerate(tables.axes[0].ln_max)),
-    )
-    bank = Bank(replace(tables, axes=(axis,)))
-    push(bank, y)
-    report = bank.report(0)
-    evidence, mean, sd = constant_by_integration(y, axis)
-    truth = {"constant": (evidence, {"N": (mean, sd)}), "random_walk": walk_by_integration(y, axis)}
-    for name, (expected, moments) in truth.items():
-        assert abs(report.log_evidence[name] - expected) <= REPORT_LIMIT[0]
-        for parameter, (m, s) in moments.items():
-            found = report.parameters[name][parameter]
-            assert abs(found.mean - m) <= REPORT_LIMIT[1] * s
-            assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
+    hold_by_integration(y, with_limits(tables_of(MODEL), N=(0.03 * low, 0.03 * high)))
 
 
 @pytest.mark.parametrize("off", [0.0, 4.0, 5.0, 6.0, 8.0])
@@ -232,26 +239,9 @@ def test_limits_of_n_that_cut_the_posterior(n: int, low: float, high: float) -> 
 def test_a_bias_far_from_its_prior_beside_a_law_that_may_explain_it(off: float, seed: int) -> None:
     """Against direct integration, `off` prior deviations: how far the bias misses its prior is noise where the drift is
     small, drift where it is not, and so no function of the spectrum that all nodes see of the data."""
-    limits = {"K": (0.004, 0.012), "sigma_m": (0.54, 1.03), "alpha": (0.002, 0.057)}
-    tables = tables_of(MODEL, bias_sd=0.2)
-    places = {PLACES[name]: (math.log(low), math.log(high)) for name, (low, high) in limits.items()}
-    axis = replace(
-        tables.axes[0],
-        ln_min=tuple(places.get(i, (old, 0.0))[0] for i, old in enumerate(tables.axes[0].ln_min)),
-        ln_max=tuple(places.get(i, (0.0, old))[1] for i, old in enumerate(tables.axes[0].ln_max)),
-    )
+    tables = with_limits(tables_of(MODEL, bias_sd=0.2), K=(0.004, 0.012), sigma_m=(0.54, 1.03), alpha=(0.002, 0.057))
     y = simulate_bank_samples("random_walk", {"N": 0.05, "K": 0.007, "bias": off * 0.2}, 1.0, 82, seed)[0]
-    bank = Bank(replace(tables, axes=(axis,)))
-    push(bank, y)
-    report = bank.report(0)
-    evidence, mean, sd = constant_by_integration(y, axis)
-    truth = {"constant": (evidence, {"N": (mean, sd)}), "random_walk": walk_by_integration(y, axis)}
-    for name, (expected, moments) in truth.items():
-        assert abs(report.log_evidence[name] - expected) <= REPORT_LIMIT[0]
-        for parameter, (m, s) in moments.items():
-            found = report.parameters[name][parameter]
-            assert abs(found.mean - m) <= REPORT_LIMIT[1] * s
-            assert abs(found.sd / s - 1.0) <= REPORT_LIMIT[2]
+    hold_by_integration(y, tables)
 
 
 @pytest.mark.parametrize(("axis", "law"), [("ax", "random_walk"), ("gx", "constant")])
