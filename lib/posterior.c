@@ -35,6 +35,8 @@ enum { GATHER, TRUTH, FIT, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BO
 #define PASSES_MAX 8U
 /* n_eff (delta + e^(-2 delta)/2 - 1/2) at the ends of the sigma_v cells. */
 #define SIGMA_DEPTH R(13.0)
+/* ln(sigma_v/mode): more than any cell has that counts beside a sound best, and e^(2 of it) is still a float. */
+#define DELTA_MOST R(30.0)
 
 static const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {
     return &work->bank->model->hypothesis[work->hypothesis];
@@ -292,7 +294,7 @@ static void sigma_cells(selfcal_work_t *work, selfcal_real_t from, selfcal_real_
     const selfcal_real_t n_eff = work->n_eff;
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
         const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width;
-        work->delta_expm1[k] = r_expm1(delta);
+        work->delta_expm1[k] = r_expm1(r_fmin(delta, DELTA_MOST));
         work->delta_weight[k] = r_exp(r_fma(-n_eff, sigma_shape(delta), drop)) * width;
     }
 }
