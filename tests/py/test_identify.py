@@ -223,8 +223,8 @@ def test_a_model_key_given_twice_is_refused(tmp_path: Path) -> None:
         Model.load(model)
 
 
-@pytest.mark.parametrize("name", ["a */ b", "a\nb"])
-def test_a_model_name_that_ends_a_comment_is_refused(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["a */ b", "a\nb", None, ["a"]])
+def test_a_model_name_that_ends_a_comment_or_is_no_text_is_refused(tmp_path: Path, name: object) -> None:
     model = tmp_path / "model.yaml"
     text = Path(MODEL.path).read_text()
     model.write_text("\n".join(f"name: {json.dumps(name)}" if x.startswith("name:") else x for x in text.splitlines()))

@@ -243,6 +243,23 @@ class _Reader:
             raise self.fail(where, f"must be a whole number from {low} to {high}, not {value!r}")
         return value
 
+    def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
+        value = self.entry(tree, key, where)
+        text = str(value)  # `unit: 1` is a number to YAML
+        known = isinstance(value, str | int | float) and not isinstance(value, bool)
+        if not known or not text.isprintable() or "*/" in text:
+            what = "one line of text, without '*/': it goes into a comment of the tables"
+            raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {value!r:.40}")
+        return text
+
+    def unit(self, tree: Mapping[str, Any], where: str) -> str:
+        unit = self.text(tree, "unit", where)
+        try:
+            units.parse(unit)
+        except UserError as error:
+            raise self.fail(f"{where}.unit", str(error)) from None
+        return unit
+
     def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
         fields = self.only(tree, ("law", "min", "max", "sd"), where)
         law = self.entry(fields, "law", where)
@@ -283,20 +300,13 @@ class _Reader:
         return Group(
             name=name,
             axes=tuple(axes),
-            unit=str(self.entry(fields, "unit", where)),
+            unit=self.unit(fields, where),
             range=self.number(fields.get("range", 0.0), f"{where}.range", strict=False),
             lsb=self.number(fields.get("lsb", 0.0), f"{where}.lsb", strict=False),
             stuck_limit=self.count(fields.get("stuck_limit", 0), f"{where}.stuck_limit", 0),
             priors=priors,
             correlation_time_s=correlation_time_s,
         )
-
-    def name(self, tree: Mapping[str, Any], where: str) -> str:
-        name = str(self.entry(tree, "name", where))
-        if not name.isprintable() or "*/" in name:
-            prefix = f"{where}." if where else ""
-            raise self.fail(f"{prefix}name", "must be one line, without '*/': it goes into a comment of the tables")
-        return name
 
     def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
         if not isinstance(tree, dict):
@@ -305,11 +315,7 @@ class _Reader:
         if kind not in REGRESSORS:
             raise self.fail(where, f"unknown kind '{kind}' ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
-        unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or str(self.entry(fields, "unit", where))
-        try:
-            units.parse(unit)
-        except UserError as error:
-            raise self.fail(f"{where}.unit", str(error)) from None
+        unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or self.unit(fields, where)
         priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
         if not priors:
             raise self.fail(f"{where}.sd", "must name at least one group")
@@ -322,13 +328,13 @@ class _Reader:
             if key in REGRESSORS[kind]
         }
         return Regressor(
-            name=self.name(fields, where),
+            name=self.text(fields, "name", where),
             kind=kind,
             unit=f"{unit}/s" if kind == "rate" else unit,
             sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
             probability=probability,
             reference=self.number(fields.get("reference", 0.0), f"{where}.reference", low=-math.inf, strict=False),
-            column=str(self.entry(fields, "column", where)) if "column" in REGRESSORS[kind] else "",
+            column=self.text(fields, "column", where) if "column" in REGRESSORS[kind] else "",
             **needed,
         )
 
@@ -387,7 +393,7 @@ class _Reader:
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
-        name = self.name(tree, "")
+        name = self.text(tree, "name", "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
         weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
@@ -415,7 +421,7 @@ class _Reader:
             name=name,
             path=self.path,
             bank_rate_hz=self.number(self.entry(tree, "bank_rate_hz", ""), "bank_rate_hz"),
-            sensor_name=str(sensor.get("name", "")),
+            sensor_name=self.text({"name": "", **sensor}, "name", "sensor"),
             sensor_rate_hz=self.number(self.entry(sensor, "rate_hz", "sensor"), "sensor.rate_hz"),
             filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1),
             groups=groups,
