@@ -20,7 +20,7 @@ from test_wire import spoil
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import AxisReport, Decoder, Link
+from selfcal.wire import AxisReport, Decoder, Link, open_bus
 
 from wire_stream import lines, message, serial_line, stream
 
@@ -102,6 +102,19 @@ def test_ends_when_the_other_side_goes(capfd: pytest.CaptureFixture[str]) -> Non
     os.close(slave)
     assert time.monotonic() - begun < 30.0
     assert "the other side has gone" in capfd.readouterr().err
+
+
+def test_a_serial_line_has_one_reader() -> None:
+    """Of two each would lose what the other takes."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    with open_bus("slcan", path), pytest.raises(UserError, match="another program has it open"):
+        open_bus("slcan", path)
+    with open_bus("slcan", path):  # the first has closed it
+        pass
+    os.close(master)
+    os.close(slave)
 
 
 @pytest.mark.parametrize(

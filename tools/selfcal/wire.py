@@ -417,10 +417,20 @@ class Link:
 
 
 def open_bus(interface: str, channel: str, **options: Any) -> Link:
-    """Open a python-can interface. Raises UserError when that fails."""
+    """Open a python-can interface, a serial line for this process alone: of two readers each would lose what the other
+    takes. Raises UserError when that fails."""
     import can
+    from can.interfaces.slcan import slcanBus
 
     try:
-        return Link(can.Bus(interface=interface, channel=channel, **options))
+        bus = can.Bus(interface=interface, channel=channel, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
         raise UserError(f"{interface} {channel}: cannot open: {' '.join(str(error).split())}") from error
+    if isinstance(bus, slcanBus):
+        try:
+            bus.serialPortOrig.exclusive = True
+        except OSError as error:
+            bus.serialPortOrig.close()  # first: the order to close the channel would reach the other's module
+            Link(bus).close()
+            raise UserError(f"{interface} {channel}: another program has it open") from error
+    return Link(bus)
