@@ -121,8 +121,12 @@ static void open_gap(selfcal_t *self) {
     }
 }
 
-/* Time passes by `count` samples without a value. */
-static void pass(selfcal_t *self, uint64_t count) {
+/* Time passes by `count` samples without a value: missing ones, or one at fault. */
+static void pass(selfcal_t *self, uint64_t count, bool missing) {
+    if (missing) {
+        const uint64_t room = UINT64_MAX - self->counters.missing;
+        self->counters.missing += count < room ? count : room;
+    }
     if (!self->started || count == 0U) {
         return;
     }
@@ -144,28 +148,30 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    const uint64_t room = UINT64_MAX - self->counters.missing;
-    self->counters.missing += count < room ? count : room;
-    pass(self, count);
+    pass(self, count, true);
     return SELFCAL_OK;
 }
 
-/* Forgets what the block in progress holds; the rest of it will pass without a value. */
-static void drop_block(selfcal_t *self) {
+/* Forgets what the block in progress holds; the rest of it will pass without a value. False where nothing of it has passed, or that
+ * has been done. */
+static bool drop_block(selfcal_t *self) {
     const uint32_t position = self->position;
+    if (position == 0U || self->dropped) {
+        return false;
+    }
+    open_gap(self);
     start_block(self);
     self->position = position;
-    self->dropped = position > 0U;
+    self->dropped = true;
+    return true;
 }
 
 selfcal_status_t selfcal_moving(selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (self->position > 0U && !self->dropped) {
+    if (drop_block(self)) {
         self->counters.blocks_moving++;
-        open_gap(self);
-        drop_block(self);
     }
     return SELFCAL_OK;
 }
@@ -175,11 +181,8 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
         !(variance_ratio <= SELFCAL_VARIANCE_RATIO_MAX)) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (self->position > 0U) {
-        open_gap(self);
-        drop_block(self);
-        self->position = (uint32_t)((uint64_t)self->position * block / self->block); /* the same part of the interval has passed */
-    }
+    (void)drop_block(self);
+    self->position = (uint32_t)((uint64_t)self->position * block / self->block); /* the same part of the interval has passed */
     selfcal_bank_pace(self, block);
     self->variance_ratio = (selfcal_real_t)variance_ratio;
     memset(self->within, 0, sizeof self->within);
@@ -196,10 +199,7 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
     if (selfcal_retired(self, axis)) {
         return SELFCAL_OK;
     }
-    if (self->position > 0U && !self->dropped) {
-        open_gap(self);
-        drop_block(self);
-    }
+    (void)drop_block(self);
     if (self->started) {
         const float before = self->origin[axis], sum = before + amount;
         const float part = sum - before;
@@ -278,7 +278,7 @@ static bool nodes_are_due(const selfcal_t *self) {
            (uint64_t)self->block * SELFCAL_BATCH < (uint64_t)2U * SELFCAL_PUSH_EVERY * self->model->nodes;
 }
 
-uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving) {
+void selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving) {
     if (nodes_are_due(self)) {
         (void)selfcal_bank_run(self, self->push_nodes);
     }
@@ -287,9 +287,10 @@ uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regress
     const uint32_t bad = faults(self, sample) & live;
     retire(self, bad, live);
     const bool known = moving || self->columns == NULL || self->model->regressors->code->usable(self, regressors);
-    if (bad != 0U || !known || moving || self->dropped) {
-        pass(self, 1U);
-        return bad;
+    const bool sound = bad == 0U && known;
+    if (!sound || moving || self->dropped) {
+        pass(self, 1U, sound);
+        return;
     }
     self->in_gap = false;
     if (!self->started) {
@@ -308,7 +309,6 @@ uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regress
     if (self->position == self->block) {
         close_block(self);
     }
-    return 0U;
 }
 
 selfcal_status_t selfcal_push(selfcal_t *self, const float sample[]) {
@@ -319,7 +319,7 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
     if (self == NULL || sample == NULL || (self->columns != NULL && regressors == NULL)) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    (void)selfcal_take(self, sample, regressors, false);
+    selfcal_take(self, sample, regressors, false);
     return SELFCAL_OK;
 }
 

@@ -246,9 +246,7 @@ selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]) {
     if (sample == NULL || selfcal_moving(self) != SELFCAL_OK) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (selfcal_take(self, sample, NULL, true) == 0U) {
-        self->counters.missing += self->counters.missing < UINT64_MAX ? 1U : 0U;
-    }
+    selfcal_take(self, sample, NULL, true);
     return SELFCAL_OK;
 }
 

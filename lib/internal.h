@@ -287,8 +287,8 @@ void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal
 #endif
 
 /* selfcal_push_with() but for its arguments' check, or for a sample taken in motion, without regressors: some of the work that waits, a judgement
- * of the axes, and the sample into its block or passed by. A bit for each axis that it found at fault. */
-uint32_t selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving);
+ * of the axes, and the sample into its block or passed by. */
+void selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving);
 
 /* Regressors that an axis has, a bit each. */
 uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);

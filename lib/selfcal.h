@@ -302,8 +302,9 @@ typedef struct selfcal_forgetting_code selfcal_forgetting_code_t;
 extern const selfcal_forgetting_code_t selfcal_forgetting_code;
 
 /* For parts whose parameters change: what a bank sample adds to the ln-likelihood counts for 2^-(age/half_life_s), from one batch to the
- * next. What the prior of the bias (and of the coefficients) costs an evidence goes with the first batch: a law that remembers the
- * bias, such as the constant, must not go on paying what one that forgets it, such as the random walk, no longer does. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
+ * next (a report ends a batch). What the prior of the bias (and of the coefficients) costs an evidence goes with the first batch: a law
+ * that remembers the bias, such as the constant, must not go on paying what one that forgets it, such as the random walk, no longer
+ * does. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
  * are up to sqrt(2) wider than need be. O(axes) for each node and batch. */
 typedef struct {
     const selfcal_forgetting_code_t *code; /* &selfcal_forgetting_code: only a model that forgets links what it takes */
@@ -346,7 +347,7 @@ typedef enum {
 /* Monotonic since selfcal_init(). */
 typedef struct {
     uint64_t samples;       /* pushed and used */
-    uint64_t missing;       /* told by selfcal_skip() */
+    uint64_t missing;       /* told by selfcal_skip(), or in motion, see selfcal_moving() */
     uint32_t gaps;          /* runs of missing or rejected samples */
     uint32_t blocks_lost;   /* bank intervals without a value: fewer than half of their samples were usable */
     uint32_t blocks_part;   /* bank intervals averaged from part of their samples */
@@ -596,8 +597,10 @@ selfcal_status_t selfcal_moving(selfcal_t *self);
 
 /* A sample taken in motion: it is looked at for faults, which count, and retire an axis, as with selfcal_push(); one without counts as
  * missing. For the rest as selfcal_moving() and selfcal_skip(1). With the gate, every sample goes to selfcal_gate_push() first; if
- * it said resting before this sample and says so with it, the sample goes to selfcal_push(), else it goes here. So no window
- * of motion reaches back into an interval that is already closed, provided that the block is a multiple of the window. */
+ * it said resting before this sample and says so with it, the sample goes to selfcal_push(), else it goes here. So it does until the
+ * bank has taken its first one (counters' `samples`), unless it is the first of a window (the gate's `position` was 0): the bank's
+ * intervals begin there. Then no window of motion reaches back into an interval that is already closed, provided that the block is a
+ * multiple of the window. */
 selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]);
 
 /* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
@@ -902,7 +905,7 @@ typedef struct {
     uint8_t rounds, at;
 } selfcal_quantile_t;
 
-/* Private but for reading `state`, `counters`, and the last window's statistics with their thresholds. */
+/* Private but for reading `state`, `counters`, `position`, and the last window's statistics with their thresholds. */
 typedef struct {
     selfcal_gate_config_t config;
     selfcal_gate_noise_t axis[SELFCAL_AXES_MAX];
@@ -920,7 +923,7 @@ typedef struct {
     /* window in progress */
     float first[SELFCAL_AXES_MAX];
     selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
-    uint32_t position, used;
+    uint32_t position, used; /* samples of this window: passed, and sound */
     bool blind;
     /* levels: of the rest, and of the windows in a row since motion, calm by the noise the gate started from, the last ones quiet by
      * that measured */

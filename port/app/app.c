@@ -203,10 +203,11 @@ static void give(app_t *app, const float reading[])
         if (app->bank.retired != 0U) { /* also from the saved state */
             leave_out_retired(app);
         }
+        const bool in_step = app->gate.position == 0U || selfcal_counters(&app->bank)->samples > 0U;
         const selfcal_motion_t before = app->gate.state;
         const selfcal_motion_t now = selfcal_gate_push(&app->gate, reading);
         learn_noise(app);
-        if (before == SELFCAL_MOVING || now == SELFCAL_MOVING) {
+        if (before == SELFCAL_MOVING || now == SELFCAL_MOVING || !in_step) {
             (void)selfcal_push_moving(&app->bank, reading);
             return;
         }

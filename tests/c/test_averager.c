@@ -372,6 +372,7 @@ static void a_sample_in_motion_passes_by(void) {
     }
     TEST_ASSERT_TRUE(saturated > 0U);
     TEST_ASSERT_TRUE(its->missing == mine->missing + saturated);
+    TEST_ASSERT_TRUE(mine->samples + mine->missing + saturated == 300U * BLOCK); /* each in one counter: one axis fails at a time */
     TEST_ASSERT_TRUE(its->samples == mine->samples && its->blocks_moving == mine->blocks_moving && its->blocks_moving > 10U);
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(NULL, &axes[0].range));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(&bank, NULL));

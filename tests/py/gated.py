@@ -67,8 +67,9 @@ class Gated:
             if not self.resting:
                 self.bank.raw.moving()
             self.bank.raw.skip(missing)
+        in_step = self.gate.last()["position"] == 0 or self.bank.raw.counters()["samples"] > 0
         now = bool(self.learning.push(sample[None, :])[0])
-        self.used.append(self.resting and now)
+        self.used.append(self.resting and now and in_step)
         if self.used[-1]:
             self.bank.push(sample[None, :])
         else:

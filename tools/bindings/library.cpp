@@ -364,6 +364,7 @@ public:
     nb::dict last() const {
         const selfcal_gate_counters_t &c = gate_.counters;
         nb::dict d;
+        d["position"] = gate_.position;
         d["t1"] = gate_.t1;
         d["t2"] = gate_.t2;
         d["shaken_above"] = gate_.shaken_above;
