@@ -75,7 +75,7 @@ bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
 }
 
 /* `count` bank intervals without a value. A counter that is at its end stays there. */
-static void lose_blocks(selfcal_t *self, uint64_t count) {
+COLD static void lose_blocks(selfcal_t *self, uint64_t count) {
     const uint32_t room = UINT32_MAX - self->counters.blocks_lost;
     self->counters.blocks_lost += count < room ? (uint32_t)count : room;
     selfcal_bank_gap(self, count);
@@ -122,7 +122,7 @@ static void open_gap(selfcal_t *self) {
 }
 
 /* Time passes by `count` samples without a value: missing ones, or one at fault. */
-static void pass(selfcal_t *self, uint64_t count, bool missing) {
+COLD static void pass(selfcal_t *self, bool missing, uint64_t count) {
     if (missing) {
         const uint64_t room = UINT64_MAX - self->counters.missing;
         self->counters.missing += count < room ? count : room;
@@ -148,7 +148,7 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    pass(self, count, true);
+    pass(self, true, count);
     return SELFCAL_OK;
 }
 
@@ -289,7 +289,7 @@ void selfcal_take(selfcal_t *self, const float sample[], const float regressors[
     const bool known = moving || self->columns == NULL || self->model->regressors->code->usable(self, regressors);
     const bool sound = bad == 0U && known;
     if (!sound || moving || self->dropped) {
-        pass(self, 1U, sound);
+        pass(self, sound, 1U);
         return;
     }
     self->in_gap = false;

@@ -30,13 +30,6 @@ static inline int32_t rounded(int32_t value, uint32_t shift) {
     return (value + (1 << shift >> 1)) >> shift;
 }
 
-/* Kept apart from what every sample runs through, whose registers it would spill. */
-#ifdef __GNUC__
-#define COLD __attribute__((noinline))
-#else
-#define COLD
-#endif
-
 /* Makes the step so coarse that `value` fits; what falls off the sums is less than a step each. */
 COLD static void coarsen(selfcal_block_t *sums, float value) {
     const int exponent = step_exponent(value, ROOM_BITS), bits = exponent - sums->exponent;

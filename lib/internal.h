@@ -286,6 +286,13 @@ size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis);
 void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
 #endif
 
+/* Kept apart from what every sample runs through, whose registers and bytes it would take. */
+#ifdef __GNUC__
+#define COLD __attribute__((noinline))
+#else
+#define COLD
+#endif
+
 /* selfcal_push_with() but for its arguments' check, or for a sample taken in motion, without regressors: some of the work that waits, a judgement
  * of the axes, and the sample into its block or passed by. */
 void selfcal_take(selfcal_t *self, const float sample[], const float regressors[], bool moving);
