@@ -197,10 +197,11 @@ define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
-$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk
-	@rm -rf $$(@D)/objects && mkdir -p $$(@D)/objects
+$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
+	@rm -rf $$(@D)/objects
+	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
 	cd $$(@D)/objects && $$(call arm_objects,$(ARM_$(1)) -I$(CURDIR)/lib -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D), \
-	    $(BENCH_C:%=$(CURDIR)/%) $(CURDIR)/$$(@D)/selfcal_model.c)
+	    $(patsubst %,$(CURDIR)/%,$(filter-out lib/%,$(BENCH_C))) $(CURDIR)/$$(@D)/selfcal_model.c)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
@@ -221,10 +222,11 @@ MORE_regressors :=
 MORE_sums := -DSELFCAL_TERMS_MAX=3
 define BENCH_MORE
 bench-images: $(BENCH)/$(1)/$(2).elf
-$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk tests/bench/image.ld
-	@rm -rf $$(@D)/$(2) && mkdir -p $$(@D)/$(2)
+$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk tests/bench/image.ld
+	@rm -rf $$(@D)/$(2)
+	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS=$$(filter -DSELFCAL_%,$(MORE_$(2)))
 	cd $$(@D)/$(2) && $$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -I$(CURDIR)/lib -I$$(CURDIR)/$$(@D), \
-	    $(addprefix $(CURDIR)/,$(wildcard lib/*.c) $(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
+	    $(addprefix $(CURDIR)/,$(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
 	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))

@@ -3,8 +3,8 @@
 
 include port/arm.mk
 
-QEMU_SOURCES := $(wildcard lib/*.c port/replay/*.c port/qemu/*.c) $(APP_WITHOUT_SENSOR) $(MODEL_DIR)/selfcal_model.c
-QEMU_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/qemu/*.h) $(MODEL_DIR)/selfcal_model.h
+QEMU_SOURCES := $(wildcard port/replay/*.c port/qemu/*.c) $(APP_WITHOUT_SENSOR) $(MODEL_DIR)/selfcal_model.c
+QEMU_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/replay/*.h port/qemu/*.h) $(MODEL_DIR)/selfcal_model.h
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
 QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
@@ -14,9 +14,10 @@ QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
 .PHONY: qemu
 qemu: $(OUT)/selfcal-qemu.elf
 
-$(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/arm.mk
-	@rm -rf $(OUT)/objects && mkdir -p $(OUT)/objects
-	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -I$(CURDIR)/lib -I$(CURDIR)/port \
+$(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/library.mk port/arm.mk
+	@rm -rf $(OUT)/objects
+	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(QEMU_CFLAGS))'
+	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -I$(CURDIR)/lib -I$(CURDIR)/port \
 	    -I$(CURDIR)/port/app -I$(CURDIR)/port/replay -I$(abspath $(MODEL_DIR)),$(abspath $(QEMU_SOURCES)))
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
 	    $(OUT)/objects/*.o -lm -o $@

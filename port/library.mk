@@ -1,0 +1,19 @@
+# The library for a core, compiled once for all programs that share its flags; it knows neither the model nor the settings of the application.
+#   make -f port/library.mk objects CORE=CORE OUT=DIR [PROGRAM_FLAGS=...]
+# puts its objects, and what gcc says of their stacks (.su), into DIR.
+include port/arm.mk
+
+LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -W% %.c,$(PROGRAM_FLAGS)))
+LIBRARY := build/library/$(CORE)-$(firstword $(shell printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))' | cksum))
+
+# The lock: programs may be made at the same time.
+.PHONY: objects
+objects:
+	@mkdir -p build/library $(OUT)
+	@flock $(LIBRARY).lock $(MAKE) --no-print-directory -f port/library.mk $(LIBRARY)/stamp
+	@cp $(LIBRARY)/*.o $(LIBRARY)/*.su $(OUT)
+
+$(LIBRARY)/stamp: $(wildcard lib/*.c lib/*.h) port/arm.mk
+	@rm -rf $(@D) && mkdir -p $(@D)
+	cd $(@D) && $(call arm_objects,$(LIBRARY_FLAGS) -I$(CURDIR)/lib,$(abspath $(wildcard lib/*.c)))
+	@touch $@
