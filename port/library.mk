@@ -3,7 +3,7 @@
 # puts its objects, and what gcc says of their stacks (.su), into DIR.
 include port/arm.mk
 
-LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -W% %.c,$(PROGRAM_FLAGS)))
+LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c,$(PROGRAM_FLAGS)))
 LIBRARY := build/library/$(CORE)-$(firstword $(shell printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))' | cksum))
 
 # The lock: programs may be made at the same time.
