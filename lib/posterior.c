@@ -655,8 +655,8 @@ static bool has_parameter(selfcal_law_t law, unsigned parameter) {
  * conditional mode and below it that peak lies, in ln. Nothing is left unless from < to. */
 typedef struct {
     selfcal_real_t from, to, drop, peak;
-    selfcal_real_t base; /* drop where N's limits leave a flank alone, which all cells see alike, or the limits leave little; else 0, and all
-                          * of [delta_lo, delta_hi], of which parts do not count */
+    selfcal_real_t base; /* drop where the limits leave a flank alone or little; else 0, and all of [delta_lo, delta_hi], of which parts do not
+                          * count */
 } reach_t;
 
 /* `half`: what N and the drift parameter run through from the middle of a cell to its side, so that so far beyond the limits parts of the cell
@@ -666,28 +666,28 @@ static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_valu
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_real_t n_eff = work->n_eff;
     reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0), R(0.0)};
-    bool flank = false;
+    selfcal_real_t whole = R(6.0); /* drop up to which the cells of [delta_lo, delta_hi] see what the limits leave, measured */
     for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
         const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
         const selfcal_prior_t *prior = &prior_of(work)[p];
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min - ln_value[p], hi = (selfcal_real_t)prior->ln_max - ln_value[p];
         if (j == 0U && (lo > half[j] || hi < -half[j])) {
             half[j] = R(0.0);
-            flank = true;
+            whole = R(6.0);
         }
         reach.from = r_fmax(reach.from, lo - half[j]);
         reach.to = r_fmin(reach.to, hi + half[j]);
     }
-    const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to), shape = sigma_shape(peak);
+    const selfcal_real_t peak = r_fmin(r_fmax(R(0.0), reach.from), reach.to);
     reach.peak = peak;
-    reach.drop = n_eff * shape;
-    if (!flank && reach.to - reach.from > R(0.3) * (work->delta_hi - work->delta_lo)) {
+    reach.drop = n_eff * sigma_shape(peak);
+    if (reach.drop < whole && reach.to - reach.from > R(0.3) * (work->delta_hi - work->delta_lo)) {
         reach.from = work->delta_lo;
         reach.to = work->delta_hi;
         return reach;
     }
     reach.base = reach.drop;
-    const selfcal_real_t depth = SIGMA_DEPTH / (n_eff * r_fabs(R(2.0) * (peak - shape))); /* over the slope, 1 - e^(-2 delta) */
+    const selfcal_real_t depth = R(0.5) * SIGMA_DEPTH / r_fabs(r_fma(n_eff, peak, -reach.drop)); /* over the slope, 1 - e^(-2 delta) */
     reach.from = r_fmax(reach.from, peak + r_fmax(work->delta_lo, -depth));
     reach.to = r_fmin(reach.to, peak + r_fmin(work->delta_hi, depth));
     return reach;

@@ -271,8 +271,9 @@ typedef struct {
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank interval:
  * sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v. The alpha nodes span the priors; the rho nodes span the priors of K or sigma_m over
- * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way, of e^1.25 above sigma_m. Where the
- * nodes lie decides how well the likelihood is interpolated, not the prior. */
+ * the white noise seen in the first SELFCAL_BATCH bank samples, with a margin of e^0.5 either way, of e^1.25 above sigma_m. A call that
+ * looks at the sums sooner (a report, a node's) places them by what is there, for good: with fewer than 8 bank samples often not where
+ * later ones need them. Where the nodes lie decides how well the likelihood is interpolated, not the prior. */
 typedef struct {
     selfcal_law_t law;
     float ln_probability;        /* prior */
