@@ -145,7 +145,10 @@ def test_interrupt_is_clean() -> None:
             os.read(master, 1)  # python-can opens the channel: the verb runs
             time.sleep(0.5)
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=30)
+            try:
+                _, errors = process.communicate(timeout=30)
+            finally:
+                process.kill()
     finally:
         os.close(master)
         os.close(slave)
