@@ -305,8 +305,9 @@ extern const selfcal_forgetting_code_t selfcal_forgetting_code;
 /* For parts whose parameters change: what a bank sample adds to the ln-likelihood counts for 2^-(age/half_life_s), from one batch to the
  * next (a report ends a batch). What the prior of the bias (and of the coefficients) costs an evidence goes with the first batch: a law
  * that remembers the bias, such as the constant, must not go on paying what one that forgets it, such as the random walk, no longer
- * does. Reports then rest on some half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals
- * are up to sqrt(2) wider than need be. O(axes) for each node and batch. */
+ * does. The bias and the coefficients are those of the record so weighted: they forget as well. Reports then rest on some
+ * half_life_s/(dt_s ln 2) bank samples, and where the parameters stand still after all their intervals are up to sqrt(2) wider than
+ * need be. O(axes) for each node and batch. */
 typedef struct {
     const selfcal_forgetting_code_t *code; /* &selfcal_forgetting_code: only a model that forgets links what it takes */
     float half_life_s; /* at least SELFCAL_BATCH dt_s */
@@ -605,8 +606,8 @@ selfcal_status_t selfcal_moving(selfcal_t *self);
 selfcal_status_t selfcal_push_moving(selfcal_t *self, const float sample[]);
 
 /* The sampling rate changes: from now on `block` samples make a bank interval, whose length dt stays. The interval in progress
- * yields no value. `variance_ratio`: white-noise variance of a whole block's mean over what it is for the model's block at the
- * model's rate. It is 1 where the sensor's own averaging keeps the noise density, and model->block / block where single samples
+ * yields no value and goes on to its end: its position is scaled to the new block. `variance_ratio`: white-noise variance of a
+ * whole block's mean over what it is for the model's block at the model's rate. It is 1 where the sensor's own averaging keeps the noise density, and model->block / block where single samples
  * stay as noisy as before. sigma_v and N remain those of the model's block: the likelihood is exact, though any ratio but 1
  * costs the full gain computation for every sample. SELFCAL_BAD_ARGUMENT, and nothing changes, on a block of 0 or a ratio beyond
  * SELFCAL_VARIANCE_RATIO_MAX or below its inverse. selfcal_within_sd() starts anew. */
@@ -709,7 +710,9 @@ enum {
     SELFCAL_AT_MAX = 4,       /* likewise at the top */
     SELFCAL_OFF_GRID = 8      /* the grid does not bear it: more than 1 % of the posterior lies beyond the last node, or the nodes are so far apart
                                  that with a record so long, or with so much missing in so many places, or with rates so different, the
-                                 interpolation may be off by more than 0.05 nat, 0.05 sd, 3 % of sd */
+                                 interpolation may be off by more than 0.05 nat, 0.05 sd, 3 % of sd. A bound, not an
+                                 estimate. Without a Gauss-Markov law in the model it does not see a record that holds what no random walk
+                                 makes: give the walk 20 nodes there */
 };
 
 typedef struct {

@@ -122,8 +122,9 @@ def outside_priors(prior: AxisTable) -> str:
     """What to tell the user when no hypothesis has any evidence."""
     return (
         f"the record lies outside the model's priors of {prior.name}, whose white noise N runs from "
-        f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz): widen "
-        "them in the model file, or check the unit and whether the sensor was at rest"
+        f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz), or its drift "
+        "beyond those of K or sigma_m: widen them in the model file, or check the unit and whether the sensor was at "
+        "rest"
     )
 
 
