@@ -1,0 +1,212 @@
+"""Findings that need little or no fit: missing samples, an unstated lattice, readings at a limit, motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.special import ndtr
+from scipy.stats import truncnorm
+
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+from selfcal.diagnosis.statemodel import Array
+
+#: Missing samples are told of from this share on.
+MISSING_LEAST = 1e-3
+#: An unstated lattice is told of from this many white noise sd on.
+LATTICE_LEAST = 0.5
+#: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
+MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+
+
+def missing(record: Record) -> Look | None:
+    """Gaps in the stamps."""
+    gone = int((~record.present).sum())
+    if gone <= MISSING_LEAST * record.present.size:
+        return None
+    where = np.flatnonzero(~record.present) / record.rate_hz
+    return Look(
+        "missing_samples",
+        float(gone),
+        float(gone),
+        {"missing": interval(float(gone), 0.0, "samples")},
+        {},
+        when=(float(where[0]), float(where[-1])),
+    )
+
+
+def quantization(state: State) -> Look | None:
+    """A lattice that the model file does not state and that is coarse against the white noise."""
+    q = state.lsb
+    stated = state.stated_lsb
+    if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02):
+        return None
+    sigma = state.best.sigma
+    white = math.sqrt(max(sigma**2 - q * q / 12.0, 1e-12 * sigma**2))
+    if q / white < LATTICE_LEAST:
+        return None
+    n = state.best.n
+    # Continuous readings would fall within 1/1000 of a lattice by chance: ln 1000 nats each.
+    gain = n * math.log(max(q / white, 1.0) * 10.0)
+    return Look(
+        "quantization",
+        gain,
+        gain,
+        {"lsb": interval(q, q * 1e-3, state.unit)},
+        {"stated_lsb": q},
+    )
+
+
+def saturation(state: State) -> tuple[Look, State] | None:
+    """Readings pile up at the largest or the smallest value: the model expects some beyond it and none is.
+
+    The expected number beyond is the evidence, in nats (Poisson). Clipped readings are then drawn anew from what the
+    filter predicts beyond the limit, so that the rest is judged as if it had not been clipped."""
+    y = state.y
+    finite = np.isfinite(y)
+    found = state
+    sides: list[tuple[float, int]] = []
+    gain = 0.0
+    for sign in (1, -1):
+        edge = float(np.nanmax(sign * y))
+        at_edge = finite & (sign * y >= edge - 1e-9 * max(1.0, abs(edge)))
+        if at_edge.sum() < 5:
+            continue
+        half = 0.5 * state.lsb
+        predicted = sign * (y - state.whitened * np.sqrt(state.variance))
+        beyond = ndtr((predicted - edge - half) / np.sqrt(state.variance))
+        expected = float(np.nansum(beyond))
+        # Heavy tails inside the limit make the expectation uncertain by its root: ask for a clear excess.
+        if expected - 2.0 * math.sqrt(expected) < NET_LEAST or at_edge.sum() < 0.5 * expected:
+            continue
+        sides.append((sign * edge, int(at_edge.sum())))
+        gain += expected
+        found = _unclipped(found, at_edge, edge, sign)
+    if not sides:
+        return None
+    limit = max(sides, key=lambda side: side[1])[0]
+    count = sum(side[1] for side in sides)
+    look = Look(
+        "saturation",
+        gain,
+        gain,
+        {"limit": interval(limit + state.level, state.lsb / 4.0 or 1e-6 * abs(limit + state.level), state.unit),
+         "clipped": count},
+        {},
+    )
+    return look, found
+
+
+def _unclipped(state: State, at_edge: Array, edge: float, sign: int) -> State:
+    random = np.random.default_rng(1)
+    for _ in range(4):
+        s = np.sqrt(state.variance[at_edge])
+        predicted = sign * state.y[at_edge] - sign * state.whitened[at_edge] * s
+        low = (edge - 0.5 * state.lsb - predicted) / s
+        drawn = predicted + s * truncnorm.rvs(low, np.inf, random_state=random)
+        y = state.y.copy()
+        y[at_edge] = sign * drawn
+        state = state.refit(y=y)
+    return state
+
+
+def motion(record: Record) -> dict[str, tuple[Look, Array]]:
+    """Bursts of energy on two axes or more at once, 0.5 to 16 s long, against each axis' own level about it."""
+    # On a lattice coarser than the noise a rare change of code looks like a burst.
+    names = [name for name, state in record.axes.items() if state.lsb < 1.5 * state.best.sigma]
+    if len(names) < 2:
+        return {}
+    n = record.present.size
+    rate = record.rate_hz
+    squares = []
+    for name in names:
+        w2 = np.where(np.isfinite(record.axes[name].whitened), record.axes[name].whitened ** 2, np.nan)
+        filled = np.where(np.isfinite(w2), w2, 1.0)
+        around = max(3, min(n // 3, round(120.0 * rate)))
+        block = max(1, round(rate))
+        level = _robust_level(filled, block, around)
+        squares.append(np.minimum(filled / level, 400.0))
+    power = np.array(squares)
+    marked = np.zeros(n, bool)
+    best = np.zeros(len(names))
+    ln_looks = math.log(max(2.0, n / rate)) + 2.0
+    for length in MOTION_S:
+        window = round(length * rate)
+        if window < 1 or window > n // 4:
+            continue
+        mean = uniform_filter1d(power, window, axis=1, mode="nearest") if window > 1 else power
+        gain = np.where(mean > 1.0, 0.5 * window * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))), 0.0)
+        moved = gain > 4.0
+        joint = np.where(moved, gain - 1.5, 0.0).sum(axis=0)
+        second = np.sort(gain, axis=0)[-2]
+        hit = (moved.sum(axis=0) >= 2) & (joint > ln_looks + NET_LEAST + 3.0) & (second > 6.0)
+        for at in np.flatnonzero(hit):
+            marked[max(0, at - window // 2) : at + (window + 1) // 2] = True
+        if hit.any():
+            best = np.maximum(best, gain[:, hit].max(axis=1))
+    if not marked.any() or marked.mean() > 0.25:
+        return {}
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    joined = [(int(starts[0]), int(ends[0]))]
+    for a, b in zip(starts[1:], ends[1:], strict=True):
+        if a - joined[-1][1] < 2.0 * rate:
+            joined[-1] = (joined[-1][0], int(b))
+        else:
+            joined.append((int(a), int(b)))
+    pad = max(1, round(0.5 * rate))
+    mask = np.zeros(n, bool)
+    for a, b in joined:
+        mask[max(0, a - pad) : b + pad] = True
+    found: dict[str, tuple[Look, Array]] = {}
+    for k, name in enumerate(names):
+        gain = sum(
+            max(0.0, 0.5 * (b - a) * (float(power[k, a:b].mean()) - 1.0 - math.log(max(1e-9, float(power[k, a:b].mean())))))
+            for a, b in joined
+        )
+        shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 3.0]
+        if not shown:
+            continue
+        look = Look(
+            "motion",
+            gain,
+            max(net(gain, 1, ln_looks), NET_LEAST + 0.1),
+            {"intervals": interval(float(len(shown)), 0.0, "1")},
+            {},
+            when=(shown[0][0] / rate, shown[-1][1] / rate),
+        )
+        found[name] = (look, mask)
+    return found if len(found) >= 2 else {}
+
+
+def _burst(power: Array) -> float:
+    mean = float(power.mean())
+    return 0.5 * power.size * (mean - 1.0 - math.log(max(mean, 1e-12))) if mean > 1.0 else 0.0
+
+
+def _robust_level(square: Array, block: int, around: int) -> Array:
+    """Local level of squared innovations: the running median of block means, over its own median's ratio."""
+    count = square.size // block
+    if count < 8:
+        return np.full(square.size, max(1e-9, float(np.median(square)) / 0.4549))
+    means = square[: count * block].reshape(count, block).mean(axis=1)
+    size = max(3, min(count, around // block) | 1)
+    middle = median_filter(means, size, mode="nearest")
+    # The median of a mean of `block` squares of normals, against its mean of 1 (Wilson and Hilferty).
+    ratio = (1.0 - 2.0 / (9.0 * block)) ** 3
+    level = np.interp(np.arange(square.size), (np.arange(count) + 0.5) * block, middle / ratio)
+    return np.maximum(level, 1e-9)
+
+
+def masked(state: State, mask: Array) -> State:
+    """The state without the samples of `mask`."""
+    y = state.y.copy()
+    y[mask.astype(bool)] = np.nan
+    return replace(state, y=y)
+
+
+__all__ = ["missing", "quantization", "saturation", "motion", "masked", "Mapping"]
