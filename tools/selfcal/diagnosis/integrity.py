@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import ndtr
-from scipy.stats import truncnorm
+from scipy.stats import chi2, truncnorm
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
@@ -21,6 +21,10 @@ MISSING_LEAST = 1e-3
 LATTICE_LEAST = 0.5
 #: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
 MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+#: A burst counts from this worth on, net of the search; several that each could be chance are none together.
+BURST_LEAST = 1.5
+#: What the axes beside the strongest must show, nats: an event of one axis meets chance on the others.
+REST_PRICE = 4.0
 
 
 def missing(record: Record) -> Look | None:
@@ -129,52 +133,53 @@ def motion(record: Record) -> dict[str, tuple[Look, Array]]:
         around = max(3, min(n // 3, round(120.0 * rate)))
         block = max(1, round(rate))
         level = _robust_level(filled, block, around)
-        squares.append(np.minimum(filled / level, 400.0))
+        squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
-    marked = np.zeros(n, bool)
-    best = np.zeros(len(names))
-    ln_looks = math.log(max(2.0, n / rate)) + 2.0
+    count = len(names)
+    # Looks: windows of every length, half a length apart.
+    ln_looks = math.log(max(2.0, n / rate)) + 1.0
+    worth, half = np.zeros(n), np.zeros(n, np.int64)
     for length in MOTION_S:
         window = round(length * rate)
         if window < 1 or window > n // 4:
             continue
-        mean = uniform_filter1d(power, window, axis=1, mode="nearest") if window > 1 else power
-        gain = np.where(mean > 1.0, 0.5 * window * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))), 0.0)
-        moved = gain > 4.0
-        joint = np.where(moved, gain - 1.5, 0.0).sum(axis=0)
-        second = np.sort(gain, axis=0)[-2]
-        hit = (moved.sum(axis=0) >= 2) & (joint > ln_looks + NET_LEAST + 3.0) & (second > 6.0)
-        for at in np.flatnonzero(hit):
-            marked[max(0, at - window // 2) : at + (window + 1) // 2] = True
-        if hit.any():
-            best = np.maximum(best, gain[:, hit].max(axis=1))
-    if not marked.any() or marked.mean() > 0.25:
+        mean = uniform_filter1d(power, window, axis=1, mode="reflect") if window > 1 else power
+        gain = 0.5 * window * _excess(mean)
+        # One axis alone is an outlier or a change of its own noise: the others together must show the burst too.
+        rest = gain.sum(axis=0) - gain.max(axis=0)
+        each = -chi2.logsf(2.0 * gain.sum(axis=0), count)  # a size of its own on every axis
+        common = -chi2.logsf(window * count * _excess(mean.mean(axis=0)), 1)  # one size on all
+        told = np.minimum(
+            np.maximum(each, common) - math.log(2.0) - ln_looks, -chi2.logsf(2.0 * rest, count - 1) - REST_PRICE
+        )
+        better = told > worth
+        worth[better], half[better] = told[better], (window + 1) // 2
+    bursts: list[tuple[int, int]] = []
+    total, left = 0.0, worth.copy()
+    while left.max() > BURST_LEAST and len(bursts) < 1000:
+        at = int(np.argmax(left))
+        a, b = max(0, at - int(half[at])), min(n, at + int(half[at]) + 1)
+        bursts.append((a, b))
+        total += float(left[at]) + math.log(len(bursts))
+        margin = max(1, round(2.0 * rate))
+        left[max(0, a - margin) : b + margin] = 0.0
+    if total < NET_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
-    starts, ends = edges[::2], edges[1::2]
-    joined = [(int(starts[0]), int(ends[0]))]
-    for a, b in zip(starts[1:], ends[1:], strict=True):
-        if a - joined[-1][1] < 2.0 * rate:
-            joined[-1] = (joined[-1][0], int(b))
-        else:
-            joined.append((int(a), int(b)))
+    joined = _joined_bursts(bursts, round(2.0 * rate))
     pad = max(1, round(0.5 * rate))
     mask = np.zeros(n, bool)
     for a, b in joined:
         mask[max(0, a - pad) : b + pad] = True
     found: dict[str, tuple[Look, Array]] = {}
     for k, name in enumerate(names):
-        gain = sum(
-            max(0.0, 0.5 * (b - a) * (float(power[k, a:b].mean()) - 1.0 - math.log(max(1e-9, float(power[k, a:b].mean())))))
-            for a, b in joined
-        )
-        shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 3.0]
+        gain = sum(_burst(power[k, a:b]) for a, b in joined)
+        shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 2.0]
         if not shown:
             continue
         look = Look(
             "motion",
             gain,
-            max(net(gain, 1, ln_looks), NET_LEAST + 0.1),
+            total,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
             when=(shown[0][0] / rate, shown[-1][1] / rate),
@@ -183,9 +188,25 @@ def motion(record: Record) -> dict[str, tuple[Look, Array]]:
     return found if len(found) >= 2 else {}
 
 
+def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:
+    """In order of time; those closer than `apart` are one."""
+    ordered = sorted(bursts)
+    found = [ordered[0]]
+    for a, b in ordered[1:]:
+        if a - found[-1][1] < apart:
+            found[-1] = (found[-1][0], max(b, found[-1][1]))
+        else:
+            found.append((a, b))
+    return found
+
+
+def _excess(mean: Array) -> Array:
+    """Twice the gain, a sample, of a variance `mean` above the stated one."""
+    return np.where(mean > 1.0, mean - 1.0 - np.log(np.maximum(mean, 1e-12)), 0.0)
+
+
 def _burst(power: Array) -> float:
-    mean = float(power.mean())
-    return 0.5 * power.size * (mean - 1.0 - math.log(max(mean, 1e-12))) if mean > 1.0 else 0.0
+    return 0.5 * power.size * float(_excess(power.mean()))
 
 
 def _robust_level(square: Array, block: int, around: int) -> Array:
@@ -195,7 +216,7 @@ def _robust_level(square: Array, block: int, around: int) -> Array:
         return np.full(square.size, max(1e-9, float(np.median(square)) / 0.4549))
     means = square[: count * block].reshape(count, block).mean(axis=1)
     size = max(3, min(count, around // block) | 1)
-    middle = median_filter(means, size, mode="nearest")
+    middle = median_filter(means, size, mode="reflect")
     # The median of a mean of `block` squares of normals, against its mean of 1 (Wilson and Hilferty).
     ratio = (1.0 - 2.0 / (9.0 * block)) ** 3
     level = np.interp(np.arange(square.size), (np.arange(count) + 0.5) * block, middle / ratio)
