@@ -41,6 +41,7 @@ struct Sums {
     double *G;       // [marks, columns, columns]
     double *D;       // [marks]
     double *counted; // [marks] samples present
+    double *x;       // [marks, columns, states] predicted states at each mark
     double *white;   // [n, columns] or null: whitened innovations, NaN where y is missing
     double *s;       // [n] or null: variance of each innovation
 };
@@ -156,6 +157,9 @@ template <int D> struct Filter {
                 for (int a = 0; a < in.columns; a++)
                     for (int b = 0; b < in.columns; b++)
                         out.G[(mark * in.columns + a) * in.columns + b] = G[a][b];
+                for (int k = 0; k < in.columns; k++)
+                    for (int a = 0; a < D; a++)
+                        out.x[(mark * in.columns + k) * D + a] = x[k][a];
                 out.D[mark] = ln_s;
                 out.counted[mark++] = static_cast<double>(counted);
             }
@@ -215,8 +219,9 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
             throw std::invalid_argument("marks must rise, up to the length of y");
     const int c = static_cast<int>(p) + 1;
     const std::size_t m = marks.size();
-    Sums out{fresh(m * c * c), fresh(m), fresh(m), innovations ? fresh(n * c) : nullptr, innovations ? fresh(n) : nullptr};
+    Sums out{fresh(m * c * c), fresh(m), fresh(m), fresh(m * c * d), innovations ? fresh(n * c) : nullptr, innovations ? fresh(n) : nullptr};
     Out G = array(out.G, {m, std::size_t(c), std::size_t(c)}), D = array(out.D, {m}), counted = array(out.counted, {m});
+    Out x = array(out.x, {m, std::size_t(c), d});
     Out white = array(innovations ? out.white : fresh(0), {innovations ? n : 0, std::size_t(c)});
     Out s = array(innovations ? out.s : fresh(0), {innovations ? n : 0});
     const Input in{y.data(), z.data(), r.data(), n, c, F.data(), Q.data(), h.data(), P0.data(), R, marks.data(), m};
@@ -237,7 +242,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
         default: filter<12>(in, out); break;
         }
     }
-    return nb::make_tuple(G, D, counted, white, s);
+    return nb::make_tuple(G, D, counted, x, white, s);
 }
 
 } // namespace

@@ -129,6 +129,48 @@ def identify(
 
 
 @app.command()
+def diagnose(
+    log: Log,
+    axis: Axis = None,
+    model: ModelFile = None,
+    json: Json = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")
+    ] = None,
+    write_model: Annotated[
+        Path | None, typer.Option(metavar="MODEL.yaml", help="Write the model file with what was found in it")
+    ] = None,
+    fail_on: Annotated[
+        str | None, typer.Option(metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it")
+    ] = None,
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+) -> None:
+    """What the model gets wrong in a recording at rest, why, and what mending it gains."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import diagnose as verb
+
+    result = verb.diagnose(
+        log,
+        axes=axis or (),
+        model=model,
+        json=json,
+        report=report,
+        write_model=write_model,
+        fail_on=fail_on,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+    )
+    verb.show(result)
+    if fail_on is not None and verb.failing(result, fail_on):
+        sys.exit(1)
+
+
+@app.command()
 def simulate(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[

@@ -48,6 +48,7 @@ class Sums:
     G: Array
     D: float
     n: float
+    x: Array  # [1 + p, states]: predicted state of the next sample, of the record and of each column
 
     def coefficients(self) -> tuple[Array, Array, float]:
         """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares."""
@@ -85,10 +86,10 @@ def run(
     """One pass; sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their variances [n]."""
     m = matrices(terms, theta, series.dt, series.duration_s)
     at = list(marks) or [series.y.size]
-    G, D, n, white, s = _likelihood.run(
+    G, D, n, x, white, s = _likelihood.run(
         series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, at, innovations
     )
-    return [Sums(G[k], float(D[k]), float(n[k])) for k in range(len(at))], white, s
+    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
 
 
 def ln_likelihood(sums: Sums) -> float:

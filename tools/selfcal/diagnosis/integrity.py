@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.special import ndtr
 from scipy.stats import chi2, truncnorm
 
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
 from selfcal.diagnosis.statemodel import Array
 
 #: Missing samples are told of from this share on.
@@ -98,8 +97,10 @@ def saturation(state: State) -> tuple[Look, State] | None:
         "saturation",
         gain,
         gain,
-        {"limit": interval(limit + state.level, state.lsb / 4.0 or 1e-6 * abs(limit + state.level), state.unit),
-         "clipped": count},
+        {
+            "limit": interval(limit + state.level, state.lsb / 4.0 or 1e-6 * abs(limit + state.level), state.unit),
+            "clipped": count,
+        },
         {},
     )
     return look, found
@@ -228,6 +229,3 @@ def masked(state: State, mask: Array) -> State:
     y = state.y.copy()
     y[mask.astype(bool)] = np.nan
     return replace(state, y=y)
-
-
-__all__ = ["missing", "quantization", "saturation", "motion", "masked", "Mapping"]

@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import noise, periodic, regressors, step
 from selfcal.diagnosis.record import Record
@@ -38,6 +36,8 @@ class Finding:
 
     look: Look
     round: int
+    before: State
+    after: State
     also_possible: tuple[str, ...] = ()
     shared_with: tuple[str, ...] = ()
 
@@ -91,20 +91,23 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     gone = integrity.missing(record)
     for name, one in found.items():
         if name in moved:
-            one.findings.append(Finding(moved[name][0], 0, shared_with=tuple(k for k in moved if k != name)))
+            one.findings.append(
+                Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
+            )
         if gone is not None:
-            one.findings.append(Finding(gone, 0))
+            one.findings.append(Finding(gone, 0, one.state, states[name]))
     for name in states:
         clipped = integrity.saturation(states[name])
         if clipped is not None:
-            states[name] = clipped[1]
             if name in found:
-                found[name].findings.append(Finding(clipped[0], 0))
+                found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
+            states[name] = clipped[1]
         lattice = integrity.quantization(states[name])
         if lattice is not None:
-            states[name] = replace(states[name], stated_lsb=states[name].lsb)
+            before = states[name]
+            states[name] = replace(before, stated_lsb=before.lsb)
             if name in found:
-                found[name].findings.append(Finding(lattice, 0))
+                found[name].findings.append(Finding(lattice, 0, before, states[name]))
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
@@ -123,8 +126,8 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None]) -> N
         rivals = tuple(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )
-        one.findings.append(Finding(best, number, also_possible=rivals))
-        one.state = one.state.refit(**best.changes)
+        before, one.state = one.state, one.state.refit(**best.changes)
+        one.findings.append(Finding(best, number, before, one.state, also_possible=rivals))
 
 
 def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
@@ -173,6 +176,4 @@ def _unexplained(one: Diagnosed) -> None:
         look = Look(
             "unexplained", nats, nats, {"statistic": worst.name, "measured": worst.measured}, {}, shown_by=worst.name
         )
-        one.findings.append(Finding(look, ROUNDS + 1))
-
-
+        one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))

@@ -35,9 +35,7 @@ class Record:
 
     def other_axes(self, axis: str) -> dict[str, Array]:
         """The other axes about their level, bridged where missing."""
-        return {
-            name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis
-        }
+        return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
 
 
 def of_recording(recording: Recording, model: Model, axes: Sequence[str]) -> Record:

@@ -123,7 +123,11 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
     if terms.color == "ma":  # e_i + theta e_(i-1)
         m = math.tanh(value["color"])
         unit = 1.0 / (1.0 + m * m)
-        F, Q, P0 = _joined(F, [[0.0, 0.0], [1.0, 0.0]]), _joined(Q, [[unit, 0.0], [0.0, 0.0]]), _joined(P0, np.eye(2) * unit)
+        F, Q, P0 = (
+            _joined(F, [[0.0, 0.0], [1.0, 0.0]]),
+            _joined(Q, [[unit, 0.0], [0.0, 0.0]]),
+            _joined(P0, np.eye(2) * unit),
+        )
         h += [1.0, m]
         R = 1e-9
     for k, frequency in enumerate(terms.bands):
@@ -136,9 +140,7 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         h += [1.0, 0.0]
     if not h:
         F, Q, P0, h = np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), [0.0]
-    return Matrices(
-        np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R
-    )
+    return Matrices(np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R)
 
 
 def _joined(a: Array, b: object) -> Array:

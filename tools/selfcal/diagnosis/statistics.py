@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.state import State
@@ -61,14 +61,17 @@ def all_statistics(w: Array, y: Array, lsb: float) -> dict[str, float]:
         energy = np.minimum(x[: size * pieces] ** 2, 16.0).reshape(pieces, size).mean(axis=1)
         # In units of the pieces' own expected spread, from the fourth moment.
         spread = float(np.var(np.minimum(x * x, 16.0))) / size
-        found[f"noise_level_of_{pieces}_pieces"] = _root(float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1)
-    square = np.minimum(filled**2, 16.0)
+        found[f"noise_level_of_{pieces}_pieces"] = _root(
+            float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1
+        )
+    # Magnitudes, not squares: their products have no heavy tail.
+    square = np.minimum(np.abs(filled), 3.5)
     square = np.where(present, square - square[present].mean(), 0.0)
     scale = math.sqrt(n) * float(square[present].var())
     lagged = _lagged(square, min(101, n // 8)) / scale
     for lag in (1, 3, 10, 30, 100):
         if lag < lagged.size:
-            found[f"squared_innovation_lag{lag}"] = float(lagged[lag])
+            found[f"innovation_magnitude_lag{lag}"] = float(lagged[lag])
     # Level over the record: means of pieces against white noise.
     for pieces in (8, 40):
         size = n // pieces
@@ -216,5 +219,3 @@ def combined(statistics: list[Statistic]) -> float:
     if not statistics:
         return 1.0
     return min(1.0, statistics[0].p * len(statistics))
-
-

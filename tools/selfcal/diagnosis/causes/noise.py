@@ -10,7 +10,9 @@ import numpy as np
 from selfcal.diagnosis.fit import best, fit, moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State, interval, net
-from selfcal.diagnosis.statemodel import Array
+
+#: The best place of a change of the noise gains about this much of noise alone.
+LN_CHANGES = 2.6
 
 
 def colored(state: State, record: Record) -> list[Look]:
@@ -113,7 +115,7 @@ def variance_change(state: State, record: Record) -> list[Look]:
     # A kurtosis of the squares other than the normal's 2 widens the null in proportion.
     wide = max(1.0, float(np.var(square / first[at] if at else square)) / 2.0) if state.lsb == 0.0 else 1.0
     scan = float(gain[at]) / wide
-    if net(scan, 1, 2.6) < 1.0:
+    if net(scan, 1, LN_CHANGES) < 1.0:
         return []
     place = int(np.flatnonzero(present)[at + 1])
     ratio = math.sqrt(float(second[at] / first[at]))
@@ -121,7 +123,7 @@ def variance_change(state: State, record: Record) -> list[Look]:
     r[place:] *= ratio**2
     changed = state.refit(r=r)
     exact = changed.best.ln_likelihood - state.best.ln_likelihood
-    worth = net(min(exact, scan * 1.2 + 2.0), 1, 2.6)
+    worth = net(min(exact, scan * 1.2 + 2.0), 1, LN_CHANGES)
     if worth < 1.0:
         return []
     sd = ratio * math.sqrt(0.5 / (at + 1) + 0.5 / (n - at - 1))

@@ -43,7 +43,9 @@ def looks(state: State, record: Record) -> list[Look]:
 
     f = float(
         minimize_scalar(
-            cost, bounds=(frequency[at] - 0.5 * width, frequency[at] + 0.5 * width), method="bounded",
+            cost,
+            bounds=(frequency[at] - 0.5 * width, frequency[at] + 0.5 * width),
+            method="bounded",
             options={"xatol": 1e-4 * width},
         ).x
     )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, net
-from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does.
@@ -46,8 +44,13 @@ def looks(state: State, record: Record) -> list[Look]:
         found += _linear(state, cause, options, "coefficient", LN_SMOOTHINGS)
     others = record.other_axes(state.axis)
     options = [
-        Regressor(f"axis_{name}", "cross_axis", values, record.axes[name].unit,
-                  {"kind": "column", "column": name, "unit": record.axes[name].unit, "reference": 0.0})
+        Regressor(
+            f"axis_{name}",
+            "cross_axis",
+            values,
+            record.axes[name].unit,
+            {"kind": "column", "column": name, "unit": record.axes[name].unit, "reference": 0.0},
+        )
         for name, values in others.items()
         if f"axis_{name}" not in known and np.ptp(values) > 0.0
     ]

@@ -49,7 +49,7 @@ def looks(state: State, record: Record) -> list[Look]:
         cross, _ = scan(state, np.ascontiguousarray(q[:, k]), response)
         A = A - cross**2
     first, last = np.flatnonzero(np.isfinite(state.y))[[0, -1]]
-    gain = np.where(A > 0.05 * float((response**2).sum()), 0.5 * B**2 / np.maximum(A, 1e-12), 0.0)
+    gain = np.where(0.05 * float((response**2).sum()) < A, 0.5 * B**2 / np.maximum(A, 1e-12), 0.0)
     gain[: first + 4] = gain[last - 2 :] = 0.0
     if gain.max() < SCREEN + 2.0:
         return []
@@ -66,9 +66,7 @@ def looks(state: State, record: Record) -> list[Look]:
         return []
     time = float(record.time_s[place])
     spread = _place_spread(gain, place, state.dt)
-    column = Regressor(
-        f"step_{time:.6g}s", "step", _column(n, place), "1", {"kind": "step", "time_s": time}
-    )
+    column = Regressor(f"step_{time:.6g}s", "step", _column(n, place), "1", {"kind": "step", "time_s": time})
     return [
         Look(
             "step",
