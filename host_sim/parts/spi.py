@@ -51,8 +51,9 @@ class Spi(Part):
         return self._noisy(self.device(self._noisy(word), self.cr1 & 3, self.sck_hz, end_us))
 
     def read(self, offset: int) -> int:
-        """CR1, CR2, SR, DR. A program that finds SR busy asks again and again: time goes on to the frame's end, or to the
-        next event."""
+        """CR1, CR2, SR, DR. While SR is busy, time goes on to the frame's end or the next event: the program would ask
+        again and again.
+        """
         if offset == 0x08:
             done = self.machine.time_us >= self.done_at
             if not done:
