@@ -36,7 +36,7 @@ def make_grid(nodes: int) -> Grid:
     """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/posterior.c)."""
     z = np.arange(nodes, dtype=float)
     knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
-    return Grid(nodes, np.linalg.inv(_basis(z, knots, 5)))
+    return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
 
 
 def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
