@@ -502,7 +502,10 @@ def _add(scene: Scene, axis: str, cause: str, shape: Shape, price: float, beside
 
 
 def flicker(scene: Scene, axis: str, price: float) -> None:
-    """1/f noise in place of the drift: Gauss-Markov terms, half a decade apart; two-sided density B^2/(2 pi f)."""
+    """1/f noise in place of the drift: Gauss-Markov terms, half a decade apart; two-sided density B^2/(2 pi f).
+
+    B is 5 N at most. At 1 Hz some 50 nats are the most that an hour can offer, so plain ones come at 10 and 100 Hz.
+    """
     law = scene.laws[axis] = Law("flicker", scene.laws[axis].N)
     step = 0.5 * np.log(10.0)
     rates = np.exp(np.arange(np.log(0.1 / scene.length), np.log(2.0 * scene.rate), step))
@@ -513,7 +516,7 @@ def flicker(scene: Scene, axis: str, price: float) -> None:
     def gain(b: float) -> float:
         return spectral.gain([(1.0, scene.sd(axis) ** 2 + b**2 * step / np.pi * terms)])
 
-    b = solve(gain, nats + price, 0.05 * law.N, 3.0 * law.N)
+    b = solve(gain, nats + price, 0.05 * law.N, 5.0 * law.N)
     sigma = b * np.sqrt(step / np.pi)
     scene.noise[axis] = scene.white[axis] + sum(gauss_markov(scene.n, scene.dt, sigma, a, scene.rng) for a in rates)
     scene.effects.append(Effect(axis, "flicker", {"B": b}, nats))
@@ -717,9 +720,7 @@ IMPOSSIBLE = {
         ("outliers", "motion"),
     )
 }
-PAIRS = [
-    (a, b) for i, a in enumerate(CAUSES) for b in list(CAUSES)[i + 1 :] if frozenset((a, b)) not in IMPOSSIBLE
-]
+PAIRS = [(a, b) for i, a in enumerate(CAUSES) for b in list(CAUSES)[i + 1 :] if frozenset((a, b)) not in IMPOSSIBLE]
 
 
 # --------------------------------------------------------------------------------------------------- outside the table
