@@ -1,6 +1,7 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
@@ -21,7 +22,7 @@ RECORDING ?= tests/data/simulated_adis16405.npz
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix test soak tolerances emulate c-tests check clean
+.PHONY: all setup system python run posix test hidden soak tolerances emulate c-tests check clean
 
 all: setup
 
@@ -82,6 +83,11 @@ TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/
 
 test: setup
 	@$(BIN)/python tests/run.py
+
+# Seeds from the date unless SEED is given.
+hidden: setup
+	nice $(BIN)/python tests/hidden/judge.py --records $(or $(RECORDS),20) --classes $(CLASSES) $(if $(SEED),--seed $(SEED)) $(if $(RATE),--rate $(RATE)) \
+	    $(if $(SAVE),--save $(SAVE)) $(if $(RIVALS),--rivals)
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
@@ -297,6 +303,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
+	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 

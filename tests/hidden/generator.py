@@ -175,24 +175,52 @@ GRID: dict[str, list[tuple[float, ...]]] = {
 LIMITS = {"constant": [], "random_walk": [NULL_K], "gauss_markov": [NULL_SIGMA_M, NULL_ALPHA]}
 
 
-def least(cost: Callable[[str, Sequence[float]], float], coarse: Mapping[str, Sequence[float]]) -> float:
+#: Cost, law and parameters.
+Best = tuple[float, str, tuple[float, ...]]
+
+
+def least(cost: Callable[[str, Sequence[float]], float], coarse: Mapping[str, Sequence[float]]) -> Best:
     """Least cost over the laws of the null; `coarse`: the costs on `GRID`. Laws far above the best are left."""
-    best = min(min(values) for values in coarse.values())
-    for law, values in coarse.items():
-        if law == "constant" or min(values) > best + 10.0:
+    starts = {law: int(np.argmin(values)) for law, values in coarse.items()}
+    best: Best = min((coarse[law][at], law, GRID[law][at]) for law, at in starts.items())
+    limit = best[0] + 10.0
+    for law, at in starts.items():
+        if law == "constant" or coarse[law][at] > limit:
             continue
-        start = GRID[law][int(np.argmin(values))]
-        bounds = [tuple(np.log(limit)) for limit in LIMITS[law]]
-        step = np.vstack([start, *(np.array(start) + 0.3 * np.eye(len(start)))])
+        start = np.array(GRID[law][at])
         found = minimize(
             lambda theta, law=law: cost(law, theta),
             start,
             method="Nelder-Mead",
-            bounds=bounds,
-            options={"initial_simplex": step, "xatol": 0.02, "fatol": 0.01},
+            bounds=[tuple(np.log(each)) for each in LIMITS[law]],
+            options={
+                "initial_simplex": np.vstack([start, start + 0.3 * np.eye(start.size)]),
+                "xatol": 0.02,
+                "fatol": 0.01,
+            },
         )
-        best = min(best, float(found.fun))
+        best = min(best, (float(found.fun), law, tuple(found.x)))
     return best
+
+
+def innovations(y: Array, dt: float) -> Array:
+    """float64[n]: one-step prediction errors of the null refitted to y, over their sd; the start is still settling."""
+    signals = (y - y[0])[None]
+
+    def cost(law: str, theta: Sequence[float]) -> float:
+        return exact(signals, dt, law, theta).cost(np.ones(1))
+
+    _, law, theta = least(cost, {law: [cost(law, theta) for theta in points] for law, points in GRID.items()})
+    phi, q, centred = 1.0, 0.0, y - y.mean()
+    if law == "constant":
+        return np.asarray(centred / centred.std())
+    if law == "random_walk":
+        q = (np.exp(theta[0]) * dt) ** 2
+    else:
+        phi = float(np.exp(-np.exp(theta[1]) * dt))
+        q = np.exp(2.0 * theta[0]) * dt * (1.0 - phi * phi)
+    seen = lfilter([1.0, -phi], [1.0, -phi / (1.0 + steady(phi, q))], y - y[0] if law == "random_walk" else centred)
+    return np.asarray(seen / seen.std())
 
 
 class Additive:
@@ -225,7 +253,7 @@ class Additive:
     def _least(self, factor: float) -> float:
         weights = np.array([1.0, factor**2])
         coarse = {law: [fit.cost(weights) for fit in fits] for law, fits in self.coarse.items()}
-        return least(lambda law, theta: self._fit(law, theta).cost(weights), coarse)
+        return least(lambda law, theta: self._fit(law, theta).cost(weights), coarse)[0]
 
     def gain(self, factor: float) -> float:
         """Expected nats of the truth over the refitted null."""
@@ -281,7 +309,7 @@ class Spectral:
             return 0.5 * (self.n * float(np.log(white)) + float(self.count @ np.log(shape)))
 
         coarse = {law: [cost(shape) for shape in shapes] for law, shapes in self.coarse.items()}
-        return least(lambda law, theta: cost(self._shape(law, theta)), coarse) - 0.5 * truth
+        return least(lambda law, theta: cost(self._shape(law, theta)), coarse)[0] - 0.5 * truth
 
 
 # ----------------------------------------------------------------------------------------------------------- the scene

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from conftest import ROOT
 sys.path.insert(0, str(ROOT / "tests" / "hidden"))
 
 import generator
+import judge
 from generator import AXES, CAUSES, CLEAN, GRID, OUTSIDE, PAIRS, Law, Scene, draw, exact, least
 
 #: Samples of a record, unless stated.
@@ -51,7 +54,7 @@ def fitted(y: np.ndarray, dt: float = 1.0) -> float:
     def cost(law: str, theta: Sequence[float]) -> float:
         return exact(y[None] - y[0], dt, law, theta).cost(np.ones(1))
 
-    return least(cost, {law: [cost(law, theta) for theta in points] for law, points in GRID.items()})
+    return least(cost, {law: [cost(law, theta) for theta in points] for law, points in GRID.items()})[0]
 
 
 @pytest.mark.parametrize("dt", [0.1, 1.0])
@@ -195,9 +198,7 @@ def test_the_same_seed_draws_the_same_record_and_another_does_not() -> None:
 
 def test_every_kind_can_be_drawn() -> None:
     assert len(PAIRS) >= 30
-    for pair in PAIRS:
-        if "missing_samples" not in pair and "quantization" not in pair:
-            continue
+    for pair in PAIRS[::9]:
         record = draw("pair", 0, rate=10.0 if "flicker" in pair else 1.0, pair=pair)
         assert set(pair) <= set(record.causes(record.axis))
     for name in OUTSIDE:
@@ -209,3 +210,80 @@ def test_every_kind_can_be_drawn() -> None:
             record = draw(f"clean:{name}", 0, rate=1.0, law=law)
             assert record.causes(record.axis) == []
             assert record.laws[record.axis].law == ("constant" if name == "constant" else law)
+
+
+# ------------------------------------------------------------------------------------------------------------ the judge
+
+
+def oracle(path: Path, axes: list[str]) -> dict[str, Any]:
+    """Knows the truth, from the file beside the recording; its sizes are a tenth wide on either side."""
+    truth = json.loads(path.with_suffix(".truth.json").read_text())
+    own = [effect for effect in truth["effects"] if effect["axis"] == axes[0]]
+    findings = []
+    for effect in own:
+        estimate = {
+            key: {"median": value, "q05": value - 0.1 * abs(value), "q95": value + 0.1 * abs(value)}
+            if isinstance(value, float | int)
+            else value
+            for key, value in effect["size"].items()
+        }
+        cause = effect["cause"] if effect["cause"] in CAUSES else "unexplained"
+        score = {"log_score_per_sample": {"before": -1.0, "after": -0.99, "sd": 0.001}}
+        findings.append({"cause": cause, "evidence_gain_nats": 50.0, "estimate": estimate, "gain": score})
+    verdict = "inadequate" if findings else "adequate"
+    shown = {"statistic": "s", "measured": 5.0, "simulated_q005": -1.0, "simulated_q995": 1.0}
+    cleared = {**shown, "after": {**shown, "measured": 0.0}}
+    entry = {"verdict": verdict, "findings": findings, "discrepancies": [cleared] if findings else []}
+    return {"axes": {axes[0]: entry}}
+
+
+def content(path: Path, axes: list[str]) -> dict[str, Any]:
+    """Finds nothing, ever."""
+    return {"axes": {axis: {"verdict": "adequate", "findings": [], "discrepancies": []} for axis in axes}}
+
+
+def broken(path: Path, axes: list[str]) -> dict[str, Any]:
+    raise ValueError("no")
+
+
+def judged(detector: Any, tmp_path: Path) -> list[dict[str, Any]]:
+    """One answer a group and kind, without those whose drawing takes long."""
+    classes = ["step", "quantization", "missing_samples", "pair", "outside:echo", "clean:nothing", "clean:ms_stamps"]
+    work = [task for task in judge.tasks(classes, 1, 1, 1.0) if "flicker" not in (task.pair or ())]
+    first = {(task.group, task.kind): task for task in reversed(work)}
+    return [judge.answer(task, f"{__name__}:{detector.__name__}", tmp_path) for task in first.values()]
+
+
+def test_the_judge_finds_nothing_wrong_with_the_truth(tmp_path: Path) -> None:
+    answers = judged(oracle, tmp_path)
+    lines = judge.requirements(answers)
+    assert all(line.met for line in lines), "\n".join(map(str, lines))
+    assert {each["truth"]["group"] for each in answers} == set(judge.GROUPS)
+    assert all(line.hits == line.of for line in lines if "adequate" in line.what or "first" in line.what)
+    assert [gain.cause for gain in judge.held_out(answers)] == ["step", "quantization", "missing_samples"]
+    assert all(ok for each in answers for ok in each["sizes"].values())
+    assert {"step.amplitude", "quantization.lsb", "missing_samples.missing"} <= {k for e in answers for k in e["sizes"]}
+
+
+def test_the_judge_fails_a_detector_that_sees_nothing(tmp_path: Path) -> None:
+    lines = judge.requirements(judged(content, tmp_path))
+    for what in ("  step", "two causes: both named", "outside the table: not adequate"):
+        line = next(line for line in lines if line.what == what)
+        assert line.hits == 0 < line.of
+        assert not line.met
+    assert next(line for line in lines if line.what == "  ms_stamps").hits == 1
+
+
+def test_a_fault_of_the_detector_is_an_answer(tmp_path: Path) -> None:
+    found = judge.answer(judge.Task("plain", "quantization", 1, rate=1.0), f"{__name__}:broken", None)
+    assert (found["first"], found["error"]) == ("refused", "ValueError: no")
+    assert "| quantization, plain | 1 |" in judge.confusion([found])
+
+
+def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> None:
+    tasks = judge.tasks(["clean:constant"], 2, 3, 1.0) + judge.tasks(["outliers"], 3, 3, 1.0)
+    answers = [judge.rivals(task) for task in tasks]
+    kinds = [each["truth"]["kind"] for each in answers]
+    alarms = [min(each["p"].values()) < 0.003 for each in answers]
+    assert sum(alarm for alarm, kind in zip(alarms, kinds, strict=True) if kind.startswith("clean")) <= 2
+    assert sum(alarm for alarm, kind in zip(alarms, kinds, strict=True) if kind == "outliers") >= 5
