@@ -86,8 +86,8 @@ test: setup
 
 # Seeds from the date unless SEED is given.
 hidden: setup
-	nice $(BIN)/python tests/hidden/judge.py --records $(or $(RECORDS),20) --classes $(CLASSES) $(if $(SEED),--seed $(SEED)) $(if $(RATE),--rate $(RATE)) \
-	    $(if $(SAVE),--save $(SAVE)) $(if $(RIVALS),--rivals)
+	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) $(SEED:%=--seed %) \
+	    $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
@@ -303,7 +303,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py
+	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py ../tests/hidden/rivals.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 

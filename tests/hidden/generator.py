@@ -227,10 +227,10 @@ class Additive:
     """Evidence that a shape [n] offers beside noise [n], as a function of the shape's factor.
 
     The noise counts with both signs, so no chance product with the shape is left. The likelihood is that of block
-    means at 1 Hz; what the shape does within the blocks meets white noise of sd `white_sd` alone.
+    means at 1 Hz; what the shape does within the blocks meets the noise's variance there, as if that were white.
     """
 
-    def __init__(self, noise: Array, shape: Array, dt: float, white_sd: float, beside: Sequence[Array] = ()) -> None:
+    def __init__(self, noise: Array, shape: Array, dt: float, beside: Sequence[Array] = ()) -> None:
         block = max(1, round(1.0 / dt))
         n = noise.size // block * block
         means = [signal[:n].reshape(-1, block).mean(axis=1) for signal in (noise, shape, *beside)]
@@ -238,12 +238,13 @@ class Additive:
         self.beside = np.array([m / max(float(np.sqrt(m @ m)), 1e-300) for m in means[2:]]) if beside else None
         self.dt = dt * block
         self.within = n - n // block
-        inner = (shape[:n].reshape(-1, block) - means[1][:, None]).ravel()
-        for other in beside:  # what a known shape beside takes away
-            known = (other[:n].reshape(-1, block) - other[:n].reshape(-1, block).mean(axis=1)[:, None]).ravel()
-            if (power := float(known @ known)) > 0.0:
-                inner = inner - known * float(inner @ known) / power
-        self.inner = float(inner @ inner) / max(self.within, 1) / white_sd**2
+        left, inner, *others = [
+            (signal[:n].reshape(-1, block) - mean[:, None]).ravel()
+            for signal, mean in zip((noise, shape, *beside), means, strict=True)
+        ]
+        for other in others:  # what a known shape beside takes away
+            inner = inner - other * float(inner @ other) / max(float(other @ other), 1e-300)
+        self.inner = float(inner @ inner) / max(float(left @ left), 1e-300) if block > 1 else 0.0
         self.coarse = {law: [self._fit(law, theta) for theta in points] for law, points in GRID.items()}
         self.nothing = self._least(0.0)
 
@@ -434,8 +435,8 @@ def _law(scene: Scene, axis: str, law: str) -> Law:
 
 
 def _temperature(scene: Scene, shape: str) -> Array:
-    """degC: `rise` grows all the time; `cycle`, `wander` and `mixed` turn back."""
-    curve = np.full(scene.n, scene.rng.uniform(15.0, 35.0))
+    """degC: `rise` grows all but all the time; `cycle`, `wander` and `mixed` turn back. None is a pure line."""
+    curve = scene.rng.uniform(15.0, 35.0) + scene.rng.uniform(0.2, 0.6) * scene.wander(scene.log_uniform(100.0, 400.0))
     if shape in ("rise", "mixed"):
         curve += scene.rng.uniform(3.0, 12.0) * (1.0 - np.exp(-scene.t / scene.log_uniform(200.0, 1200.0)))
     if shape in ("cycle", "mixed"):
@@ -520,7 +521,7 @@ def _add(scene: Scene, axis: str, cause: str, shape: Shape, price: float, beside
     """The shape at a size drawn for the scene; `beside`: shapes that the null knows already."""
     nats = _target(scene, scene.size)
     known = [other.values for other in beside]
-    sized = Additive(scene.noise[axis], shape.values, scene.dt, scene.sd(axis), known)
+    sized = Additive(scene.noise[axis], shape.values, scene.dt, known)
     factor = scene.sign() * sized.factor(nats + price)
     scene.values[axis] = scene.values[axis] + factor * shape.values
     scene.effects.append(Effect(axis, cause, shape.estimate(factor), nats))
@@ -666,8 +667,11 @@ def saturation(scene: Scene, axis: str, price: float) -> None:
 
 
 def quantization(scene: Scene, axis: str, price: float) -> None:
-    """A coarse lattice that no model file states. Plain: 0.8 to 2 sd of the white noise; near: 0.6 to 0.8."""
-    low, high = (0.6, 0.8) if scene.size == "near" else (0.8, 2.0)
+    """A coarse lattice that no model file states. Plain: 0.8 to 2 sd of the white noise; near: 0.6 to 0.8.
+
+    Beside another cause 1.2 at most, so that its noise takes no more than a tenth of the other's evidence.
+    """
+    low, high = (0.6, 0.8) if scene.size == "near" else (0.8, 1.2 if _sick(scene, axis) else 2.0)
     q = scene.lattice[axis] = float(f"{scene.log_uniform(low, high) * scene.sd(axis):.4g}")
     scene.effects.append(Effect(axis, "quantization", {"lsb": q}))
 
@@ -763,7 +767,7 @@ def _shaped(values: Callable[[Scene], Array]) -> Callable[[Scene], None]:
 
     def apply(scene: Scene) -> None:
         curve = values(scene)
-        sized = Additive(scene.noise[scene.axis], curve, scene.dt, scene.sd(scene.axis))
+        sized = Additive(scene.noise[scene.axis], curve, scene.dt)
         factor = scene.sign() * sized.factor(_certain(scene))
         scene.values[scene.axis] = scene.values[scene.axis] + factor * curve
 
@@ -933,11 +937,13 @@ def _others_sick(scene: Scene, count: int) -> None:
     """So many other axes get a cause each that stays on its axis."""
     alone = ("ramp", "step", "periodic", "outliers", "variance_change", "colored_noise", "temperature", "supply")
     names = [name for name in AXES if name != scene.axis]
+    size, scene.size = scene.size, "plain"
     for name in scene.rng.choice(names, count, replace=False):
         try:
             _apply(scene, str(name), [str(scene.rng.choice(alone))])
         except Unattainable:
             continue
+    scene.size = size
 
 
 def _supply_steps(scene: Scene) -> None:
@@ -984,7 +990,7 @@ def _scene(rng: np.random.Generator, kind: str, size: str, rate: float | None, l
     """Six axes of noise, a temperature and a supply, without any effect."""
     rate = float(rng.choice(RATES_HZ, p=RATE_SHARES)) if rate is None else rate
     scene = Scene(rng, rate, round(rng.uniform(1200.0, 3600.0) * rate), str(rng.choice(AXES)), size)
-    turns = kind in ("temperature", "pair", "outside:hysteresis")
+    turns = kind in ("temperature", "ramp", "pair", "outside:hysteresis")
     curves = ["cycle", "wander", "mixed"] if turns else ["rise", "cycle", "wander", "mixed"]
     scene.temperature = _temperature(scene, "rise" if kind == "clean:temperature_rises" else str(rng.choice(curves)))
     scene.supply = _supply(scene)
@@ -1049,7 +1055,6 @@ def _draw(
 
 
 def _clean(scene: Scene, name: str) -> None:
-    scene.size = "plain"
     if name == "supply_steps":
         _supply_steps(scene)
     elif name == "others_sick":

@@ -2,7 +2,8 @@
 
     make hidden                                       everything; an hour and more
     make hidden CLASSES="step clean" RECORDS=5        some of it
-    make hidden RIVALS=1                              the textbook tests of statsmodels on the same records instead
+    make hidden SAVE=build/hidden/records             leaves recordings, truths and answers for a closer look
+    make hidden RIVALS=1                              rivals.py on the same records instead
 
 Classes: plain, near, pair, outside, clean, or a kind (`step`, `outside:echo`, `clean:ms_stamps`). Seeds come from the
 date unless stated. The answers are left in build/hidden/answers.json. Exit code 1: a requirement is not met.
@@ -17,7 +18,6 @@ import os
 import sys
 import tempfile
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -34,9 +34,9 @@ from rich.progress import track
 
 from selfcal.recording import save
 
-from generator import CAUSES, CLEAN, OUTSIDE, PAIRS, SIZES, Effect, Record, draw, innovations
+from generator import CAUSES, CLEAN, OUTSIDE, PAIRS, SIZES, Effect, Record, draw
 
-ROOT = Path(__file__).resolve().parents[2]
+OUT = Path(__file__).resolve().parents[2] / "build" / "hidden"
 DIAGNOSE = "selfcal.verbs.diagnose:diagnose"
 GROUPS = ("plain", "near", "pair", "outside", "clean")
 #: Estimates that are right or wrong, and the relative difference that is still right.
@@ -300,92 +300,60 @@ def held_out(answers: Sequence[Answer]) -> list[Gain]:
     return gains
 
 
-# ------------------------------------------------------------------------------------------------------------- rivals
-
-
-def rivals(task: Task) -> Answer:
-    """p values of the textbook tests on the innovations of the refitted null, at 10 Hz block means at most."""
-    from statsmodels.stats.diagnostic import acorr_ljungbox, het_arch
-    from statsmodels.stats.stattools import jarque_bera
-
-    record = draw(task.kind, task.seed, task.size, task.rate, task.law, task.pair)
-    block = max(1, round(record.rate_hz / 10.0))
-    y = record.columns[record.axis][1]
-    y = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
-    seen = innovations(y, block / record.rate_hz)[50:]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # het_arch of statsmodels 0.15 warns of its own inner call
-        arch = het_arch(seen, nlags=10)
-    p = {
-        "Ljung-Box": float(acorr_ljungbox(seen, lags=[20])["lb_pvalue"].iloc[0]),
-        "Jarque-Bera": float(jarque_bera(seen)[1]),
-        "ARCH": float(arch[1]),
-    }
-    return {"truth": {**record.truth(), "group": task.group}, "p": p}
-
-
-def rival_table(answers: Sequence[Answer], level: float = 0.01) -> str:
-    """Share of alarms by class; any: at a third of the level each."""
-    tests = ("Ljung-Box", "Jarque-Bera", "ARCH")
-    lines = [
-        f"alarms at {100 * level:g} %, in % of the records",
-        "| drawn | records | " + " | ".join(tests) + " | any |",
-    ]
-    lines.append("|---" * 6 + "|")
-    rows: dict[str, list[dict[str, float]]] = {}
-    for each in answers:
-        truth = each["truth"]
-        rows.setdefault(f"{truth['kind']}, {truth['size']}", []).append(each["p"])
-    for name, p in rows.items():
-        shares = [100.0 * sum(each[test] < level for each in p) / len(p) for test in tests]
-        shares.append(100.0 * sum(min(each.values()) < level / 3.0 for each in p) / len(p))
-        lines.append(f"| {name} | {len(p)} | " + " | ".join(f"{share:.0f}" for share in shares) + " |")
-    return "\n".join(lines)
-
-
 # --------------------------------------------------------------------------------------------------------------- main
 
 
 def run(work: Sequence[Task], job: Callable[..., Answer], *given: Any, processes: int = 2) -> list[Answer]:
-    """The answers in the order of the tasks, with a progress bar. Ctrl-C keeps what is there."""
+    """The answers in the order of the tasks, with a progress bar. Ctrl-C keeps what is there.
+
+    What cannot be drawn (plain flicker of 20 min at 1 Hz) is left out and said.
+    """
     done: dict[int, Answer] = {}
     with ProcessPoolExecutor(processes) as pool:
         futures = {pool.submit(job, task, *given): i for i, task in enumerate(work)}
         try:
             for future in track(as_completed(futures), "hidden effects", total=len(work)):
-                done[futures[future]] = future.result()
+                try:
+                    done[futures[future]] = future.result()
+                except RuntimeError as error:
+                    print(f"left out: {error}", file=sys.stderr)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
     return [done[i] for i in sorted(done)]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; exit code 1 where a requirement is not met."""
-    parser = argparse.ArgumentParser(description="Hidden effects: does `selfcal diagnose` name them?")
+def command_line(description: str) -> argparse.ArgumentParser:
+    """The options that choose the records."""
+    today = int(datetime.now().strftime("%Y%m%d"))
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--classes", nargs="*", default=[], help="groups or kinds; all if none")
     parser.add_argument("--records", type=int, default=20, help="records a cause and size")
-    parser.add_argument(
-        "--seed", type=int, default=int(datetime.now().strftime("%Y%m%d")), help="today's date if not given"
-    )
+    parser.add_argument("--seed", type=int, default=today, help="today's date if not given")
     parser.add_argument("--rate", type=float, help="Hz: this rate alone")
-    parser.add_argument("--save", type=Path, metavar="DIR", help="leave recordings, truths and answers here")
-    parser.add_argument("--detector", default=DIAGNOSE, help="module:function(path, axes=[...]) -> document")
-    parser.add_argument("--rivals", action="store_true", help="the textbook tests instead")
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "build" / "hidden" / "answers.json", help="JSON of all answers"
-    )
-    options = parser.parse_args(arguments)
-    work = tasks(options.classes, options.records, options.seed, options.rate)
+    return parser
+
+
+def chosen(parser: argparse.ArgumentParser, options: argparse.Namespace) -> list[Task]:
+    """The records of these options, announced; an unknown class ends the program."""
     known = {*GROUPS, *(task.kind for task in tasks([], 2, 0, None))}
     if unknown := [name for name in options.classes if name not in known]:
         parser.error(f"unknown class {unknown[0]}; there are {', '.join(sorted(known))}")
+    work = tasks(options.classes, options.records, options.seed, options.rate)
+    print(f"{len(work)} records, seed {options.seed}", flush=True)
+    return work
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; exit code 1 where a requirement is not met."""
+    parser = command_line("Hidden effects: does `selfcal diagnose` name them?")
+    parser.add_argument("--save", type=Path, metavar="DIR", help="leave recordings, truths and answers here")
+    parser.add_argument("--detector", default=DIAGNOSE, help="module:function(path, axes=[...]) -> document")
+    parser.add_argument("--out", type=Path, default=OUT / "answers.json", help="JSON of all answers")
+    options = parser.parse_args(arguments)
+    work = chosen(parser, options)
     if options.save:
         options.save.mkdir(parents=True, exist_ok=True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    print(f"{len(work)} records, seed {options.seed}")
-    if options.rivals:
-        print(rival_table(run(work, rivals)))
-        return 0
     answers = run(work, answer, options.detector, options.save)
     options.out.write_text(json.dumps(answers, default=float) + "\n")
     lines, gains = requirements(answers), held_out(answers)

@@ -22,6 +22,7 @@ sys.path.insert(0, str(ROOT / "tests" / "hidden"))
 
 import generator
 import judge
+import rivals
 from generator import AXES, CAUSES, CLEAN, GRID, OUTSIDE, PAIRS, Law, Scene, draw, exact, least
 
 #: Samples of a record, unless stated.
@@ -282,7 +283,7 @@ def test_a_fault_of_the_detector_is_an_answer(tmp_path: Path) -> None:
 
 def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> None:
     tasks = judge.tasks(["clean:constant"], 2, 3, 1.0) + judge.tasks(["outliers"], 3, 3, 1.0)
-    answers = [judge.rivals(task) for task in tasks]
+    answers = [rivals.textbook(task) for task in tasks]
     kinds = [each["truth"]["kind"] for each in answers]
     alarms = [min(each["p"].values()) < 0.003 for each in answers]
     assert sum(alarm for alarm, kind in zip(alarms, kinds, strict=True) if kind.startswith("clean")) <= 2
