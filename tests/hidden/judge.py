@@ -69,24 +69,22 @@ class Task:
 def tasks(classes: Sequence[str], records: int, seed: int, rate: float | None) -> list[Task]:
     """The records of these classes; all without any.
 
-    `records` a cause and size. Pairs: two for each cause pair of 42. Outside: half as many a kind. Clean: twenty times
-    as many a law.
+    `records` a cause and size, half as many a kind outside the table, four times as many of different pairs, twenty
+    times as many clean ones of each drift law.
     """
     made: list[Task] = []
     for group in ("plain", "near"):
         made += [Task(group, kind, seed + i, group, rate) for kind in CAUSES for i in range(records)]
     pairs = [PAIRS[i] for i in np.random.default_rng(seed).permutation(len(PAIRS))]
-    made += [
-        Task("pair", "pair", seed + i, rate=rate, pair=pairs[i % len(pairs)]) for i in range(max(1, records * 84 // 20))
-    ]
-    made += [
-        Task("outside", f"outside:{kind}", seed + i, rate=rate) for kind in OUTSIDE for i in range(max(1, records // 2))
-    ]
-    made += [
-        Task("clean", f"clean:{CLEAN[i % len(CLEAN)]}", seed + i, rate=rate, law=law)
-        for law in ("random_walk", "gauss_markov")
-        for i in range(20 * records)
-    ]
+    made += [Task("pair", "pair", seed + i, rate=rate, pair=pairs[i % len(pairs)]) for i in range(4 * records)]
+    for kind in OUTSIDE:
+        made += [Task("outside", f"outside:{kind}", seed + i, rate=rate) for i in range((records + 1) // 2)]
+    kinds = [kind for kind in CLEAN if kind != "constant"]
+    for law in ("random_walk", "gauss_markov"):
+        made += [
+            Task("clean", f"clean:{kinds[i % len(kinds)]}", seed + i, rate=rate, law=law) for i in range(20 * records)
+        ]
+    made += [Task("clean", "clean:constant", seed + i, rate=rate) for i in range(4 * records)]
     return [task for task in made if not classes or task.group in classes or task.kind in classes]
 
 
