@@ -288,3 +288,9 @@ def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> No
     alarms = [min(each["p"].values()) < 0.003 for each in answers]
     assert sum(alarm for alarm, kind in zip(alarms, kinds, strict=True) if kind.startswith("clean")) <= 2
     assert sum(alarm for alarm, kind in zip(alarms, kinds, strict=True) if kind == "outliers") >= 5
+
+
+@pytest.mark.parametrize(("hits", "of", "met"), [(84, 100, False), (90, 100, True), (96, 100, False), (0, 0, True)])
+def test_coverage_may_miss_on_both_sides(hits: int, of: int, met: bool) -> None:
+    answers = [{"sizes": {"step.amplitude": i < hits}} for i in range(of)]
+    assert judge._size_lines("plain", answers)[0].met == met
