@@ -6,7 +6,8 @@
     make hidden RIVALS=1                              rivals.py on the same records instead
 
 Classes: plain, near, pair, outside, clean, or a kind (`step`, `outside:echo`, `clean:ms_stamps`). Seeds come from the
-date unless stated. The answers are left in build/hidden/answers.json. Exit code 1: a requirement is not met.
+date unless stated. The answers are left in build/hidden/answers.json. Exit code 1: a requirement is not met,
+or not all was run.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import importlib
 import json
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -311,7 +313,8 @@ def run(work: Sequence[Task], job: Callable[..., Answer], *given: Any, processes
     What cannot be drawn (plain flicker of 20 min at 1 Hz) is left out and said.
     """
     done: dict[int, Answer] = {}
-    with ProcessPoolExecutor(processes) as pool:
+    # The terminal interrupts the workers too: they finish their record.
+    with ProcessPoolExecutor(processes, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
         futures = {pool.submit(job, task, *given): i for i, task in enumerate(work)}
         try:
             for future in track(as_completed(futures), "hidden effects", total=len(work)):
@@ -365,6 +368,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"an axis: median {np.median(seconds):.1f} s, longest {max(seconds):.1f} s" if seconds else "")
     for error, count in faults.most_common(5):
         print(f"{count} times refused: {error}")
+    if len(answers) < len(work):
+        print(f"NOT WHOLE: {len(answers)} of {len(work)} records")
+        return 1
     return int(not (all(line.met for line in lines) and all(gain.met for gain in gains)))
 
 
