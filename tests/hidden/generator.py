@@ -128,8 +128,28 @@ class Fit:
         return 0.5 * (self.freedom * float(np.log(weights @ np.diag(self.rss))) + self.log_det)
 
 
-def exact(signals: Array, dt: float, law: str, theta: Sequence[float], regressors: Array | None = None) -> Fit:
-    """Exact likelihood of signals [k, n] with a free bias and free regressors [p, n].
+@dataclass(frozen=True)
+class Filtered:
+    """Signals [k, n] and what is free [p, n] behind the steady filter. White noise of sd 1 comes out with variance s.
+
+    `prior`: variance of the last row of what is free; infinite for a walk, whose first state is the bias.
+    """
+
+    y: Array
+    x: Array
+    s: float
+    prior: float
+
+    @property
+    def information(self) -> Array:
+        """[p, p] of what is free."""
+        found = self.x @ self.x.T / self.s
+        found[-1, -1] += 1.0 / self.prior
+        return np.asarray(found)
+
+
+def filtered(signals: Array, dt: float, law: str, theta: Sequence[float], regressors: Array | None = None) -> Filtered:
+    """One filter over signals [k, n], a free bias and free regressors [p, n].
 
     `theta`: ln(K/N) or ln(sigma_m/N), ln(alpha). The filter is in its steady state from the first sample on. A
     regressor makes that exact: the response to the part of the first state's variance above the steady one.
@@ -149,17 +169,19 @@ def exact(signals: Array, dt: float, law: str, theta: Sequence[float], regressor
     stacked = np.vstack([signals, *rows])
     seen = stacked if q == 0.0 else lfilter([1.0, -phi], [1.0, -decay], stacked)
     power = np.exp(np.maximum(np.arange(n) * np.log(decay), -300.0)) if decay < 1.0 else np.ones(n)
-    y, x = seen[: len(signals)], np.vstack([seen[len(signals) :], power])
-    s = 1.0 + p
-    information = x @ x.T / s
-    log_det = n * np.log(s)
-    if np.isfinite(first):
-        information[-1, -1] += 1.0 / (first - p)
-        log_det += np.log(first - p)
-    b = x @ y.T / s
-    rss = y @ y.T / s - b.T @ np.linalg.solve(information, b)
-    log_det += float(np.linalg.slogdet(information)[1])
-    return Fit(rss, float(log_det), n - len(x) + bool(np.isfinite(first)))
+    return Filtered(seen[: len(signals)], np.vstack([seen[len(signals) :], power]), 1.0 + p, float(first - p))
+
+
+def exact(signals: Array, dt: float, law: str, theta: Sequence[float], regressors: Array | None = None) -> Fit:
+    """Exact likelihood of signals [k, n]; arguments as of `filtered`."""
+    seen = filtered(signals, dt, law, theta, regressors)
+    n, proper = signals.shape[1], bool(np.isfinite(seen.prior))
+    b = seen.x @ seen.y.T / seen.s
+    rss = seen.y @ seen.y.T / seen.s - b.T @ np.linalg.solve(seen.information, b)
+    log_det = n * np.log(seen.s) + float(np.linalg.slogdet(seen.information)[1])
+    if proper:
+        log_det += np.log(seen.prior)
+    return Fit(rss, float(log_det), n - len(seen.x) + proper)
 
 
 def _grid(*limits: tuple[int, tuple[float, float]]) -> list[tuple[float, ...]]:
@@ -204,23 +226,16 @@ def least(cost: Callable[[str, Sequence[float]], float], coarse: Mapping[str, Se
 
 
 def innovations(y: Array, dt: float) -> Array:
-    """float64[n]: one-step prediction errors of the null refitted to y, over their sd; the start is still settling."""
+    """float64[n]: prediction errors of the null refitted to y, over their sd; bias and first state by least squares."""
     signals = (y - y[0])[None]
 
     def cost(law: str, theta: Sequence[float]) -> float:
         return exact(signals, dt, law, theta).cost(np.ones(1))
 
     _, law, theta = least(cost, {law: [cost(law, theta) for theta in points] for law, points in GRID.items()})
-    phi, q, centred = 1.0, 0.0, y - y.mean()
-    if law == "constant":
-        return np.asarray(centred / centred.std())
-    if law == "random_walk":
-        q = (np.exp(theta[0]) * dt) ** 2
-    else:
-        phi = float(np.exp(-np.exp(theta[1]) * dt))
-        q = np.exp(2.0 * theta[0]) * dt * (1.0 - phi * phi)
-    seen = lfilter([1.0, -phi], [1.0, -phi / (1.0 + steady(phi, q))], y - y[0] if law == "random_walk" else centred)
-    return np.asarray(seen / seen.std())
+    seen = filtered(signals, dt, law, theta)
+    errors = seen.y[0] - np.linalg.solve(seen.information, seen.x @ seen.y[0] / seen.s) @ seen.x
+    return np.asarray(errors / errors.std())
 
 
 class Additive:
@@ -1020,7 +1035,7 @@ def draw(
     `pair`: the two causes of a `pair`, drawn if not given. The same arguments give the same recording.
     """
     for attempt in range(100):
-        rng = np.random.default_rng([seed, zlib.crc32(f"{kind} {size}".encode()), attempt])
+        rng = np.random.default_rng([seed, zlib.crc32(f"{kind} {size} {law}".encode()), attempt])
         try:
             return _draw(rng, kind, seed, size, rate, law, pair)
         except Unattainable:

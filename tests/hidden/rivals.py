@@ -26,8 +26,6 @@ from statsmodels.stats.stattools import jarque_bera
 from generator import Array, Record, draw, innovations
 from judge import OUT, Answer, Task, chosen, command_line, run
 
-#: First innovations left out: the filter is settling.
-SETTLE = 50
 #: Exit code of tsoutliers.R where the package is absent.
 ABSENT = 77
 
@@ -42,7 +40,7 @@ def block_means(record: Record, rate: float) -> tuple[Array, float]:
 def textbook(task: Task) -> Answer:
     """p values of the tests for one record."""
     record = draw(task.kind, task.seed, task.size, task.rate, task.law, task.pair)
-    seen = innovations(*block_means(record, 10.0))[SETTLE:]
+    seen = innovations(*block_means(record, 10.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # het_arch of statsmodels 0.15 warns of its own inner call
         arch = het_arch(seen, nlags=10)

@@ -294,3 +294,14 @@ def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> No
 def test_coverage_may_miss_on_both_sides(hits: int, of: int, met: bool) -> None:
     answers = [{"sizes": {"step.amplitude": i < hits}} for i in range(of)]
     assert judge._size_lines("plain", answers)[0].met == met
+
+
+def test_innovations_of_a_slow_walk_are_white_from_the_start() -> None:
+    """A filter that starts from the first sample would err by its noise for thousands of samples."""
+    law, rng = Law("random_walk", 0.04, K=8e-5), np.random.default_rng(4)
+    starts = []
+    for _ in range(20):
+        y = law.drift(6000, 0.1, rng) + rng.normal(0.0, law.white_sd(0.1), 6000)
+        starts.append(float(generator.innovations(y, 0.1)[:1000].mean()))
+    # The mean of 1000 white innovations: sd 0.032, here with a fitted bias 0.03; of a bad start: above 0.5.
+    assert np.std(starts) < 0.06
