@@ -2,6 +2,7 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
@@ -22,7 +23,7 @@ RECORDING ?= tests/data/simulated_adis16405.npz
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix quick test soak tolerances emulate c-tests check clean
+.PHONY: all setup system python run posix quick test hidden soak tolerances emulate c-tests check clean
 
 all: setup
 
@@ -93,6 +94,11 @@ soak tolerances emulate campaigns: export OPENBLAS_NUM_THREADS := 1
 # What `make test` leaves out. When each last ran, and on which commit, stands in tests/long_runs.txt.
 LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
 PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=.
+
+# Seeds from the date unless SEED is given.
+hidden: setup
+	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) $(SEED:%=--seed %) \
+	    $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
@@ -313,6 +319,7 @@ check-ruff: $(PACKAGE)
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py tests/bench/bench.py tests/bench/image_sizes.py
+	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py ../tests/hidden/rivals.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:
