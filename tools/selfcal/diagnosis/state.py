@@ -116,8 +116,9 @@ def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     if same:
         return fit(series, terms, same[0].theta, step=0.5)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
-    if near:
-        return fit(series, terms, moved(near[0], terms))
+    richest = max(known, key=lambda one: len(one.terms.names), default=None)
+    if near and richest is not None:
+        return fit(series, terms, moved(near[0], terms, richest))
     return fit(series, terms)
 
 
