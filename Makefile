@@ -17,6 +17,12 @@ BUILD := build
 VENV := .venv
 BIN := $(VENV)/bin
 RECORDING ?= tests/data/simulated_adis16405.npz
+# A file's name is data: make expands nothing in it, here or in a make below, and the shell takes it from the environment.
+ifeq ($(origin RECORDING),command line)
+MAKEOVERRIDES :=
+endif
+override RECORDING := $(value RECORDING)
+export RECORDING
 
 include port/arm.mk
 
@@ -63,7 +69,7 @@ $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal
 
 run: setup
 	@mkdir -p $(BUILD)/run
-	$(BIN)/selfcal replay $(RECORDING) --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png
+	$(BIN)/selfcal replay --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png -- "$$RECORDING"
 
 # The firmware for this machine, of the default model; `selfcal replay` builds its own for each recording's rate.
 posix: $(MODEL)/selfcal_model.c
@@ -179,7 +185,7 @@ flash: setup
 BENCH := $(BUILD)/bench
 BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
-ARM_FAST += $(CURDIR)/tests/bench/%
+ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part has: the measuring and its records take some of it.
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
@@ -200,8 +206,7 @@ $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
-	cd $$(@D)/objects && $$(call arm_objects,$(ARM_$(1)) -I$(CURDIR)/lib -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D), \
-	    $(patsubst %,$(CURDIR)/%,$(filter-out lib/%,$(BENCH_C))) $(CURDIR)/$$(@D)/selfcal_model.c)
+	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),$(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
@@ -225,8 +230,8 @@ bench-images: $(BENCH)/$(1)/$(2).elf
 $(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS='$(MORE_$(2))'
-	cd $$(@D)/$(2) && $$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -I$(CURDIR)/lib -I$$(CURDIR)/$$(@D), \
-	    $(addprefix $(CURDIR)/,$(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
+	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),$(addprefix tests/bench/,count.c image.c more.c record.c) \
+	    $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
 	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))
