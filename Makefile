@@ -27,7 +27,7 @@ export RECORDING
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix test soak tolerances emulate c-tests check clean
+.PHONY: all setup system python lock run posix test soak tolerances emulate c-tests check clean
 
 all: setup
 
@@ -38,29 +38,47 @@ UNITY := $(UNITY_ROOT)/unity.c
 PACKAGE := $(VENV)/package.stamp
 MODEL := $(BUILD)/model
 
-setup: system python $(UNITY)
+# One at a time: whoever has waited for the lock finds all done.
+setup:
+	@mkdir -p $(BUILD)
+	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 system $(PACKAGE) $(UNITY)
 
 system:
 	@PYTHON="$(PYTHON)" tools/setup/system.sh
 
 python: $(PACKAGE)
 
+ifdef SETTING_UP
+# Of stated hashes, and nothing that would have to be built by what has none. The venv's own pip is replaced as well.
 $(VENV)/requirements.stamp: tools/requirements.txt | system
-	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --requirement tools/requirements.txt
+	@echo "Python packages into $(VENV) (a minute or two)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements.txt
 	@touch $@
 
 # Installed in place: Python sources need no new set-up, C and C++ ones do.
 $(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt $(wildcard tools/bindings/*) \
             $(wildcard host_sim/*) $(wildcard lib/*.[ch])
-	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --editable tools
+	@echo "selfcal into $(VENV): its C and C++ is compiled (a minute)"
+	$(BIN)/python -m pip install --no-build-isolation --no-deps --editable tools
 	@touch $@
 
 ifeq ($(UNITY_ROOT),$(BUILD)/unity)
 $(UNITY): tools/setup/unity.py | system
+	@echo "Unity into $(UNITY_ROOT) (half a minute)"
 	$(PYTHON) tools/setup/unity.py $(UNITY_ROOT)
 	@touch $@
 endif
+else
+$(PACKAGE) $(UNITY): setup ;
+endif
+
+# Versions and hashes anew, from the names in tools/pyproject.toml. What has a version keeps it: UPGRADE=1 takes the newest of all, UPGRADE=numpy of one.
+lock:
+	@mkdir -p $(BUILD) && $(PYTHON) -m venv --clear $(BUILD)/lock
+	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: --requirement tools/setup/lock.txt
+	cd tools && ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group dev --custom-compile-command "make lock" \
+	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements.txt pyproject.toml
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)

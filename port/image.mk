@@ -16,15 +16,17 @@ $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model
                     port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/library.mk port/arm.mk $(OUT)/flags
 	@rm -rf $(OUT)/objects
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(PROGRAM_FLAGS))'
-	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(PROGRAM_FLAGS) -Ilib -Iport -Iport/app \
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app \
 	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
 	    $(OUT)/objects/*.o -lm -o $@
 
-# Other flags, another image: touched when they change.
+# Other flags, another image: touched when they change. The compiler reads them there, so that no log shows a command key. Who can read an
+# image has its key: the folder of one that has any is its owner's alone.
 .PHONY: flags
 $(OUT)/flags: flags
-	@mkdir -p $(OUT) && printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' > $@
+	@mkdir -p $(OUT) && $(if $(findstring APP_COMMAND_KEY,$(PROGRAM_FLAGS)),chmod go= $(OUT) &&) umask 077 && touch -a $@ && chmod 600 $@ && \
+	    { printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' > $@; }
 
 $(OUT)/selfcal.bin: $(OUT)/selfcal.elf
 	arm-none-eabi-objcopy -O binary $< $@

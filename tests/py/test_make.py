@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
+import sys
 import threading
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +18,7 @@ import pytest
 from selfcal import recording
 from selfcal.model import Model
 from selfcal.verbs import replay as verb
+from selfcal.verbs.command import build_flag
 from selfcal.verbs.replay import build
 
 from conftest import ROOT
@@ -51,6 +56,72 @@ def test_a_name_like_an_option_is_a_file() -> None:
     done = make("run", "RECORDING=--help.npz")
     assert done.returncode == 2
     assert "--help.npz" in done.stderr and "Traceback" not in done.stderr
+
+
+# ------------------------------------------------------------------------------------------------------------- set-up
+
+FAKE_PYTHON = """#!/bin/sh
+case "$*" in
+"-m venv --clear .venv") mkdir -p .venv/bin; cp "$0" .venv/bin/python; said=venv ;;
+"-m pip "*) said=pip ;;
+"tools/setup/unity.py "*) mkdir -p "$2"; : >"$2/unity.c"; said=unity ;;
+*) exec {python} "$@" ;;
+esac
+echo $said begins >>log; sleep 0.3; echo $said ends >>log
+"""
+
+
+def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
+    """Three are begun together, of which one uses the package at once; each step of the set-up is done once."""
+    for part in ("Makefile", "port/arm.mk", "tools/requirements.txt", "tools/pyproject.toml", "tools/CMakeLists.txt"):
+        (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / part, tmp_path / part)
+    shutil.copytree(ROOT / "tools" / "setup", tmp_path / "tools" / "setup")
+    fake = tmp_path / "python"
+    fake.write_text(FAKE_PYTHON.format(python=sys.executable))
+    fake.chmod(0o755)
+    command = ["make", "-j2", f"PYTHON={fake}"]
+    makes = [subprocess.Popen([*command, goal], cwd=tmp_path) for goal in ("setup", "python", "setup")]
+    assert [one.wait() for one in makes] == [0, 0, 0]
+    steps = [f"{step} {end}" for step in ("venv", "pip", "pip", "unity") for end in ("begins", "ends")]
+    assert sorted((tmp_path / "log").read_text().splitlines()) == sorted(steps)
+    assert make("setup", f"PYTHON={fake}", cwd=tmp_path).returncode == 0
+    assert len((tmp_path / "log").read_text().splitlines()) == len(steps)
+
+
+def test_every_package_is_locked() -> None:
+    """Each name in tools/pyproject.toml has one version in the lock, and each version a hash: `make lock` was run."""
+    project = tomllib.loads((ROOT / "tools" / "pyproject.toml").read_text())
+    named = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
+    named += project["dependency-groups"]["dev"]
+    text = (ROOT / "tools" / "requirements.txt").read_text()
+    locked = re.findall(r"^([a-z0-9-]+)==(\S+)(?: ;.*)? \\\n    --hash=sha256:[0-9a-f]{64}\b", text, re.MULTILINE)
+    names = [name for name, _ in locked]
+    assert len(locked) == text.count("==") - text.count(" == ")
+    assert len(names) == len(set(names))
+    assert {re.sub(r"[-_.]+", "-", name).lower() for name in named} <= set(names)
+    for name in ("pip", "setuptools", "numpy"):
+        assert metadata.version(name) == dict(locked)[name]
+
+
+def test_a_unity_of_another_content_is_refused(tmp_path: Path) -> None:
+    """As a package whose files were tampered with would be; what was there stays."""
+    inside = tmp_path / "ntpsec-9" / "tests" / "unity"
+    inside.mkdir(parents=True)
+    for file in (ROOT / "build" / "unity").iterdir():
+        shutil.copy(file, inside)
+    unpack = "import sys; sys.path.insert(0, sys.argv[1]); import unity, pathlib; "
+    unpack += "unity.unpack(pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]))"
+    command = [sys.executable, "-c", unpack, ROOT / "tools" / "setup", tmp_path / "ntpsec.tar", tmp_path / "unity"]
+    shutil.make_archive(str(tmp_path / "ntpsec"), "tar", tmp_path, "ntpsec-9")
+    assert subprocess.run(command, check=False).returncode == 0
+    assert {file.name for file in (tmp_path / "unity").iterdir()} == {"unity.c", "unity.h", "unity_internals.h"}
+    (inside / "unity.c").write_text((inside / "unity.c").read_text() + "\n")
+    shutil.make_archive(str(tmp_path / "ntpsec"), "tar", tmp_path, "ntpsec-9")
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "ntpsec.tar holds no Unity of a stated SHA-256" in done.stderr
+    assert (tmp_path / "unity" / "unity.c").is_file()
 
 
 # ------------------------------------------------------------------------------------------- the firmware of `replay`
@@ -153,3 +224,36 @@ def test_two_at_once_build_one(compiler: Path) -> None:
     assert found[0] == found[1]
     assert found[0].read_text() == "program"
     assert compiled(compiler) == 1
+
+
+# -------------------------------------------------------------------------------------------------------- the images
+
+
+def test_a_key_stays_with_its_owner(checkout: Path) -> None:
+    """No log has it, and what holds it is the owner's alone; other flags are other images all the same."""
+    bin_ = checkout / "bin"
+    bin_.mkdir()
+    tool = """#!/bin/sh
+while [ $# -gt 1 ]; do [ "$1" = -o ] && : >"$2" && : >"${2%.o}.su"; shift; done
+: >>"$1"
+"""
+    for name in ("gcc", "objcopy"):
+        (bin_ / f"arm-none-eabi-{name}").write_text(tool)
+        (bin_ / f"arm-none-eabi-{name}").chmod(0o755)
+    (checkout / "model").mkdir()
+    for name in ("selfcal_model.c", "selfcal_model.h"):
+        (checkout / "model" / name).touch()
+    command = ["-f", "port/stm32f405/stm32f405.mk", "stm32f405", "MODEL_DIR=model", "OUT=out"]
+    path = f"{bin_}:{os.environ['PATH']}"
+    flags = checkout / "out" / "flags"
+    assert make(*command, "CFLAGS=-DBOARD_GATE=0", cwd=checkout, PATH=path).returncode == 0
+    assert flags.read_text().split() == ["-DBOARD_GATE=0"]
+    flags.chmod(0o644)  # as older ones are
+    done = make(*command, f"CFLAGS={build_flag(bytes(range(16)))}", cwd=checkout, PATH=path)
+    assert done.returncode == 0, done.stderr
+    assert "@out/flags" in done.stdout
+    assert "0706050403020100" not in done.stdout + done.stderr
+    assert "0706050403020100" in flags.read_text()
+    assert flags.stat().st_mode & 0o777 == 0o600
+    assert flags.parent.stat().st_mode & 0o077 == 0
+    assert "gcc" not in make(*command, f"CFLAGS={build_flag(bytes(range(16)))}", cwd=checkout, PATH=path).stdout

@@ -228,7 +228,7 @@ def command(
         print(verb.build_flag(verb.read_key(key)))
     else:
         answer = verb.command(order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate)
-        print(f"{order}: {answer}")
+        print(f"{order}: {answer} ({verb.UNVERIFIED})")
         sys.exit(0 if answer == "done" else USER_ERROR)
 
 
