@@ -1,4 +1,5 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
+#   make help                   this list
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make soak                   a record of 10^8 bank samples
@@ -10,6 +11,9 @@
 #   make firmware [TARGET=...] [CFLAGS=...] [ACCEPT=1]   build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above its budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
+#   make setup                  the set-up alone
+#   make lock [UPGRADE=1 | UPGRADE=name]   versions and hashes of the Python packages, from the names in tools/pyproject.toml
+#   make clean                  removes what was made, but for .venv
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
 PYTHON ?= python3
@@ -27,9 +31,12 @@ export RECORDING
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python lock run posix test soak tolerances emulate c-tests check clean
+.PHONY: all help setup system python lock run posix test soak tolerances emulate c-tests check clean
 
 all: setup
+
+help:
+	@sed -n 's/^#   //p; /^# Settings/s/^# //p' Makefile
 
 # ------------------------------------------------------------------------------------------------------------- set-up
 

@@ -58,6 +58,17 @@ def test_a_name_like_an_option_is_a_file() -> None:
     assert "--help.npz" in done.stderr and "Traceback" not in done.stderr
 
 
+def test_help_names_what_the_documents_call() -> None:
+    """`make help` has every goal that README, GUIDE and CONTRIBUTING tell the reader to type."""
+    said = make("help").stdout
+    listed = set(re.findall(r"^make ([a-z]+)", said, re.MULTILINE))
+    documents = "".join((ROOT / name).read_text() for name in ("README.md", "GUIDE.md", "CONTRIBUTING.md"))
+    called = set(re.findall(r"(?:`|^ {4})make ([a-z]+)", documents, re.MULTILINE))
+    assert called <= listed
+    assert {"run", "test", "firmware", "lock"} <= listed
+    assert "Settings: PYTHON" in said
+
+
 # ------------------------------------------------------------------------------------------------------------- set-up
 
 FAKE_PYTHON = """#!/bin/sh
