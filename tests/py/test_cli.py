@@ -14,6 +14,7 @@ import selfcal
 
 from conftest import ROOT
 
+DEFAULT = ROOT / "tools" / "selfcal" / "models" / "default.yaml"
 COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
 
 
@@ -46,6 +47,20 @@ def test_help() -> None:
     for verb in selfcal.VERBS:
         assert re.search(rf"^  {verb} ", done.stdout, re.MULTILINE)
         assert run(verb, "--help").returncode == 0
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_can_be_installed(shell: str, tmp_path: Path) -> None:
+    """Into the user's own files, from within that shell; and the shell is then told the verbs."""
+    home = os.environ | {"HOME": str(tmp_path), "SHELL": f"/bin/{shell}"}
+    install = [*COMMAND, "--install-completion", shell]
+    done = subprocess.run(install, capture_output=True, text=True, env=home, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [path for path in tmp_path.rglob("*") if path.is_file() and "SELFCAL_COMPLETE" in path.read_text()]
+    if shell == "bash":
+        asked = home | {"_SELFCAL_COMPLETE": "complete_bash", "COMP_WORDS": "selfcal id", "COMP_CWORD": "1"}
+        done = subprocess.run(COMMAND, capture_output=True, text=True, env=asked, check=False)
+        assert done.stdout.split() == ["identify"]
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -93,14 +108,38 @@ def test_faults_are_one_line(tmp_path: Path, arguments: list[str], expected: str
     assert one_error(*arguments, cwd=tmp_path).startswith(expected)
 
 
+@pytest.mark.parametrize(
+    ("rate", "said"),
+    [
+        ("100", "100 samples at 100 Hz make a bank sample of 1 s"),
+        ("819.2", "819 samples at 819.2 Hz make a bank sample of 0.9997559 s"),
+        ("0.5", "1 sample at 0.5 Hz makes a bank sample of 2 s"),
+    ],
+)
+def test_codegen_says_what_its_tables_assume(rate: str, said: str, tmp_path: Path) -> None:
+    """And its header has the rate for the preprocessor to check. (819 samples are 819/819.2 s.)"""
+    done = run("codegen", str(DEFAULT), "-o", "made", "--rate", rate, cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout == f"made: {said}\n"
+    header = (tmp_path / "made" / "selfcal_model.h").read_text()
+    assert f"#define SELFCAL_MODEL_RATE_MILLIHZ {float(rate) * 1000:.0f}UL" in header
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "nan", "1e9"])
+def test_codegen_of_no_rate(rate: str, tmp_path: Path) -> None:
+    said = one_error("codegen", str(DEFAULT), "-o", "made", "--rate", rate, cwd=tmp_path)
+    assert f"the sampling rate, {float(rate):g} Hz, is outside 1e-06 to 1e+06 Hz" in said
+    assert not (tmp_path / "made").exists()
+
+
 def test_a_gate_that_codegen_leaves_out_is_named(tmp_path: Path) -> None:
     """It works on windows of two samples or more within a bank interval."""
-    text = (ROOT / "tools" / "selfcal" / "models" / "default.yaml").read_text()
+    text = DEFAULT.read_text()
     complaint = "model.yaml: `gate` is left out: a bank interval is one sample"
     for bank_hz, said, gate in ((819.2, complaint, 0), (409.6, "", 1)):
         (tmp_path / "model.yaml").write_text(text.replace("bank_rate_hz: 1.0", f"bank_rate_hz: {bank_hz}"))
         done = run("codegen", "model.yaml", "-o", "made", cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (0, "")
+        assert done.returncode == 0
         assert done.stderr.startswith(said)
         assert done.stderr.count("\n") == 1 - gate
         assert f"#define SELFCAL_MODEL_GATE {gate}\n" in (tmp_path / "made" / "selfcal_model.h").read_text()

@@ -15,7 +15,6 @@ from selfcal.errors import UserError
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -274,7 +273,7 @@ def command(
         print(verb.build_flag(verb.read_key(key)))
     else:
         answer = verb.command(order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate)
-        print(f"{order}: {answer}")
+        print(f"{order}: {answer} ({verb.UNVERIFIED})")
         sys.exit(0 if answer == "done" else USER_ERROR)
 
 
@@ -298,11 +297,14 @@ def codegen(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],
     target: Annotated[str, typer.Option(help="Whose node counts of the model file")] = "host",
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the samples that are fed; default: the sensor's")
+    ] = None,
 ) -> None:
     """Write the C model tables for the firmware."""
     from selfcal.verbs import codegen as verb
 
-    verb.codegen(model, output, target=target)
+    print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate))}")
 
 
 def _fail(message: str) -> NoReturn:

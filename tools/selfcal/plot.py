@@ -52,7 +52,7 @@ def plot_run(
         sharex=True,
         layout="constrained",
     )
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     for row, axis in zip(grid, axes, strict=True):
         reports = history[axis]
         time = np.array([report.time_s for report in reports])

@@ -19,6 +19,8 @@ CHALLENGE = "challenge"
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
 #: s after a challenge or a wrong tag within which a module gives no other.
 PAUSE_S = 1.0
+#: Of every answer: whoever is on the wire can give it.
+UNVERIFIED = "unverified: an answer has a checksum, but no tag"
 #: Orders that go to no module.
 OWN_ORDERS = ("new-key", "build-flag")
 _MASK = 2**64 - 1
@@ -128,7 +130,7 @@ def argument_of(order: str, value: str | None) -> int:
 def command(
     order: str, value: str | None, *, key_file: Path | str, interface: str, channel: str, bitrate: int | None = None
 ) -> str:
-    """Have a module do `order`; returns its answer, the name of a result in the DBC.
+    """Have a module do `order`; returns its answer, the name of a result in the DBC. Nothing proves who gave it.
 
     Raises UserError for an order or argument that does not exist, a key that cannot be read, a channel that is not
     named or cannot be opened, or no answer.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import math
+import os
 import re
 import shutil
 import socket
@@ -42,6 +43,9 @@ TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
 #: s without a frame from an emulated module: its reports are slow, and so may the machine be.
 EMULATED_TIMEOUT_S = 600.0
+#: What a firmware is made of, and variables of the environment that its `make` file takes.
+SOURCES = (".c", ".h", ".ld", ".mk")
+BUILD_SETTINGS = ("CC", "POSIX_CFLAGS", "QEMU_CFLAGS")
 PLOT_FORMATS = (".png", ".pdf", ".svg", ".jpg")
 
 
@@ -135,34 +139,57 @@ def replay(
 
 
 def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host", nodes: str | None = None) -> Path:
-    """The firmware of a target for a model, a sampling rate and a choice of axes; made anew only if something changed.
+    """The firmware of a target for a model, a sampling rate and a choice of axes; made only if it is not there.
 
-    `nodes`: whose node counts it gets (default: the target's own).
+    `nodes`: whose node counts it gets (default: the target's own). Its folder is named by the content of all that it
+    is made of, and appears whole or not at all. Raises UserError if it cannot be made.
     """
-    core = nodes or target
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
-        made = Path(name)
-        write_tables(model, make_tables(model, rate_hz, tuple(axes), core), made)
-        digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(made.iterdir()))).hexdigest()[:12]
-        folder = ROOT / "build" / made_by.make / (digest if target == "host" else f"{target}-{digest}")
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("w") as lock:
+        tables = Path(name)
+        write_tables(model, make_tables(model, rate_hz, tuple(axes), nodes or target), tables)
+        key = _content(tables, made_by.make)
+        folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with folder.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            for file in made.iterdir():
-                if not (folder / file.name).exists():
-                    shutil.copy(file, folder)
-            makefile = f"port/{made_by.make}/{made_by.make}.mk"
-            command = ["make", "-s", "-f", makefile, made_by.make, f"MODEL_DIR={folder}", f"OUT={folder}"]
-            try:
-                done = subprocess.run(
-                    [*command, f"CORE={target}"], cwd=ROOT, capture_output=True, text=True, check=False
-                )
-            except OSError as error:
-                raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
-            if done.returncode != 0:
-                raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
+            if not folder.is_dir():
+                part = folder.with_suffix(".part")
+                shutil.rmtree(part, ignore_errors=True)  # a build that was killed leaves it
+                try:
+                    shutil.copytree(tables, part)
+                    _make(made_by.make, target, part.relative_to(ROOT))
+                    part.rename(folder)
+                except BaseException:
+                    shutil.rmtree(part, ignore_errors=True)
+                    raise
     return folder / made_by.image
+
+
+def _content(tables: Path, name: str) -> str:
+    """Names what a firmware is made of: its tables, every source, and settings that its `make` file takes."""
+    folders = [ROOT / "lib", ROOT / "port", *(ROOT / "port" / part for part in ("app", "replay", name)), tables]
+    files = [file for folder in folders for file in sorted(folder.glob("*.*")) if file.suffix in SOURCES]
+    said = hashlib.sha256(repr([os.environ.get(setting) for setting in BUILD_SETTINGS]).encode())
+    for file in files:
+        said.update(f"\0{file.name}\0".encode())
+        said.update(hashlib.sha256(file.read_bytes()).digest())
+    return said.hexdigest()[:16]
+
+
+def _make(name: str, target: str, folder: Path) -> None:
+    """Make a firmware in `folder`, which is relative to ROOT: a checkout's own path may hold spaces."""
+    command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
+    # Of a `make` around this program nothing is passed on: neither its options nor its variables.
+    environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
+    try:
+        done = subprocess.run(
+            [*command, f"CORE={target}"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        )
+    except OSError as error:
+        raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
+    if done.returncode != 0:
+        raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
 
 
 def _complaint(said: str) -> str:
