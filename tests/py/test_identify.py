@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.blocks import REPORT_MIN, block_means
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import NODES, PLAIN, Model, Prior
 from selfcal.recording import save
+from selfcal.table import show
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import REPORT_MIN, block_means, identify, show
+from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import shared_recording, worst_difference

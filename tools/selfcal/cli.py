@@ -110,6 +110,7 @@ def identify(
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import identify as verb
 
     result = verb.identify(
@@ -125,7 +126,7 @@ def identify(
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
-    verb.show(result)
+    show(result)
 
 
 @app.command()
@@ -166,8 +167,8 @@ def replay(
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import replay as verb
-    from selfcal.verbs.identify import show
 
     result = verb.replay(
         log,

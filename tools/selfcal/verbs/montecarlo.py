@@ -22,10 +22,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from selfcal.document import write_json
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Group, Model, Prior
+from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import TABLE_WIDTH, write_json
 
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.

@@ -19,22 +19,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from selfcal.blocks import usable_blocks
+from selfcal.checks import innovation_checks
+from selfcal.document import Identified, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
 from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.result import in_unit
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import write_tables
-from selfcal.verbs.identify import (
-    Identified,
-    chosen_axes,
-    in_unit,
-    innovation_checks,
-    to_document,
-    usable_blocks,
-    write_json,
-)
+from selfcal.verbs.identify import chosen_axes
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
