@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,19 @@ def usable_blocks(
     return blocks
 
 
+def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:
+    """Which of `samples` [n] are not used, by reason."""
+    finite = np.isfinite(samples)
+    limit = np.float32(group.range) if group.range > 0.0 else np.inf
+    saturated = finite & (np.abs(samples) >= limit)
+    stuck = np.zeros(samples.size, bool)
+    if group.stuck_limit > 0:
+        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
+        run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
+        stuck = finite & (run >= group.stuck_limit)
+    return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
+
+
 def block_means(
     samples: NDArray[np.float64],
     missing_before: NDArray[np.int64],
@@ -67,21 +81,9 @@ def block_means(
 ) -> Blocks:
     """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
     `columns` [n, p] of the regressors are averaged over the same samples."""
-    finite = np.isfinite(samples)
-    limit = np.float32(group.range) if group.range > 0.0 else np.inf
-    saturated = finite & (np.abs(samples) >= limit)
-    stuck = np.zeros(samples.size, bool)
-    if group.stuck_limit > 0:
-        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
-        run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
-        stuck = finite & (run >= group.stuck_limit)
-    usable = finite & ~saturated & ~stuck
-    kept_out = {
-        "missing": int(missing_before.sum()),
-        "not_finite": int((~finite).sum()),
-        "saturated": int(saturated.sum()),
-        "stuck": int(stuck.sum()),
-    }
+    reasons = kept_out(samples, group)
+    usable = ~np.logical_or.reduce(list(reasons.values()))
+    counts = {"missing": int(missing_before.sum()), **{what: int(mask.sum()) for what, mask in reasons.items()}}
     at = np.arange(samples.size) + np.cumsum(missing_before)
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
@@ -104,4 +106,4 @@ def block_means(
     squares = float(((values - raw[index])[good] ** 2).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within, kept_out, z[first:])
+    return Blocks(mean[first:], r[first:], within, counts, z[first:])

@@ -46,7 +46,7 @@ def _kind(document: Mapping[str, Any], unit: str) -> Kind:
     found = {
         name: axis
         for name, axis in document["axes"].items()
-        if units.same_kind(axis["bias_now"]["unit"], unit)
+        if "error" not in axis and units.same_kind(axis["bias_now"]["unit"], unit)
     }
     if not found:
         what = "gyro" if unit == "rad/s" else "accelerometer"

@@ -51,6 +51,11 @@ class AxisResult:
     bias_sd: float
     coefficients: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
+    @property
+    def best(self) -> str:
+        """The most probable law."""
+        return max(self.probability, key=lambda name: self.probability[name])
+
 
 def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
     """The result in `to` instead of `unit`: every number but alpha and the ratios, and the evidence, as a density per

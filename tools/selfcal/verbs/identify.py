@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
 from selfcal import _library32
-from selfcal.blocks import MOST_DENSE, usable_blocks
-from selfcal.checks import innovation_checks
-from selfcal.document import Identified, to_document, write_json
+from selfcal.allan import Sampled, sample_lengths, sampled
+from selfcal.blocks import MOST_DENSE, kept_out, usable_blocks
+from selfcal.checks import coefficients_of, judge
+from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import Model
+from selfcal.plot import check_picture
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult, in_unit
@@ -33,6 +36,8 @@ def identify(
     engine: str = "library",
     decimate: float | None = None,
     json: Path | str | None = None,
+    plot: Path | str | None = None,
+    datasheet: bool = False,
     export: tuple[str, Path | str] | None = None,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
@@ -44,9 +49,14 @@ def identify(
     `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU,
     by 16-bit products) or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
     `decimate`: rate of the block means in Hz, else the model's.
+    `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
     `export`: a format of `selfcal.export` and the file to write.
-    Numbers are in the recording's units. Raises UserError for what the user can put right.
+    Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
+    UserError for what the user can put right, and if no axis has a result.
     """
+    check_writable(json, plot, None if export is None else export[1])
+    if plot is not None:
+        check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if engine not in ("library", "reference", "fixed"):
@@ -56,7 +66,7 @@ def identify(
     loaded_model = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
-    found: dict[str, Identified] = {}
+    found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         subsets = sum(len(choices_of(offered(loaded_model, name))) for name in names)
@@ -65,15 +75,26 @@ def identify(
             progress.update(task, description=f"{name} ({engine})")
             try:
                 found[name] = identify_axis(
-                    recording, name, loaded_model, engine, decimate, lambda: progress.advance(task)
+                    recording,
+                    name,
+                    loaded_model,
+                    engine,
+                    decimate,
+                    lambda: progress.advance(task),
+                    draw=plot is not None,
                 )
             except UserError as error:
-                raise UserError(f"{recording.path}: column {name}: {error}") from error
+                found[name] = error
     document = to_document(recording, found)
     if json is not None:
         write_json(document, json)
     if export is not None:
         write_export(document, *export)
+    if plot is not None:
+        from selfcal.allan_plot import plot_allan
+
+        plot_allan(document, plot, datasheet=datasheet)
+        console.print(f"plot: {plot}", highlight=False, soft_wrap=True)
     return document
 
 
@@ -99,9 +120,11 @@ def identify_axis(
     engine: str,
     decimate: float | None,
     advance: Callable[[], object] = lambda: None,
+    *,
+    draw: bool = False,
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it. With regressors every subset of
-    them is scored; `advance` is called after each."""
+    them is scored; `advance` is called after each. `draw`: with the Allan deviation of the samples."""
     group = model.group_of(name)
     regressors = offered(model, name)
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
@@ -114,6 +137,12 @@ def identify_axis(
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
+
+    def curve_of_samples(values: NDArray[np.floating[Any]]) -> Sampled:
+        unused = np.logical_or.reduce(list(kept_out(samples, group).values()))
+        at = sample_lengths(int((~unused).sum()), tables.block)
+        return sampled(np.where(unused, np.nan, values), recording.missing_before, recording.rate_hz, at)
+
     choices = choices_of(regressors)
     results: list[AxisResult] = []
     z = blocks.z - np.array([column.reference for column in tables.regressors])
@@ -140,17 +169,20 @@ def identify_axis(
             advance()
     unit = recording.columns[name].unit
     if not regressors:
-        checks = innovation_checks(blocks, tables, group, results[0], [])
-        return Identified(unit, in_unit(results[0], group.unit, unit), checks, blocks.kept_out)
+        judged = judge(blocks, tables, group, results[0])
+        curve = curve_of_samples(samples) if draw else None
+        return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, blocks.kept_out, None, curve)
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
     inside = combine(choices, results, model.hypotheses, group.unit)
     used = _used(mask_of(regressors, choices[inside.best]))
-    checks = innovation_checks(blocks, tables, group, results[inside.best], used)
+    judged = judge(blocks, tables, group, results[inside.best], used)
+    explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
+    curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
-    return Identified(unit, scored.result, checks, blocks.kept_out, scored)
+    return Identified(unit, group.unit, scored.result, judged, blocks.kept_out, scored, curve)
 
 
 def _used(mask: int) -> list[int]:

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from selfcal.document import write_json
+from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Group, Model, Prior
 from selfcal.table import TABLE_WIDTH
@@ -61,6 +61,7 @@ def montecarlo(
     Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
     records the calculated and actual probability of false identification, with the sd of their difference.
     """
+    check_writable(json)
     loaded = Model.load(model)
     if records < 2:
         raise UserError("--records must be at least 2")
@@ -171,7 +172,7 @@ def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str
     }
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The table of calculated against actual."""
     table = Table(
         box=box.SIMPLE_HEAD,
@@ -191,7 +192,7 @@ def show(document: Mapping[str, Any]) -> None:
                 f"{p['rms_actual'] / p['rms_calculated']:.3f}",
             )
         table.add_row(law, "bias now", f"{100 * entry['bias_coverage_90']:.1f} %", end_section=True)
-    console = Console()
+    console = Console(stderr=to_stderr)
     console.width = max(console.width, TABLE_WIDTH)
     console.print(table)
     f = document["false_identification"]
