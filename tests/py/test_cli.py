@@ -72,6 +72,7 @@ def test_verbs_are_functions() -> None:
         (["identify", "log.csv", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
         (["identify", "log.csv", "--json", "."], ".: cannot write: it is a folder"),
         (["identify", "log.csv", "--plot", "out.xls"], "out.xls: a plot is one of .png, .pdf, .svg, .jpg"),
+        (["identify", "log.csv", "--overbound", "0.9"], "--overbound is for --export FORMAT FILE"),
         (["identify", "log.csv", "--units", "metric"], "Invalid value for '--units': 'metric' is not "),
         (["montecarlo", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
         (["simulate", "m.yaml", "-o", "log.csv", "--seed", "abc"], "Invalid value for '--seed': must be a whole"),

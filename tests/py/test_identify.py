@@ -220,7 +220,7 @@ def test_an_axis_without_a_result_leaves_the_others(tmp_path: Path, capsys: pyte
     alone = identify(log, axes=["gy"])["axes"]["gy"]
     assert document["axes"]["gy"]["hypotheses"] == alone["hypotheses"]
     assert json.loads((tmp_path / "out.json").read_text())["axes"]["gx"] == document["axes"]["gx"]
-    assert "N gy" in (tmp_path / "k.yaml").read_text()
+    assert "gyro: axes gy;" in (tmp_path / "k.yaml").read_text()
     show(document)
     said = capsys.readouterr().out
     assert re.search(r"^no result: gx: all 500 averages are equal .*; choose axes with --axis$", said, re.MULTILINE)

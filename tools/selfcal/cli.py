@@ -117,6 +117,12 @@ def identify(
         tuple[str, Path] | None,
         typer.Option(metavar="FORMAT FILE", help="Write noise parameters for kalibr, rotors, px4, orbslam3 or vins"),
     ] = None,
+    overbound: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="Export white noise and walk above the recording's Allan deviation, at P (0.95)"
+        ),
+    ] = None,
     rate: Rate = None,
     column: Column = None,
     unit: Unit = None,
@@ -137,6 +143,7 @@ def identify(
         plot=plot,
         datasheet=table_units is Units.datasheet,
         export=export,
+        overbound=overbound,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),

@@ -27,6 +27,9 @@ from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult, in_unit
 from selfcal.tables import make_tables
 
+#: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
+LARGEST_OVERBOUND = 0.99999
+
 
 def identify(
     log: Path | str,
@@ -39,6 +42,7 @@ def identify(
     plot: Path | str | None = None,
     datasheet: bool = False,
     export: tuple[str, Path | str] | None = None,
+    overbound: float | None = None,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -59,6 +63,10 @@ def identify(
         check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
+    if overbound is not None and export is None:
+        raise UserError("--overbound is for --export FORMAT FILE: give that too")
+    if overbound is not None and not 0.5 <= overbound <= LARGEST_OVERBOUND:
+        raise UserError(f"--overbound must be 0.5 to {LARGEST_OVERBOUND:g}, not {overbound:g}")
     if engine not in ("library", "reference", "fixed"):
         raise UserError(f"there is no engine '{engine}' (library, reference, fixed)")
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
@@ -89,7 +97,7 @@ def identify(
     if json is not None:
         write_json(document, json)
     if export is not None:
-        write_export(document, *export)
+        write_export(document, *export, overbound)
     if plot is not None:
         from selfcal.allan_plot import plot_allan
 
