@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from selfcal.engines.reference import textbook_node
 from selfcal.model import LAWS, Group
@@ -127,8 +128,9 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
     if whole.all():
         pairs = count - np.arange(lags, dtype=float)
     else:
-        power = np.abs(np.fft.rfft(whole, 2 * whole.size)) ** 2
-        pairs = np.rint(np.fft.irfft(power))[:lags]
+        size = fft.next_fast_len(whole.size + lags, real=True)
+        power = np.abs(fft.rfft(whole.astype(np.float32), size)) ** 2
+        pairs = fft.irfft(power, size)[:lags].astype(float)
     square = terms.covariance(m, lags) ** 2
     return float((2.0 * (pairs @ square) - pairs[0] * square[0]) * 2.0 / (count**2 * square[0]))
 
