@@ -235,28 +235,31 @@ def curve_of(
     *,
     white: float = 1.0,
     half_life_s: float = 0.0,
-) -> Curve:
-    """Readings `y` every `dt_s` (NaN: missing) beside `law` at its posterior medians.
+) -> Curve | None:
+    """Readings `y` every `dt_s` (NaN: missing) beside `law` at its posterior medians; None if there are too few.
 
     The record has also determined the parameters, so the two are nearer to each other than a record is to a curve known
     beforehand. With a the logarithm of the record's Allan variance, S its variance about the true curve, and V the
     posterior variance of the model's curve: how far the true curve is from the posterior's mean is independent of the
     record, so S = Var(a - mean curve) + V, and the difference has the variance S - V.
     """
-    y = y - float(np.nanmean(y))
+    # With forgetting the posterior rests on the last readings. Its sums, weighted by e^(-age / w), have the variance of
+    # 2 w readings and 1 - e^-2 of their weight on the last 2 w: Var = S + V - 2 (1 - e^-2) V.
+    memory, known = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
+    if 0 < memory < y.size:
+        y, known = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
+    if n < 2 * LONGEST:
+        return None
+    y = y - float(np.nanmean(y))
     found = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
     found = [entry for entry in found if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
     m = np.array([entry[0] for entry in found], float)
     recorded = np.array([entry[1] for entry in found])
     medians = {name: estimate.median for name, estimate in estimates.items()}
     fit = fit_of(law, medians, group, dt_s, n, m, white)
-    variance = fit.variance
     own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in found])
-    # With forgetting the posterior rests on the last readings: its weighted sums have the variance of so many.
-    memory = 2.0 * half_life_s / math.log(2.0) / dt_s
-    posterior = fit_of(law, medians, group, dt_s, memory, m, white).variance if 0.0 < memory < n else variance
-    left = np.maximum(own + posterior - 2.0 * variance, _LEAST_LEFT * own)
+    left = np.maximum(own - known * fit.variance, _LEAST_LEFT * own)
     ratio = recorded / fit.allan_variance
     low, high = _band(law, estimates, fit, group, dt_s, m, white)
     return Curve(

@@ -52,7 +52,7 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
         half_life_s=tables.half_life_s,
     )
     checks = innovation_checks(blocks, tables, group, result, list(used))
-    return Judged({**checks, **allan_checks(curve)}, curve)
+    return Judged({**checks, **(allan_checks(curve) if curve else {})}, curve)
 
 
 def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
