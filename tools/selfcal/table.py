@@ -95,7 +95,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
     for line in (*kept, *failed):
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, markup=False)
 
 
 def _regressor_table(axes: Mapping[str, Any]) -> Table:

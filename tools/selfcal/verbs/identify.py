@@ -102,7 +102,7 @@ def identify(
         from selfcal.allan_plot import plot_allan
 
         plot_allan(document, plot, datasheet=datasheet)
-        console.print(f"plot: {plot}", highlight=False, soft_wrap=True)
+        console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
     return document
 
 
