@@ -1,5 +1,6 @@
 """The command: every fault of the user is one line on stderr and exit code 2, whatever raised it."""
 
+import json
 import os
 import re
 import signal
@@ -87,8 +88,17 @@ def test_verbs_are_functions() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["nonsense"], "No such command 'nonsense'."),
-        (["identify"], "Missing argument 'LOG'."),
+        (["nonsense"], "No such command 'nonsense'; see `selfcal --help`"),
+        (["identify"], "Missing argument 'LOG' (Recording: .csv, .csv.gz or .npz); see `selfcal identify --help`"),
+        (["identify", "."], ".: is a folder: name a recording in it (.csv, .csv.gz or .npz)"),
+        (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),
+        (["identify", "log.csv", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
+        (["identify", "log.csv", "--json", "."], ".: cannot write: it is a folder"),
+        (["identify", "log.csv", "--plot", "out.xls"], "out.xls: a plot is one of .png, .pdf, .svg, .jpg"),
+        (["identify", "log.csv", "--overbound", "0.9"], "--overbound is for --export FORMAT FILE"),
+        (["identify", "log.csv", "--units", "metric"], "Invalid value for '--units': 'metric' is not "),
+        (["montecarlo", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
+        (["simulate", "m.yaml", "-o", "log.csv", "--seed", "abc"], "Invalid value for '--seed': must be a whole"),
         (["identify", "log.csv", "--rate", "fast"], "Invalid value for '--rate'"),
         (["identify", "log.csv", "--engine", "steam"], "Invalid value for '--engine'"),
         (["identify", "log.csv", "--unit", "rad/s"], "--unit takes NAME=VALUE, not 'rad/s'"),
@@ -99,7 +109,7 @@ def test_verbs_are_functions() -> None:
         (["identify", "log.csv", "--model", "absent.yaml"], "absent.yaml: "),
         (["simulate", "absent.yaml", "-o", "log.csv"], "absent.yaml: "),
         (["codegen", "absent.yaml", "-o", "."], "absent.yaml: "),
-        (["monitor"], "Missing option '--channel'."),
+        (["monitor"], "Missing option '--channel'"),
         (["monitor", "--channel", "/dev/absent"], ""),
     ],
 )
@@ -130,6 +140,17 @@ def test_codegen_of_no_rate(rate: str, tmp_path: Path) -> None:
     said = one_error("codegen", str(DEFAULT), "-o", "made", "--rate", rate, cwd=tmp_path)
     assert f"the sampling rate, {float(rate):g} Hz, is outside 1e-06 to 1e+06 Hz" in said
     assert not (tmp_path / "made").exists()
+
+
+def test_json_on_stdout_is_nothing_else(tmp_path: Path) -> None:
+    """A program reads stdout; the tables go to stderr."""
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + "".join(f"{k},{0.1 * (k * 7 % 5)}\n" for k in range(60)))
+    for verb in (["identify", "log.csv"], ["montecarlo", "--records", "2", "--duration", "20"]):
+        done = run(*verb, "--json", "-", cwd=tmp_path)
+        assert done.returncode == 0, done
+        assert json.loads(done.stdout)["schema"] == f"selfcal.{verb[0]}/1"
+        assert "─" in done.stderr
+        assert run(*verb, cwd=tmp_path).stdout.count("─") > 20
 
 
 def test_a_gate_that_codegen_leaves_out_is_named(tmp_path: Path) -> None:

@@ -49,6 +49,13 @@ class Engine(StrEnum):
     fixed = "fixed"
 
 
+class Units(StrEnum):
+    """What a table is in."""
+
+    recording = "recording"
+    datasheet = "datasheet"
+
+
 class Target(StrEnum):
     """Where the firmware runs."""
 
@@ -98,9 +105,22 @@ def identify(
         float | None, typer.Option(metavar="HZ", help="Rate of the block means instead of the model file's")
     ] = None,
     json: Json = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Save the Allan deviations beside the model's (.png .pdf .svg)")
+    ] = None,
+    table_units: Annotated[
+        Units,
+        typer.Option("--units", help="Of table and plot: the recording's, or deg/sqrt(h), deg/h, ug as data sheets"),
+    ] = Units.recording,
     export: Annotated[
         tuple[str, Path] | None,
         typer.Option(metavar="FORMAT FILE", help="Write noise parameters for kalibr, rotors, px4, orbslam3 or vins"),
+    ] = None,
+    overbound: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="Export white noise and walk above the recording's Allan deviation, at P (0.95)"
+        ),
     ] = None,
     rate: Rate = None,
     column: Column = None,
@@ -109,6 +129,7 @@ def identify(
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import identify as verb
 
     result = verb.identify(
@@ -118,13 +139,16 @@ def identify(
         engine=engine.value,
         decimate=decimate,
         json=json,
+        plot=plot,
+        datasheet=table_units is Units.datasheet,
         export=export,
+        overbound=overbound,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
-    verb.show(result)
+    show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
 
 
 @app.command()
@@ -211,8 +235,8 @@ def replay(
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import replay as verb
-    from selfcal.verbs.identify import show
 
     result = verb.replay(
         log,
@@ -229,7 +253,7 @@ def replay(
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
-    show(result)
+    show(result, to_stderr=str(json) == "-")
 
 
 @app.command()
@@ -289,7 +313,8 @@ def montecarlo(
     """Simulate records with parameters drawn from the prior and compare stated with actual errors."""
     from selfcal.verbs import montecarlo as verb
 
-    verb.show(verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json))
+    result = verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json)
+    verb.show(result, to_stderr=str(json) == "-")
 
 
 @app.command()
@@ -307,6 +332,26 @@ def codegen(
     print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate))}")
 
 
+#: What typer says of a wrong value, and what a person reads.
+_PLAINER = {
+    "Value error, ": "",
+    "Input should be a valid integer, unable to parse string as an integer": "must be a whole number",
+    "Input should be a valid number, unable to parse string as a number": "must be a number",
+    "Input should be": "must be",
+}
+
+
+def _usage(error: TyperException) -> str:
+    """One line of a wrong use: what is wrong, what is wanted there, and where to read on."""
+    said = error.format_message().rstrip(".")
+    for theirs, ours in _PLAINER.items():
+        said = said.replace(theirs, ours)
+    wanted = getattr(getattr(error, "param", None), "help", None) if said.startswith("Missing") else None
+    context = getattr(error, "ctx", None)
+    verb = f" {context.info_name}" if context is not None and context.parent is not None else ""
+    return f"{said}{f' ({wanted})' if wanted else ''}; see `selfcal{verb} --help`"
+
+
 def _fail(message: str) -> NoReturn:
     print(f"selfcal: error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(USER_ERROR)
@@ -319,7 +364,7 @@ def main() -> NoReturn:
     except UserError as error:
         _fail(str(error))
     except TyperException as error:
-        _fail(error.format_message())
+        _fail(_usage(error))
     except (typer.Abort, KeyboardInterrupt):
         sys.exit(130)
     except BrokenPipeError:  # the reader of our output has gone, as in `| head`

@@ -27,6 +27,14 @@ PANELS = {
     "sigma_m": ("gauss_markov",),
     "alpha": ("gauss_markov",),
 }
+#: What a picture's name may end in.
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def check_picture(path: Path | str) -> None:
+    """Raise UserError for a file name that is no picture's."""
+    if Path(path).suffix not in PICTURES:
+        raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
 def plot_run(

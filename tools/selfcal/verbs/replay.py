@@ -20,22 +20,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from selfcal.blocks import usable_blocks
+from selfcal.checks import Judged, judge
+from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
-from selfcal.plot import plot_run
+from selfcal.plot import check_picture, plot_run
 from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.result import in_unit
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import write_tables
-from selfcal.verbs.identify import (
-    Identified,
-    chosen_axes,
-    in_unit,
-    innovation_checks,
-    to_document,
-    usable_blocks,
-    write_json,
-)
+from selfcal.verbs.identify import chosen_axes
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
@@ -101,11 +97,9 @@ def replay(
         raise UserError(f"--transport {transport}: this build has the transport slcan only")
     if report_every is not None and not 0.001 <= report_every <= LONGEST_PERIOD_S:
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
-    if plot is not None and Path(plot).suffix not in PLOT_FORMATS:
-        raise UserError(f"{plot}: a plot is one of {', '.join(PLOT_FORMATS)}")
-    for file in (json, plot):
-        if file is not None and not Path(file).parent.is_dir():
-            raise UserError(f"{file}: cannot write: there is no such folder")
+    if plot is not None:
+        check_picture(plot)
+    check_writable(json, plot)
     loaded_model = Model.load(model)
     if loaded_model.regressors:
         raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
@@ -346,15 +340,15 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
 def _document(
     recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], gate: bool
 ) -> dict[str, Any]:
-    found = {}
+    found: dict[str, Identified | UserError] = {}
     for name, reports in history.items():
         try:
             found[name] = _identified(recording, model, name, reports, gate)
         except UserError as error:
-            raise UserError(f"{recording.path}: column {name}: {error}") from error
+            found[name] = error
     document = to_document(recording, found)
     if gate:
-        for axis in document["axes"].values():
+        for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
     return document
 
@@ -373,5 +367,5 @@ def _identified(
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
-    checks = {} if gate else innovation_checks(blocks, tables, group, result, [])
-    return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
+    judged = Judged({}, None) if gate else judge(blocks, tables, group, result)
+    return Identified(unit, group.unit, in_unit(result, group.unit, unit), judged, blocks.kept_out)
