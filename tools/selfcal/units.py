@@ -159,3 +159,8 @@ def parameter_unit(parameter: str, unit: str) -> str:
         case "spectral_ratio" | "markov_ratio":
             return "1"
     raise ValueError(f"no such parameter: {parameter}")
+
+
+def typeset(unit: str) -> str:
+    """A unit as it is written by hand: deg/s^2/sqrt(Hz) is deg/s²/√Hz."""
+    return unit.replace("sqrt(Hz)", "√Hz").replace("^2", "²").replace("^3", "³")
