@@ -319,7 +319,9 @@ def main() -> NoReturn:
     except (typer.Abort, KeyboardInterrupt) as error:
         ended = error.__cause__ if isinstance(error, typer.Abort) else error
         sys.exit(128 + (ended.number if isinstance(ended, Ended) else signal.SIGINT))
-    except BrokenPipeError:  # the reader of our output has gone, as in `| head`
+    except (BrokenPipeError, SystemExit) as error:  # the reader of our output has gone, as in `| head`
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise  # typer turns the others into one
         for stream in (sys.stdout, sys.stderr):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         sys.exit(0)

@@ -162,7 +162,8 @@ class View:
         if contact is not None and contact.lost and not self._decoder.finished:
             word = "lost contact: no word" if contact.ever else "no word"
             return Text(f"{word} for {contact.silent_s:.0f} s", "bold red")
-        return Text(said, "bold")
+        end = contact is None and self._total_s is None and self._source.closed
+        return Text(f"{said}, end of the log" if end else said, "bold")
 
     def _now(self) -> float:
         """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
@@ -196,7 +197,7 @@ class View:
             age_s = max(0.0, self._time_s - report.time_s)
             age_s += self._contact.silent_s if self._contact is not None else 0.0
             best = most_probable(report)
-            head = Text(f"{axis:<4}{_number(report, 'count', '%.0f'):>8}")
+            head = Text(f"{axis:<5}{_number(report, 'count', '%.0f'):>8}")
             for law in laws:
                 head.append("  ").append(_bar(report, law, cells), "bold green" if law == best else "")
             head.append(f"{age_s:.0f} s".rjust(7), "dim")
@@ -227,12 +228,12 @@ def most_probable(report: AxisReport) -> str | None:
 
 
 def _bar_cells(laws: Sequence[str], width: int) -> int:
-    return min(BAR[1], max(BAR[0], (width - 19) // len(laws) - 8))
+    return min(BAR[1], max(BAR[0], (width - 20) // len(laws) - 8))
 
 
 def _heading(laws: Sequence[str], cells: int) -> Text:
     named = "  ".join(f"{'P ' + SHORT[law]:<{6 + cells}}" for law in laws)
-    return Text(f"axis{'averages':>8}  {named}{'age':>7}", "dim")
+    return Text(f"axis {'averages':>8}  {named}{'age':>7}", "dim")
 
 
 def _fitted(blocks: list[list[Text]], height: int | None) -> list[Text]:
@@ -301,7 +302,7 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
         " " if not math.isfinite(value) else BLOCKS[min(7, max(0, int(8.0 * ((value - middle) / span + 0.5))))]
         for value in shown
     )
-    return "".join(heights).rjust(cells)
+    return "".join(heights).ljust(cells)
 
 
 def _parameters(report: AxisReport) -> list[str]:

@@ -7,6 +7,7 @@ missing stays incomplete: it is never filled up with older values.
 from __future__ import annotations
 
 import errno
+import logging
 import math
 import os
 import time
@@ -351,17 +352,11 @@ def _possible(message: str, signal: str, value: float) -> bool:
     In axis messages a value that is not a number says that the module has none. A law without any evidence has minus
     infinity; a hair beyond 1 is a probability's rounding in float32.
     """
-    if message not in (axis.upper() for axis in AXES):
-        return math.isfinite(value) and not (signal.startswith("sd_") and value < 0.0)
     if math.isnan(value):
-        return True
+        return message.lower() in AXES
     if signal.endswith("_probability"):
         return 0.0 <= value <= 1.0 + 1e-6
-    if signal == "ln_evidence":
-        return value < math.inf
-    if signal == "bias_sd" or (signal.endswith(STATISTICS) and signal != "bias_mean"):
-        return 0.0 <= value < math.inf
-    return math.isfinite(value)
+    return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)
 
 
 def _report(report: _Open, *, complete: bool) -> AxisReport:
@@ -477,6 +472,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> Link:
     takes. Raises UserError when that fails."""
     import can
 
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # what its drivers lack is told by their errors
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise UserError(f"--interface {interface}: python-can has no such interface (there are {known})")
@@ -488,8 +484,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
     from can.interfaces.slcan import slcanBus
     from can.interfaces.udp_multicast import UdpMulticastBus
 
-    if interface == "slcan":
-        _check_port(channel)
+    if interface in ("slcan", "serial"):
+        _check_port(interface, channel)
     try:
         bus = can.Bus(interface=interface, channel=channel, **options)
     except Exception as error:  # python-can's drivers raise what the libraries below them raise
@@ -510,20 +506,23 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
     return bus
 
 
-def _check_port(channel: str) -> None:
-    """Raises UserError if a channel of interface slcan can be no serial port; a URL of pyserial's may be one."""
+def _check_port(interface: str, channel: str) -> None:
+    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be one."""
     if "://" in channel:
         return
-    path = Path(channel.split("@")[0])
-    if not channel or not path.exists():
-        raise UserError(f"slcan {channel}: there is no such port ({_ports()})")
+    name, _, baud = channel.partition("@")
+    path = Path(name)
+    if baud and not baud.isdecimal():
+        raise UserError(f"{interface} {channel}: after the @ stands the line's rate, bit/s: {name}@115200")
+    if not name or not path.exists():
+        raise UserError(f"{interface} {channel}: there is no such port ({serial_ports()})")
     if not path.is_char_device():
         kind = "a folder" if path.is_dir() else "a file"
-        more = f"; `selfcal monitor --read {channel}` reads a log of frames" if path.is_file() else ""
-        raise UserError(f"slcan {channel}: this is {kind}, no serial port ({_ports()}){more}")
+        more = f"; `selfcal monitor --read {name}` reads a log of frames" if path.is_file() else ""
+        raise UserError(f"{interface} {channel}: this is {kind}, no serial port ({serial_ports()}){more}")
 
 
-def _ports() -> str:
+def serial_ports() -> str:
     """The machine's serial ports, in words."""
     from serial.tools.list_ports import comports
 
@@ -558,13 +557,18 @@ def _reason(interface: str, channel: str, error: BaseException) -> str:
             return f"there is no such CAN device ({_can_devices()})"
         if number == errno.ENETDOWN:
             return f"the device is down: `ip link set {channel} up type can bitrate 500000`"
-    if interface == "udp_multicast" and number in (errno.ENODEV, errno.ENETUNREACH, errno.EADDRNOTAVAIL):
-        return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
-    if interface == "slcan":
+    if interface == "udp_multicast":
+        if number in (errno.ENODEV, errno.ENETUNREACH):
+            return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
+        if "msgpack" not in said:
+            return "this is no multicast group: take 239.74.163.2, python-can's own"
+    if interface in ("slcan", "serial"):
         if number in (errno.EACCES, errno.EPERM):
             return "no permission to open it: `sudo usermod -aG dialout $USER`, then log in anew"
-        if number in (errno.ENOTTY, errno.EINVAL):
-            return f"this is no serial port ({_ports()})"
+        if "Could not configure port" in said:
+            return f"this is no serial port ({serial_ports()})"
         if number == errno.EBUSY:
             return "another program has it open"
+    if isinstance(error, NameError | ImportError):
+        return "its driver is not installed on this machine"
     return f"cannot open: {said}"

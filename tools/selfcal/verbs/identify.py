@@ -432,14 +432,35 @@ def _finite(value: Any) -> Any:
 
 
 def show(document: Mapping[str, Any]) -> None:
-    """The table a person reads: per axis the laws, their probabilities and parameters, and the bias."""
+    """The table a person reads: per axis the laws, their probabilities and parameters, and the bias.
+
+    In a terminal that is too narrow columns lose their intervals, first that of 1/alpha, then N's, then K's.
+    """
+    console = Console()
+    for left_out in range(4):
+        table, notes = _law_table(document, left_out)
+        if not console.is_terminal or console.measure(table).minimum <= console.width:
+            break
+    if not console.is_terminal:
+        console.width = max(console.width, TABLE_WIDTH)
+    console.print(table)
+    if any("regressors" in axis for axis in document["axes"].values()):
+        console.print(_regressor_table(document))
+    for line in notes:
+        console.print(line, highlight=False)
+
+
+def _law_table(document: Mapping[str, Any], left_out: int) -> tuple[Table, list[str]]:
+    """The table without the intervals of its last `left_out` columns, and the lines below it."""
     recording = document["recording"]
+    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
     table = Table(
         box=box.SIMPLE_HEAD,
         title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s",
         title_justify="left",
-        caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it",
+        caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it"
+        + ("; a wider window shows all intervals" if left_out else ""),
         caption_justify="left",
     )
     laws = {law for axis in document["axes"].values() for law in axis["hypotheses"]}
@@ -459,9 +480,10 @@ def show(document: Mapping[str, Any]) -> None:
             table.add_row(
                 law,
                 f"{probability:.4f}",
-                _interval(parameters["N"]),
-                _interval(_first(parameters, ("K", "sigma_m", "B"))),
-                _interval(parameters.get("alpha"), inverse=True) or _interval(_first(parameters, RATIOS)),
+                _interval(parameters["N"], brief=brief["N"]),
+                _interval(_first(parameters, ("K", "sigma_m", "B")), brief=brief["K"]),
+                _interval(parameters.get("alpha"), inverse=True, brief=brief["alpha"])
+                or _interval(_first(parameters, RATIOS), brief=brief["alpha"]),
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
@@ -478,13 +500,7 @@ def show(document: Mapping[str, Any]) -> None:
         for check, outcome in axis["checks"].items():
             if not outcome["passed"]:
                 failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
-    console = Console()
-    console.width = max(console.width, TABLE_WIDTH)
-    console.print(table)
-    if any("regressors" in axis for axis in document["axes"].values()):
-        console.print(_regressor_table(document))
-    for line in (*kept, *failed):
-        console.print(line, highlight=False)
+    return table, [*kept, *failed]
 
 
 def _regressor_table(document: Mapping[str, Any]) -> Table:
@@ -515,7 +531,7 @@ def _first(parameters: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, 
     return next((parameters[name] for name in names if name in parameters), None)
 
 
-def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> str:
+def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False, brief: bool = False) -> str:
     if estimate is None:
         return ""
     low, middle, high = estimate["q05"], estimate["median"], estimate["q95"]
@@ -524,4 +540,6 @@ def _interval(estimate: Mapping[str, Any] | None, *, inverse: bool = False) -> s
     if inverse:
         low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
     mark = "" if estimate["identified"] else "~"
+    if brief:
+        return f"{mark}{middle:.3g}"
     return f"{mark}{middle:.3g} \\[{low:.3g}, {high:.3g}]"

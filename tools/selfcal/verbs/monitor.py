@@ -19,7 +19,7 @@ from selfcal.framelog import WRITTEN, FrameLog
 from selfcal.live import Contact, View
 from selfcal.plot import check_outputs, plot_run
 from selfcal.verbs.identify import Identified, to_document, write_json
-from selfcal.wire import AXES, AxisReport, Decoder, Link, Statistics, axis_unit, open_bus
+from selfcal.wire import AXES, AxisReport, Decoder, Link, Statistics, axis_unit, open_bus, serial_ports
 
 #: s without a frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s, and one
 #: that has restarted says nothing until then.
@@ -63,7 +63,9 @@ def monitor(
     import can
 
     if (channel is None) == (read is None):
-        raise UserError("--channel names the module's port, or --read a log of its frames: one of the two")
+        raise UserError(
+            f"which module? --channel names its port ({serial_ports()}), or --read a log of its frames: one of the two"
+        )
     for name in axes:
         axis_unit(name)
     if speed is not None and (read is None or not 0.0 < speed < math.inf):
