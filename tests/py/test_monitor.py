@@ -255,3 +255,71 @@ def test_view_keeps_all_axes_of_a_slow_module(monkeypatch: pytest.MonkeyPatch) -
 def test_monitor_function_raises_user_errors() -> None:
     with pytest.raises(UserError, match="there is no such port"):
         monitor(channel="/dev/no-such-device")
+
+
+# ------------------------------------------------------------------------------------------------- fitted to the window
+
+#: As the shipped recording's reports are: median, 5 % and 95 % of each parameter.
+GYRO = {"N": (0.0423, 0.0414, 0.0431), "sigma_m": (0.0169, 0.0146, 0.0201), "alpha": (0.0237, 0.0142, 0.0364)}
+ACCEL = {"N": (0.00676, 0.00643, 0.00711), "sigma_m": (0.00859, 0.00517, 0.0403), "alpha": (0.0084, 3.5e-4, 0.0278)}
+
+
+def six_axes(monkeypatch: pytest.MonkeyPatch, width: int, height: int) -> list[str]:
+    """The lines of a view of six Gauss-Markov axes, the widest kind, with health and status to tell."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("LINES", str(height))
+    decoder = Decoder()
+    decoder.status.update(state=1.0, samples=36000.0, missing=70.0, gap_count=1.0, sensor_fault=1.0, motion=1.0)
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "slcan /dev/ttyACM0", total_s=3600.0)
+        for k in range(40):
+            for axis in ("gx", "gy", "gz", "ax", "ay", "az"):
+                values = {"count": 36000.0, "bias_mean": -0.040421 + 1e-4 * k, "bias_sd": 0.0025}
+                values |= {"constant_probability": 0.0, "random_walk_probability": 0.063}
+                values |= {"gauss_markov_probability": 0.937}
+                for name, numbers in (GYRO if axis[0] == "g" else ACCEL).items():
+                    for key, number in zip(("median", "q05", "q95"), numbers, strict=True):
+                        values[f"gauss_markov_{name}_{key}"] = number
+                view.show([AxisReport(axis, 10.0 * k, True, values)])
+        decoder.time_ms = 402_000
+        console = Console(width=width, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+        console.print(view.renderable())
+    return console.export_text().splitlines()
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (140, 40)])
+def test_view_of_six_axes_fits(monkeypatch: pytest.MonkeyPatch, width: int, height: int) -> None:
+    """All axes whole: nothing wrapped or cut, the counters there, bars of 12 cells or more, the bias's course."""
+    rows = six_axes(monkeypatch, width, height)
+    assert len(rows) <= height
+    assert all(len(row) <= width and "…" not in row for row in rows)
+    text = "\n".join(rows)
+    assert "frames: 0 received, 0 lost" in text
+    assert re.search(r"^axis averages  P constant", text, re.MULTILINE)
+    for axis in ("gx", "gy", "gz", "ax", "ay", "az"):
+        assert re.search(rf"^{axis} +36000  0\.000 ·{{12,}}  0\.063 █+·+  0\.937 █{{11,}}·+ +12 s$", text, re.MULTILINE)
+    assert len(re.findall(r"bias -0\.036521 ± 0\.0025 (?:deg/s|m/s²) +[▁▂▃▄▅▆▇█]{8,}", text)) == 6
+    assert text.count("N 0.0423 [0.0414, 0.0431] deg/s/√Hz") == 3
+    assert text.count("sigma_m 0.00859 [0.00517, 0.0403] m/s²") == 3
+    assert text.count("1/alpha 119 [36, 2.86e+03] s") == 3
+
+
+@pytest.mark.parametrize("height", [10, 14, 20])
+def test_view_in_a_low_window_keeps_one_axis_and_the_counters(monkeypatch: pytest.MonkeyPatch, height: int) -> None:
+    rows = six_axes(monkeypatch, 80, height)
+    text = "\n".join(rows)
+    assert len(rows) <= height
+    assert "frames: 0 received, 0 lost" in text
+    assert "1/alpha 42.2 [27.5, 70.4] s" in text
+    shown_axes = len(re.findall(r"^[ag][xyz] ", text, re.MULTILINE))
+    assert shown_axes == 6 or f"{6 - shown_axes} axes more" in text
+
+
+def test_axes_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = lines(stream(21, 1))
+    decoder = Decoder()
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "test", axes=("gy", "az"))
+        for line in sent:
+            view.show(decoder.feed(message(line)))
+        assert sorted(re.findall(r"^([ag][xyz]) ", shown(view), re.MULTILINE)) == ["az", "gy"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from selfcal.ending import Ended, install
+from selfcal.ending import install, last_signal
 from selfcal.errors import UserError
 
 app = typer.Typer(
@@ -42,6 +41,8 @@ def _options(
 
 #: Exit code of everything the user can put right.
 USER_ERROR = 2
+#: ... after Ctrl-C.
+INTERRUPTED = 130
 
 
 class Engine(StrEnum):
@@ -209,7 +210,7 @@ def monitor(
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
 ) -> None:
-    """Live view of a module's telemetry; exit code 1 if the module was out of reach at the end."""
+    """Live view of a module's telemetry; exit code 1 if the module was out of reach when the time was up."""
     from selfcal.verbs import monitor as verb
 
     outcome = verb.monitor(
@@ -311,14 +312,14 @@ def main() -> NoReturn:
     traceback is our bug."""
     install()
     try:
-        sys.exit(app(args=sys.argv[1:] or ["--help"], standalone_mode=False))
+        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        sys.exit((last_signal() or code) if code == INTERRUPTED else code)  # typer's code for every signal
     except UserError as error:
         _fail(str(error))
     except TyperException as error:
         _fail(error.format_message())
-    except (typer.Abort, KeyboardInterrupt) as error:
-        ended = error.__cause__ if isinstance(error, typer.Abort) else error
-        sys.exit(128 + (ended.number if isinstance(ended, Ended) else signal.SIGINT))
+    except (typer.Abort, KeyboardInterrupt):
+        sys.exit(last_signal() or INTERRUPTED)
     except (BrokenPipeError, SystemExit) as error:  # the reader of our output has gone, as in `| head`
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise  # typer turns the others into one

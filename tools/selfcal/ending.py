@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -23,6 +24,7 @@ class _State:
 
     holding = False
     came: int | None = None
+    raised: int | None = None
 
 
 _state = _State()
@@ -34,7 +36,17 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
         return
     for other in SIGNALS[1:]:
         signal.signal(other, signal.SIG_IGN)  # the end is under way: it is not to be cut short
+    _end(number)
+
+
+def _end(number: int) -> NoReturn:
+    _state.raised = number
     raise Ended(number)
+
+
+def last_signal() -> int:
+    """Exit code for the signal that was raised, 128 + its number; 0: none was."""
+    return 0 if _state.raised is None else 128 + _state.raised
 
 
 def install() -> None:
@@ -56,7 +68,7 @@ class Held:
         """Raise Ended if one came."""
         if _state.came is not None:
             number, _state.came = _state.came, None
-            raise Ended(number)
+            _end(number)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.progress_bar import ProgressBar
 from rich.text import Text
 
 from selfcal.model import LAWS, PLAIN
@@ -33,6 +32,8 @@ TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refuse
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 #: Cells of a probability bar and of the bias's sparkline, at least and at most.
 BAR, SPARK = (12, 30), (8, 40)
+#: Of an axis's lines after the first.
+INDENT = 2
 #: Lines of the status, at most.
 STATUS_LINES = 2
 #: s without a byte after which contact is lost, and how often the longest interval that was seen has to pass.
@@ -140,7 +141,8 @@ class View:
         title = Text.assemble((f"{self._title}   module time {time_s:.1f} s   ", "bold"), self._state())
         parts: list[RenderableType] = [_line(title)]
         if self._total_s is not None and not whole:
-            parts.append(ProgressBar(self._total_s, min(time_s, self._total_s), width=width // 2))
+            done = round(min(1.0, time_s / self._total_s) * (width // 2))
+            parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
         parts += self._status(width)
         parts.append(_line(Text(frame_counts(self._decoder, self._source), "dim")))
         last = dict(self._last)  # Live asks from a thread of its own
@@ -191,7 +193,7 @@ class View:
         bias = {axis: _bias(report) for axis, (report, _) in last.items()}
         parameters = {axis: _parameters(report) for axis, (report, _) in last.items()}
         bias_width = max(map(len, bias.values()))
-        spark = min(SPARK[1], width - 3 - bias_width - 2 - 2 - max(len(texts[0]) for texts in parameters.values()))
+        spark = min(SPARK[1], width - INDENT - bias_width - 2 - max(len(texts[0]) for texts in parameters.values()))
         blocks = []
         for axis, (report, trend) in last.items():
             age_s = max(0.0, self._time_s - report.time_s)
@@ -201,12 +203,11 @@ class View:
             for law in laws:
                 head.append("  ").append(_bar(report, law, cells), "bold green" if law == best else "")
             head.append(f"{age_s:.0f} s".rjust(7), "dim")
-            chunks = [Text(f"{bias[axis]:<{bias_width}}")]
-            if spark >= SPARK[0]:
-                chunks.append(Text(_spark(trend, report.value("bias_sd"), spark), "cyan"))
-            chunks += [Text(text) for text in parameters[axis]]
+            course = Text(_spark(trend, report.value("bias_sd"), spark), "cyan") if spark >= SPARK[0] else ""
+            chunks = [Text.assemble(bias[axis].ljust(bias_width), " ", course, " ", parameters[axis][0])]
+            chunks += [Text(text) for text in parameters[axis][1:]]
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
-            blocks.append([_line(head), *_flow(chunks, width, 2, indent=3)])
+            blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks
 
 

@@ -439,7 +439,8 @@ def show(document: Mapping[str, Any]) -> None:
     console = Console()
     for left_out in range(4):
         table, notes = _law_table(document, left_out)
-        if not console.is_terminal or console.measure(table).minimum <= console.width:
+        needed = console.measure(table, options=console.options.update(width=10 * TABLE_WIDTH)).maximum
+        if not console.is_terminal or needed <= console.width:
             break
     if not console.is_terminal:
         console.width = max(console.width, TABLE_WIDTH)
@@ -456,6 +457,8 @@ def _law_table(document: Mapping[str, Any], left_out: int) -> tuple[Table, list[
     brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
     table = Table(
         box=box.SIMPLE_HEAD,
+        collapse_padding=left_out > 0,
+        pad_edge=left_out == 0,
         title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s",
         title_justify="left",
@@ -474,7 +477,8 @@ def _law_table(document: Mapping[str, Any], left_out: int) -> tuple[Table, list[
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
         level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
-        table.add_row(f"{name} \\[{bias['unit']}]", "", level, "", "", style="cyan")
+        level, _, spread = level.partition(" ±") if brief["N"] else (level, "", "")
+        table.add_row(f"{name} \\[{bias['unit']}]", "", level, f"±{spread}" if spread else "", "", style="cyan")
         for law, probability in axis["hypotheses"].items():
             parameters = axis["parameters"][law]
             table.add_row(

@@ -32,7 +32,10 @@ KEPT = 2000
 
 @dataclass
 class Outcome(Statistics):
-    """The frames, and whether the module was out of reach at the end, or never in reach."""
+    """The frames, and whether the module was out of reach when the time was up or its port went.
+
+    An end that the user asked for is none of these.
+    """
 
     contact_lost: bool = False
 
@@ -121,14 +124,15 @@ def monitor(
                         logger(frame)
                     view.show(reports)
                     _keep(history, [one for one in reports if not axes or one.axis in axes])
+            wanted = ending.asked
         except KeyboardInterrupt:
-            pass
+            wanted = True
         view.show(decoder.flush())
         view.print_last()
         outcome = Outcome(**vars(decoder.statistics))
         console = Console(stderr=True)
         for line in _farewell(source, contact, decoder, name):
-            outcome.contact_lost = True
+            outcome.contact_lost = not wanted
             console.print(line, highlight=False, markup=False, soft_wrap=True)
     reported = {axis: history[axis] for axis in AXES if axis in history}
     if (json is not None or plot is not None) and not reported:
