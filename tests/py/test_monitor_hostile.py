@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 import tty
+import zlib
 from pathlib import Path
 
 import can
@@ -251,7 +252,7 @@ def test_a_port_that_vanishes_is_taken_up_again(tmp_path: Path) -> None:
     outcome = []
 
     def watch() -> None:
-        outcome.append(monitor(channel=str(port), duration=14.0))
+        outcome.append(monitor(channel=str(port), duration=9.0))
 
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -357,6 +358,43 @@ def test_damaged_logs_end_in_one_line(tmp_path: Path, suffix: str) -> None:
         else:
             shorter += outcome.received < len(lines(stream(21, 1)))
     assert shorter > 10
+
+
+def blf(*objects: tuple[int, int, bytes], packed: bytes | None = None) -> bytes:
+    """A BLF file of objects (size told, kind, body), or of one container of `packed` bytes."""
+    head = struct.pack("<4sL", b"LOGG", 144).ljust(144, b"\0")
+    if packed is not None:
+        objects = ((0, 10, struct.pack("<H14x", 2) + packed),)
+    parts = [
+        struct.pack("<4sHHLL", b"LOBJ", 16, 1, size or 16 + len(body), kind) + body for size, kind, body in objects
+    ]
+    return head + b"".join(parts)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (blf(packed=zlib.compress(bytes(1 << 30), 9)), "unpacks to more than 16 MB"),
+        (
+            blf(packed=zlib.compress(struct.pack("<4sHHLL", b"LOBJ", 32, 1, 0, 99).ljust(64, b"\0"))),
+            "an object of 0 bytes",
+        ),
+        (blf(packed=zlib.compress(struct.pack("<4sHHLL", b"LOBJ", 32, 1, 2**32 - 1, 1).ljust(64))), "4294967295 bytes"),
+        (blf((2**32 - 1, 10, b"")), "no frame"),
+        (blf()[:20], "no frame log"),
+        (struct.pack("<4sL", b"LOGG", 2**32 - 1), "no frame log"),
+        (b"", "no frame log"),
+    ],
+    ids=["bomb", "no size", "huge inner size", "huge size", "cut header", "huge header", "empty"],
+)
+def test_a_hostile_log_takes_no_memory_and_no_time(tmp_path: Path, content: bytes, complaint: str) -> None:
+    """In a process that may have 1 GB: one line, exit code 2."""
+    (tmp_path / "hostile.blf").write_bytes(content)
+    limit = ["prlimit", f"--as={1 << 30}", *COMMAND, "--read", str(tmp_path / "hostile.blf")]
+    done = subprocess.run(limit, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 2, done.stderr
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 # ------------------------------------------------------------------------------------------------------------- signals

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import struct
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +17,12 @@ if TYPE_CHECKING:
 
 #: What `monitor --log` writes, and what --read reads.
 WRITTEN = (".asc", ".blf", ".csv", ".log", ".trc")
+
+#: Of Vector's BLF: size of the file's header, then an object's signature, size and kind; a container's own header.
+BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL"), struct.Struct("<4s4xLL")
+BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
+#: Bytes that a container may unpack to; python-can and Vector write 128 KB.
+BLF_CONTAINER_MAX = 16 << 20
 
 
 class FrameLog:
@@ -39,6 +47,8 @@ class FrameLog:
         if not self.path.is_file():
             missing = "there is no such file" if not self.path.exists() else "this is no file"
             raise UserError(f"{path}: cannot read the frame log: {missing}")
+        if self.path.suffix.lower() == ".blf":
+            _check_blf(self.path)
         try:
             self._reader = can.LogReader(self.path)
             self._frames: Iterator[can.Message] = iter(self._reader)
@@ -88,6 +98,56 @@ class FrameLog:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _check_blf(path: Path) -> None:
+    """Raises UserError for a BLF file on which python-can's reader would take all memory, or go round for ever.
+
+    A file is a header and objects; an object's header tells its size, and a container holds objects, packed by zlib.
+    """
+    with path.open("rb") as file:
+        left = path.stat().st_size
+        start = file.read(BLF_HEADER.size)
+        header = BLF_HEADER.unpack(start)[1] if len(start) == BLF_HEADER.size else 0
+        if header > left:
+            raise UserError(f"{path}: no frame log: its header is cut off")
+        file.seek(max(header, len(start)))
+        tail = b""
+        while len(head := file.read(BLF_OBJECT.size)) == BLF_OBJECT.size:
+            signature, size, kind = BLF_OBJECT.unpack(head)
+            if signature != b"LOBJ" or not BLF_OBJECT.size <= size <= left:
+                return  # python-can stops there
+            body = file.read(size - BLF_OBJECT.size)
+            file.seek(size % 4, 1)
+            if kind == BLF_CONTAINER:
+                tail = _check_objects(path, tail + _unpacked(path, body))
+
+
+def _unpacked(path: Path, body: bytes) -> bytes:
+    """What a container holds, as far as it can be unpacked."""
+    data = body[BLF_CONTAINER_HEAD:]
+    if body[:2] == BLF_ZLIB:
+        packed = zlib.decompressobj()
+        try:
+            data = packed.decompress(data, BLF_CONTAINER_MAX + 1)
+        except zlib.error:
+            data = b""
+    if len(data) > BLF_CONTAINER_MAX:
+        raise UserError(f"{path}: a part of this frame log unpacks to more than {BLF_CONTAINER_MAX >> 20} MB")
+    return data
+
+
+def _check_objects(path: Path, data: bytes) -> bytes:
+    """Walk through the objects of a container as python-can does; returns the beginning of one that goes on."""
+    at = 0
+    while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and len(data) - at >= BLF_OBJECT.size:
+        _, size, _ = BLF_OBJECT.unpack_from(data, at)
+        if not BLF_OBJECT.size <= size <= BLF_CONTAINER_MAX:
+            raise UserError(f"{path}: damaged frame log: an object of {size} bytes")
+        if at + size > len(data):
+            return data[at:]
+        at += size
+    return b""
 
 
 def _said(error: Exception) -> str:
