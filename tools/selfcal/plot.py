@@ -109,6 +109,8 @@ def plot_run(
                     if last[law] > last.get(best, 0.0):
                         best = law
                         _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[law])
+                elif len(candidates) == 1:  # nothing else in this panel
+                    spans[axis, parameter] += middle[late:].tolist()
             value = _true(told, parameter, unit[axis])
             if value is not None:
                 spans[axis, parameter].append(value)
