@@ -156,9 +156,9 @@ def test_replay_is_the_library_over_the_wire(
     titles: list[str] = []
     drawn = replay_module.plot_run
 
-    def watched(history: Any, path: Any, title: str, truth: Any) -> None:
+    def watched(history: Any, path: Any, title: str, truth: Any, units: Any) -> None:
         titles.append(title)
-        drawn(history, path, title, truth)
+        drawn(history, path, title, truth, units)
 
     monkeypatch.setattr(replay_module, "plot_run", watched)
     document = replay(log, report_every=100.0, json=tmp_path / "report.json", plot=tmp_path / "report.png")

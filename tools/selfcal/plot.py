@@ -32,6 +32,8 @@ PANELS = {
 }
 #: A law whose last probability is below this is drawn faint, and its values are not written.
 FAINT = 0.01
+#: A true value beyond this is none: an integer may have any number of digits.
+LARGEST = 1e30
 #: Share of the reports, from the first on, whose intervals do not count for the scales: they are the prior's.
 SETTLING = 0.2
 FORMATS = (".png", ".pdf", ".svg", ".jpg")
@@ -152,7 +154,7 @@ def _verdict(last: Mapping[str, float], told: Any) -> tuple[str, str]:
         return "outside the priors", "black"
     best = max(finite, key=lambda law: finite[law])
     said = f"{best.replace('_', ' ')} {finite[best]:.3f}"
-    if isinstance(told, Mapping) and told.get("hypothesis") in LAWS:
+    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(LAWS):
         said += f" (truth: {told['hypothesis'].replace('_', ' ')})"
     return said, COLORS[best]
 
@@ -162,7 +164,7 @@ def _true(told: Any, parameter: str, unit: str) -> float | None:
     if not isinstance(told, Mapping):
         return None
     value = told.get("N_with_lattice", told.get("N")) if parameter == "N" else told.get(parameter)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < LARGEST:
         return None
     if parameter == "alpha":
         return 1.0 / value
