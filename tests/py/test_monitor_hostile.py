@@ -32,6 +32,7 @@ from selfcal.live import Contact, View, most_probable
 from selfcal.verbs.monitor import monitor
 from selfcal.wire import LINE_MAX, AxisReport, Decoder, Link, load_dbc, open_bus
 
+from conftest import needs_multicast
 from wire_stream import lines, message, serial_line, stream
 
 COMMAND = (sys.executable, "-m", "selfcal.cli", "monitor")
@@ -98,6 +99,7 @@ def test_hostile_values_with_a_right_checksum_do_not_end_the_view(value: float) 
     assert refused > 0
 
 
+@needs_multicast
 def test_junk_on_a_udp_bus_does_not_end_it() -> None:
     """Datagrams that are no frames, between frames: counted, and the frames still come."""
     sent = lines(stream(21, 2))
@@ -402,7 +404,7 @@ def test_a_hostile_log_takes_no_memory_and_no_time(tmp_path: Path, content: byte
 
 @pytest.mark.parametrize(
     ("number", "delay"),
-    [(signal.SIGINT, 0.3), (signal.SIGTERM, 0.0), (signal.SIGTERM, 0.7), (signal.SIGHUP, 0.3)],
+    [(signal.SIGINT, 0.3), (signal.SIGTERM, 0.7), (signal.SIGHUP, 0.0)],
 )
 def test_signals_end_it_with_the_cursor_back_and_a_log_that_can_be_read(
     tmp_path: Path, number: int, delay: float
