@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import subprocess
 import sys
 import threading
 import time
@@ -17,6 +16,7 @@ import pytest
 from rich.console import Console
 from test_wire import spoil
 
+from selfcal import cli
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.verbs.monitor import monitor
@@ -24,7 +24,6 @@ from selfcal.wire import AxisReport, Decoder, Link, open_bus
 
 from wire_stream import lines, message, serial_line, stream
 
-COMMAND = (sys.executable, "-m", "selfcal.cli", "monitor")
 #: What an axis's report has no number for where the record lies outside the priors.
 NO_NUMBER = ("bias_mean", "bias_sd", "constant_probability", "random_walk_probability", "gauss_markov_probability")
 
@@ -144,13 +143,18 @@ def test_a_serial_line_has_one_reader() -> None:
         (["--interface", "virtual", "--channel", "x", "--log", "/no-such-folder/frames.asc"], "cannot write"),
     ],
 )
-def test_user_errors_are_one_line(options: list[str], complaint: str) -> None:
-    command = [*COMMAND, *options]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
-    assert complaint in done.stderr
-    assert done.stderr.startswith("selfcal: error: ")
-    assert done.stderr.count("\n") == 1
+def test_user_errors_are_one_line(
+    options: list[str], complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["selfcal", "monitor", *options])
+    monkeypatch.setattr(cli, "install", lambda: None)  # pytest keeps its signals
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    said = capsys.readouterr().err
+    assert end.value.code == 2
+    assert complaint in said
+    assert said.startswith("selfcal: error: ")
+    assert said.count("\n") == 1
 
 
 def shown(view: View) -> str:
