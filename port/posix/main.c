@@ -1,13 +1,13 @@
-/* The application on a POSIX host: a recording takes the sensor's place; telemetry leaves by a pseudo-terminal with SLCAN,
- * or by a CAN bus of the host.
+/* The application on a POSIX host: a recording takes the sensor's place; telemetry leaves by a pseudo-terminal with
+ * SLCAN, or by a CAN bus of the host.
  *
  *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate] [--stay | --can BUS]
  *
  * Prints `SELFCAL_PTY path`, waits for the host to open the channel, plays the recording (time stands still while the
  * channel is closed), and ends when the host closes the channel after the last frame. With --stay a host that goes away
  * has closed the channel, and another may open it.
- * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last frame
- * (port/posix/can.h).
+ * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last
+ * frame (port/posix/can.h).
  * With --gate motion is kept out, by the model's gate.
  * Exit code: 0; 1 if the host went away or never came, or the bus failed; 2 for bad arguments or a bad recording.
  *
@@ -220,7 +220,10 @@ int main(int argc, char **argv)
         while (more && host.error == NULL && host.can.error == NULL) {
             more = app_step(&app);
         }
-        return host.error != NULL ? fail(2, path, host.error) : host.can.error != NULL ? fail(1, bus, host.can.error) : 0;
+        if (host.error != NULL) {
+            return fail(2, path, host.error);
+        }
+        return host.can.error != NULL ? fail(1, bus, host.can.error) : 0;
     }
     const char *device = pty_open(&host.pty, timeout_ms, stay);
     if (device == NULL) {
