@@ -109,7 +109,7 @@ def test_verbs_are_functions() -> None:
         (["identify", "log.csv", "--model", "absent.yaml"], "absent.yaml: "),
         (["simulate", "absent.yaml", "-o", "log.csv"], "absent.yaml: "),
         (["codegen", "absent.yaml", "-o", "."], "absent.yaml: "),
-        (["monitor"], "Missing option '--channel'"),
+        (["monitor"], "which module? --channel names its port (th"),
         (["monitor", "--channel", "/dev/absent"], ""),
     ],
 )

@@ -156,9 +156,9 @@ def test_replay_is_the_library_over_the_wire(
     titles: list[str] = []
     drawn = replay_module.plot_run
 
-    def watched(history: Any, path: Any, title: str, truth: Any) -> None:
+    def watched(history: Any, path: Any, title: str, truth: Any, units: Any) -> None:
         titles.append(title)
-        drawn(history, path, title, truth)
+        drawn(history, path, title, truth, units)
 
     monkeypatch.setattr(replay_module, "plot_run", watched)
     document = replay(log, report_every=100.0, json=tmp_path / "report.json", plot=tmp_path / "report.png")
@@ -224,7 +224,9 @@ def assert_one_line(done: subprocess.CompletedProcess[str], complaint: str) -> N
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--transport", "can"], "--transport can: this build has the transport slcan only"),
+        (["--transport", "can", "--target", "cortex-m0"], "--transport can: an emulated board has a serial line alone"),
+        (["--channel", "vcan0"], "--channel vcan0: goes with --transport can"),
+        (["--transport", "can", "--channel", "no-such-can"], "socketcan no-such-can: th"),
         (["--report-every", "0"], "--report-every must be 0.001 to 4e+06 s, not 0"),
         (["--report-every", "1e9"], "--report-every must be 0.001 to 4e+06 s, not 1e+09"),
         (["--report-every", "nan"], "--report-every must be 0.001 to 4e+06 s, not nan"),

@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
+from selfcal.ending import install, last_signal
 from selfcal.errors import UserError
 
 app = typer.Typer(
@@ -39,6 +40,8 @@ def _options(
 
 #: Exit code of everything the user can put right.
 USER_ERROR = 2
+#: ... after Ctrl-C.
+INTERRUPTED = 130
 
 
 class Engine(StrEnum):
@@ -222,6 +225,9 @@ def replay(
     model: ModelFile = None,
     target: Annotated[Target, typer.Option(help="Where the firmware runs: here, or in QEMU")] = Target.host,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    channel: Annotated[
+        str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP on this machine")
+    ] = "",
     report_every: Annotated[
         float | None, typer.Option(metavar="S", help="Seconds between reports; default: 100 in all, fewer in QEMU")
     ] = None,
@@ -244,6 +250,7 @@ def replay(
         model=model,
         target=target.value,
         transport=transport.value,
+        channel=channel,
         report_every=report_every,
         gate=gate,
         json=json,
@@ -258,16 +265,52 @@ def replay(
 
 @app.command()
 def monitor(
-    channel: Annotated[str, typer.Option(metavar="NAME", help="Channel: a serial port for slcan", show_default=False)],
+    channel: Annotated[str | None, typer.Option(metavar="NAME", help="Channel: a serial port for slcan")] = None,
     interface: Annotated[str, typer.Option(metavar="NAME", help="python-can interface")] = "slcan",
-    log: Annotated[Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .trc)")] = None,
+    read: Annotated[Path | None, typer.Option(metavar="FILE", help="Read a log of frames instead of a channel")] = None,
+    speed: Annotated[float | None, typer.Option(metavar="X", help="Of --read, 1 as it came; default: at once")] = None,
+    axis: Axis = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc)")
+    ] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this long; default: Ctrl-C")] = None,
     bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
+    once: Annotated[bool, typer.Option("--once", help="End when the port vanishes instead of waiting for it")] = False,
+    json: Json = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
 ) -> None:
-    """Live view of a module's telemetry."""
+    """Live view of a module's telemetry; exit code 1 if the module was out of reach when the time was up."""
     from selfcal.verbs import monitor as verb
 
-    verb.monitor(interface=interface, channel=channel, log=log, duration=duration, bitrate=bitrate)
+    outcome = verb.monitor(
+        interface=interface,
+        channel=channel,
+        read=read,
+        speed=speed,
+        axes=axis or (),
+        log=log,
+        duration=duration,
+        bitrate=bitrate,
+        once=once,
+        json=json,
+        plot=plot,
+    )
+    sys.exit(1 if outcome.contact_lost else 0)
+
+
+@app.command()
+def demo(
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="Recording; default: the shipped one", show_default=False)
+    ] = None,
+    speed: Annotated[float, typer.Option(metavar="X", help="Times real time")] = 10.0,
+    transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    channel: Annotated[str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP")] = "",
+) -> None:
+    """A module without hardware: the firmware over a recording, for `selfcal monitor` to watch."""
+    from selfcal.verbs import demo as verb
+
+    verb.demo(log, speed=speed, transport=transport.value, channel=channel)
 
 
 @app.command()
@@ -358,17 +401,23 @@ def _fail(message: str) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 130 after Ctrl-C; a traceback is our bug."""
+    """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
+    traceback is our bug."""
+    install()
     try:
-        sys.exit(app(args=sys.argv[1:] or ["--help"], standalone_mode=False))
+        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        sys.exit((last_signal() or code) if code == INTERRUPTED else code)  # typer's code for every signal
     except UserError as error:
         _fail(str(error))
     except TyperException as error:
         _fail(_usage(error))
     except (typer.Abort, KeyboardInterrupt):
-        sys.exit(130)
-    except BrokenPipeError:  # the reader of our output has gone, as in `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(last_signal() or INTERRUPTED)
+    except (BrokenPipeError, SystemExit) as error:  # the reader of our output has gone, as in `| head`
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise  # typer turns the others into one
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         sys.exit(0)
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename is not None else str(error))

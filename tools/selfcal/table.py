@@ -23,16 +23,38 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
     """The table a person reads: per axis the laws, their probabilities and parameters, and the bias.
 
     It goes to stderr where stdout is the JSON's. `datasheet`: each number in the unit of data sheets, and the bias
-    instability beside the bias.
+    instability beside the bias. In a terminal that is too narrow columns lose their intervals, first that of 1/alpha,
+    then N's, then K's.
     """
+    console = Console(stderr=to_stderr)
+    for left_out in range(4):
+        table, notes = _law_table(document, left_out, datasheet)
+        needed = console.measure(table, options=console.options.update(width=10 * TABLE_WIDTH)).maximum
+        if not console.is_terminal or needed <= console.width:
+            break
+    if not console.is_terminal:
+        console.width = max(console.width, TABLE_WIDTH)
+    console.print(table)
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    if any("regressors" in axis for axis in axes.values()):
+        console.print(_regressor_table(axes))
+    for line in notes:
+        console.print(line, highlight=False, markup=False)
+
+
+def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
+    """The table without the intervals of its last `left_out` columns, and the lines below it."""
     recording = document["recording"]
+    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
     table = Table(
         box=box.SIMPLE_HEAD,
+        collapse_padding=left_out > 0,
+        pad_edge=left_out == 0,
         title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s",
         title_justify="left",
         caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
-        "~: this record does not identify it",
+        "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
         caption_justify="left",
     )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
@@ -57,15 +79,19 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
             factor = units.factor(bias["unit"], unit)
             level = f"bias {bias['mean'] * factor:.6g} ± {bias['sd'] * factor:.2g} {units.typeset(unit)}"
             heading, floor = name, _instability(axis, unit)
-        table.add_row(heading, "", level, floor, "", style="cyan")
+        level, _, spread = level.partition(" ±") if brief["N"] else (level, "", "")
+        table.add_row(heading, "", level, floor or (f"±{spread}" if spread else ""), "", style="cyan")
         for law, probability in axis["hypotheses"].items():
             parameters = axis["parameters"][law]
             table.add_row(
                 law,
                 f"{probability:.4f}",
-                _interval(parameters, ("N",), datasheet=bias["unit"] if datasheet else ""),
-                _interval(parameters, ("K", "sigma_m", "B"), datasheet=bias["unit"] if datasheet else ""),
-                _interval(parameters, ("alpha",), inverse=True) or _interval(parameters, RATIOS),
+                _interval(parameters, ("N",), datasheet=bias["unit"] if datasheet else "", brief=brief["N"]),
+                _interval(
+                    parameters, ("K", "sigma_m", "B"), datasheet=bias["unit"] if datasheet else "", brief=brief["K"]
+                ),
+                _interval(parameters, ("alpha",), inverse=True, brief=brief["alpha"])
+                or _interval(parameters, RATIOS, brief=brief["alpha"]),
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
@@ -89,13 +115,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
         ]
         if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
             failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
-    console = Console(stderr=to_stderr)
-    console.width = max(console.width, TABLE_WIDTH)
-    console.print(table)
-    if any("regressors" in axis for axis in axes.values()):
-        console.print(_regressor_table(axes))
-    for line in (*kept, *failed):
-        console.print(line, highlight=False, markup=False)
+    return table, [*kept, *failed]
 
 
 def _regressor_table(axes: Mapping[str, Any]) -> Table:
@@ -134,10 +154,15 @@ def _instability(axis: Mapping[str, Any], unit: str) -> str:
 
 
 def _interval(
-    parameters: Mapping[str, Any], names: Sequence[str], *, inverse: bool = False, datasheet: str = ""
+    parameters: Mapping[str, Any],
+    names: Sequence[str],
+    *,
+    inverse: bool = False,
+    datasheet: str = "",
+    brief: bool = False,
 ) -> str:
-    """Median and interval of the one of `names` that a law has; `datasheet`: unit of the axis, to be turned into that
-    of data sheets."""
+    """Median and interval of the one of `names` that a law has, `brief` without the interval; `datasheet`: unit of the
+    axis, to be turned into that of data sheets."""
     name = next((name for name in names if name in parameters), None)
     if name is None:
         return ""
@@ -153,4 +178,6 @@ def _interval(
         factor = units.factor(estimate["unit"], to)
         low, middle, high, unit = low * factor, middle * factor, high * factor, f" {units.typeset(to)}"
     mark = "" if estimate["identified"] else "~"
+    if brief:
+        return f"{mark}{middle:.3g}{unit}"
     return f"{mark}{middle:.3g} \\[{low:.3g}, {high:.3g}]{unit}"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal.errors import UserError
-from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus
+from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus, serial_ports
 
 if TYPE_CHECKING:
     import can
@@ -140,7 +140,9 @@ def command(
         raise UserError(f"no such command: {order} (there are {', '.join((*orders, *OWN_ORDERS))})")
     argument = argument_of(order, value)
     if not channel:
-        raise UserError("to which module? --channel names its serial port (/dev/ttyACM0), or the --interface's channel")
+        raise UserError(
+            f"to which module? --channel names its serial port ({serial_ports()}), or the --interface's channel"
+        )
     key = read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
         for wait in (PAUSE_S, PAUSE_S, 0.0):
