@@ -91,20 +91,23 @@ def diagnose_record(
 
 
 def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+    gone = integrity.missing(record)
+    if gone is not None and gone[1].any():
+        masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
+        record = replace(record, axes=masked)
     states = dict(record.axes)
     moved = integrity.motion(record)
     if moved:
         mask = next(iter(moved.values()))[1]
         for name in states:
             states[name] = integrity.masked(states[name], mask).refit()
-    gone = integrity.missing(record)
     for name, one in found.items():
         if name in moved:
             one.findings.append(
                 Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
             )
         if gone is not None:
-            one.findings.append(Finding(gone, 0, one.state, states[name]))
+            one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
         clipped = integrity.saturation(states[name])
         if clipped is not None:

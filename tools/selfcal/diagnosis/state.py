@@ -14,7 +14,7 @@ from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 8e-4
+P_LOOK = 3e-4
 NET_LEAST = -math.log(P_LOOK)
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
