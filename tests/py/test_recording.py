@@ -4,6 +4,7 @@ import gzip
 import json
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,32 @@ def test_a_later_save_leaves_no_older_meta(tmp_path: Path) -> None:
     save(tmp_path / "log.csv", columns, 1.0, {"truth": 1})
     save(tmp_path / "log.csv", columns, 1.0)
     assert load(tmp_path / "log.csv").meta == {}
+
+
+@pytest.mark.parametrize("ends_at", range(3))
+def test_no_meta_stands_beside_another_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_at: int) -> None:
+    """A save that ends at any of its steps on the disk: removing the older meta, then renaming table and meta."""
+    path = tmp_path / "log.csv"
+    save(path, {"gx": ("deg/s", np.full(3, 1.0))}, 1.0, {"seed": 1})
+    steps = []
+
+    def until(step: Callable[..., Any]) -> Callable[..., Any]:
+        def taken(self: Path, *arguments: Any, **options: Any) -> Any:
+            if len(steps) == ends_at:
+                monkeypatch.undo()
+                raise KeyboardInterrupt
+            steps.append(step.__name__)
+            return step(self, *arguments, **options)
+
+        return taken
+
+    monkeypatch.setattr(Path, "unlink", until(Path.unlink))
+    monkeypatch.setattr(Path, "replace", until(Path.replace))
+    with pytest.raises(KeyboardInterrupt):
+        save(path, {"gx": ("deg/s", np.full(3, 2.0))}, 1.0, {"seed": 2})
+    recording = load(path)
+    assert recording.meta.get("seed") in (recording.columns["gx"].values[0], None)
+    assert sorted(file.name for file in tmp_path.iterdir()) in (["log.csv"], ["log.csv", "log.csv.meta.json"])
 
 
 def test_real_recording() -> None:
@@ -487,7 +514,7 @@ def test_in_unit(tmp_path: Path) -> None:
 def test_save_says_what_it_cannot_write(tmp_path: Path) -> None:
     columns = {"gx": ("deg/s", np.zeros(2))}
     for name in ("absent/log.csv", "absent/log.csv.gz", "absent/log.npz"):
-        with pytest.raises(UserError, match="cannot be written: No such file or directory"):
+        with pytest.raises(UserError, match=r"cannot be written: there is no folder .*absent.; make it first"):
             save(tmp_path / name, columns, 1.0)
     with pytest.raises(UserError, match=r"ends in \.csv, \.csv\.gz or \.npz"):
         save(tmp_path / "log.txt", columns, 1.0)

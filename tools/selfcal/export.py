@@ -13,6 +13,7 @@ from typing import Any
 
 from selfcal import units
 from selfcal.errors import UserError
+from selfcal.output import write_text
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,7 @@ def write_export(document: Mapping[str, Any], form: str, path: Path | str) -> No
     """Write the answer of `identify` in one of FORMS. Raises UserError where axes or laws are missing."""
     gyro, accel = _kind(document, "rad/s"), _kind(document, "m/s^2")
     text = FORMS[form](gyro, accel, float(document["recording"]["rate_hz"]))
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot write: {error.strerror}") from error
+    write_text(path, text)
 
 
 def _kind(document: Mapping[str, Any], unit: str) -> Kind:

@@ -10,6 +10,7 @@ import numpy as np
 
 from selfcal.errors import UserError
 from selfcal.model import LAWS
+from selfcal.output import whole
 from selfcal.wire import AxisReport, signal_unit
 
 COLORS = {
@@ -86,8 +87,9 @@ def plot_run(
     for panel in grid[-1]:
         panel.set_xlabel("time, s")
     try:
-        figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=100)
+    except ValueError as error:
         raise UserError(f"{path}: cannot save the plot: {error}") from error
     finally:
         pyplot.close(figure)

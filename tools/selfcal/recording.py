@@ -13,6 +13,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from selfcal import units
 from selfcal.errors import UserError
+from selfcal.output import whole
 from selfcal.sampling import Ambiguous, sampling
 
 #: Sensor columns unless a model names others; a recording needs at least one.
@@ -151,35 +153,45 @@ def save(
     stores such a column as whole numbers of it. CSV values carry 9 digits. Raises UserError for an unwritable file.
     """
     path = Path(path)
-    lsb = lsb or {}
     described: dict[str, Any] = {**(meta or {}), "rate_hz": float(rate_hz)}
-    try:
-        if path.suffix.lower() == ".npz":
-            arrays: dict[str, NDArray[Any]] = {} if t is None else {"t[s]": np.asarray(t, np.float64)}
-            described["columns"] = {}
-            for name, (unit, values) in columns.items():
-                if name in lsb:
-                    counts = np.rint(np.asarray(values, np.float64) / lsb[name])
-                    arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
-                    described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
-                else:
-                    arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
-            with path.open("wb") as stream:
-                np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
-            return
-        if not path.name.lower().endswith((".csv", ".csv.gz")):
-            raise UserError(f"{path}: a recording's name ends in .csv, .csv.gz or .npz")
-        n = len(next(iter(columns.values()))[1])
-        stamps = np.arange(n) / rate_hz if t is None else t
-        table = np.column_stack([stamps, *(values for _, values in columns.values())])
-        names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
-        np.savetxt(path, table, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
-        if meta is None:
-            _sidecar(path).unlink(missing_ok=True)
+    if path.suffix.lower() == ".npz":
+        _save_npz(path, columns, described, t, lsb or {})
+        return
+    if not path.name.lower().endswith((".csv", ".csv.gz")):
+        raise UserError(f"{path}: a recording's name ends in .csv, .csv.gz or .npz")
+    n = len(next(iter(columns.values()))[1])
+    stamps = np.arange(n) / rate_hz if t is None else t
+    values = np.column_stack([stamps, *(values for _, values in columns.values())])
+    names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
+    with ExitStack() as files:
+        beside = None if meta is None else files.enter_context(whole(_sidecar(path)))
+        table = files.enter_context(whole(path))
+        np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
+        if beside is not None:
+            beside.write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+        # Both are written. From here to the renaming, first of the table, no meta stands beside another's table.
+        _sidecar(path).unlink(missing_ok=True)
+
+
+def _save_npz(
+    path: Path,
+    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    described: dict[str, Any],
+    t: NDArray[np.float64] | None,
+    lsb: Mapping[str, float],
+) -> None:
+    """Write the columns, whole numbers of an LSB where `lsb` has its size, and `described` as the member `meta`."""
+    arrays: dict[str, NDArray[Any]] = {} if t is None else {"t[s]": np.asarray(t, np.float64)}
+    described["columns"] = {}
+    for name, (unit, values) in columns.items():
+        if name in lsb:
+            counts = np.rint(np.asarray(values, np.float64) / lsb[name])
+            arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
+            described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
-            _sidecar(path).write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+            arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
+    with whole(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
 
 
 def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:

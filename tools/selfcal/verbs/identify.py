@@ -22,6 +22,7 @@ from selfcal import units as unit_module
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import LAWS, RATIOS, SUMS, Group, Model
+from selfcal.output import write_text
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import Scored, choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult
@@ -417,10 +418,7 @@ def write_json(document: Mapping[str, Any], path: Path | str) -> None:
     if str(path) == "-":
         sys.stdout.write(text)
         return
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot write: {error.strerror}") from error
+    write_text(path, text)
 
 
 def _finite(value: Any) -> Any:
