@@ -390,7 +390,7 @@ def test_bad_effects_are_one_clear_line(effect: str, words: str, tmp_path: Path)
         ("simulate: {rate_hz: 0}\n", "simulate.rate_hz"),
         ("simulate: {rate_hz: 5000}\n", "819.2 Hz at most"),
         ("simulate: {rate_hz: 1, duration_s: 1}\n", "fewer than two samples"),
-        ("simulate: {rate_hz: 1, duration_s: 1e15}\n", "more than 5e+08 samples"),
+        ("simulate: {rate_hz: 1, duration_s: 1e15}\n", "more than 100,000,000 readings: take 1.67e+07 s or"),
         ("simulate: {axes: [gx]}\n", "simulate.axes"),
         ("simulate: {axes: {qx: {bias: 1}}}\n", "no axis 'qx'"),
         ("simulate: {axes: {gx: {bais: 1}}}\n", "unknown entry 'bais'"),

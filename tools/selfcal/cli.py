@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
@@ -143,7 +143,7 @@ def simulate(
     """Write a simulated recording, read out as the sensor would, with its truth in its metadata."""
     from selfcal.verbs import simulate as verb
 
-    verb.simulate(model, output, seed=seed, effects=effect or ())
+    verb.show(verb.simulate(model, output, seed=seed, effects=effect or ()), output)
 
 
 @app.command()
@@ -260,7 +260,7 @@ def codegen(
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"selfcal: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"selfcal: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     sys.exit(USER_ERROR)
 
 
