@@ -336,3 +336,12 @@ def test_nothing_of_a_file_reaches_the_terminal_raw(tmp_path: Path) -> None:
         assert done.returncode == 2
         assert done.stderr.startswith(b"selfcal: error: ") and done.stderr.count(b"\n") == 1
         assert b"\x1b" not in done.stderr and b"\xff" not in done.stderr
+
+
+def test_a_name_that_looks_like_markup_is_shown_as_it_is(tmp_path: Path) -> None:
+    rows = "".join(f"{value}\n" for value in np.random.default_rng(1).normal(0.0, 0.05, 300))
+    (tmp_path / os.fsdecode(b"[red]\xff\x1b[2J.csv")).write_text("gx[deg/s]\n" + rows)
+    command = [str(Path(sys.executable).with_name("selfcal")), "identify", os.fsdecode(b"[red]\xff\x1b[2J.csv")]
+    done = subprocess.run([*command, "--rate", "1"], capture_output=True, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert b"[red]\\udcff\\x1b[2J.csv: 300 samples" in done.stdout

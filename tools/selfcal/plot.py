@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.model import LAWS
 from selfcal.output import whole
 from selfcal.wire import AxisReport, signal_unit
@@ -53,7 +53,7 @@ def plot_run(
         sharex=True,
         layout="constrained",
     )
-    figure.suptitle(title)
+    figure.suptitle(printable(title), parse_math=False)
     for row, axis in zip(grid, axes, strict=True):
         reports = history[axis]
         time = np.array([report.time_s for report in reports])

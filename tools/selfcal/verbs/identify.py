@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
 from selfcal import _library32
 from selfcal import units as unit_module
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.export import FORMS, write_export
 from selfcal.model import LAWS, RATIOS, SUMS, Group, Model
 from selfcal.output import write_text
@@ -434,7 +435,7 @@ def show(document: Mapping[str, Any]) -> None:
     recording = document["recording"]
     table = Table(
         box=box.SIMPLE_HEAD,
-        title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        title=f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s",
         title_justify="left",
         caption="medians [5 %, 95 %] in the units of the recording; ~: this record does not identify it",

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
 from selfcal.plot import plot_run
@@ -130,7 +130,7 @@ def replay(
         simulated = bool(recording.meta.get("simulated"))
         title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
         plot_run(history, plot, title, recording.meta.get("truth") if simulated else None)
-        Console(stderr=True).print(f"plot: {plot}", highlight=False, soft_wrap=True)
+        note(f"plot: {plot}")
     return document
 
 
