@@ -121,8 +121,6 @@ def simulate(
         "sensor": model.sensor_name,
         "model": model.name,
         "seed": seed,
-        "samples": int(present.sum()),
-        "rate_hz": scene.rate_hz,
         "effects": applied,
         "truth": truth,
     }
@@ -132,7 +130,7 @@ def simulate(
     stamps = None if present.all() else np.flatnonzero(present) / scene.rate_hz
     with Console(stderr=True).status(f"writing {scene.samples:,} samples"):
         recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})
-    return meta
+    return {**meta, "samples": int(present.sum()), "rate_hz": scene.rate_hz}
 
 
 def show(meta: Mapping[str, Any], output: Path | str) -> None:
