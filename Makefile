@@ -1,6 +1,8 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
+#   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
@@ -21,7 +23,7 @@ RECORDING ?= tests/data/simulated_adis16405.npz
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix test soak tolerances emulate c-tests check clean
+.PHONY: all setup system python run posix quick test hidden soak tolerances emulate c-tests check clean
 
 all: setup
 
@@ -83,27 +85,46 @@ TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/
 test: setup
 	@$(BIN)/python tests/run.py
 
+quick: setup
+	@$(BIN)/python tests/run.py --quick
+
+# The matrices are small: a BLAS with threads burns a core and is no faster.
+soak tolerances emulate campaigns: export OPENBLAS_NUM_THREADS := 1
+
+# What `make test` leaves out. When each last ran, and on which commit, stands in tests/long_runs.txt.
+LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
+PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=.
+
+# Seeds from the date unless SEED is given.
+hidden: setup
+	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) $(SEED:%=--seed %) \
+	    $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
+
 soak: setup
-	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
+	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
 
 # SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup
-	@$(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
+	@$(LONG) $(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup
-	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
+	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt
-	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py
+	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
+	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 
+# Without the instruction each fmaf is a call; either rounds once.
+FMA := $(if $(filter fma,$(shell grep -m1 '^flags' /proc/cpuinfo 2>/dev/null)),-mfma)
+
 # One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
 # The sanitizers' own code draws warnings, so those are left to the plain variant.
-$(BUILD)/c/plain/%: C := -O2 $(WARNINGS)
-SANITIZED := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+$(BUILD)/c/plain/%: C := -O2 $(FMA) $(WARNINGS)
+SANITIZED := -O1 $(FMA) -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
 $(BUILD)/c/sanitized/%: C := $(SANITIZED)
 $(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
 $(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
@@ -297,7 +318,8 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py tests/bench/bench.py tests/bench/image_sizes.py
+	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py ../tests/hidden/rivals.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

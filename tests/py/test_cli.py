@@ -54,6 +54,14 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stdout == "[]\n"
 
 
+def test_identify_loads_no_scipy() -> None:
+    """Without regressors, whose mixtures need it: its import takes longer than all else at the start."""
+    log = ROOT / "tests" / "data" / "simulated_adis16405.npz"
+    code = f"import sys, selfcal; selfcal.identify({str(log)!r}, axes=['gx']); print('scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
 def test_verbs_are_functions() -> None:
     for verb in selfcal.VERBS:
         assert callable(getattr(selfcal, verb))

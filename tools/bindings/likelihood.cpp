@@ -22,7 +22,7 @@ using Matrix = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::
 using Out = nb::ndarray<nb::numpy, double>;
 
 constexpr int states_max = 12;
-constexpr int columns_max = 16;
+constexpr int columns_max = 40;
 // The covariance counts as settled after this many samples in a row that change s by less than `settled` of itself.
 constexpr int settled_samples = 8;
 constexpr double settled = 1e-12;
@@ -210,7 +210,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
               const Matrix &P0, double R, const std::vector<std::size_t> &marks, bool innovations) {
     const std::size_t n = y.shape(0), d = h.shape(0), p = z.shape(0);
     if (d < 1 || d > states_max || p + 1 > columns_max)
-        throw std::invalid_argument("1 to 12 states and at most 15 columns");
+        throw std::invalid_argument("1 to 12 states and at most 39 columns");
     if (z.shape(1) != n || r.shape(0) != n || F.shape(0) != d || F.shape(1) != d || Q.shape(0) != d ||
         Q.shape(1) != d || P0.shape(0) != d || P0.shape(1) != d)
         throw std::invalid_argument("shapes do not fit");

@@ -133,6 +133,9 @@ def diagnose(
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Look at block means at this rate; default: every sample")
+    ] = None,
     json: Json = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")
@@ -156,6 +159,7 @@ def diagnose(
         log,
         axes=axis or (),
         model=model,
+        decimate=decimate,
         json=json,
         report=report,
         write_model=write_model,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +10,14 @@ from scipy.ndimage import uniform_filter1d
 
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array
+from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import Recording
 
-#: Columns that are no axis but may explain one, by cause.
-CHANNELS = {"temperature": ("degC",), "supply": ("V",)}
+#: Columns that are no axis but may explain one, by cause: name and unit.
+CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
+#: Samples that a diagnosis needs at least.
+LEAST = 200
 
 
 @dataclass(frozen=True)
@@ -38,45 +40,56 @@ class Record:
         return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
 
 
-def of_recording(recording: Recording, model: Model, axes: Sequence[str]) -> Record:
-    """`axes` and every other sensor column that the model knows, in the unit of each axis' group."""
+def of_recording(recording: Recording, model: Model, decimate: float | None = None) -> Record:
+    """Every sensor column that the model knows, in the unit of each axis' group, and the side channels.
+
+    `decimate`, Hz: means of whole blocks at the rate nearest to it; a block of which half is missing is missing.
+    """
     at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
     at -= at[0]
-    n = int(at[-1]) + 1
-    present = np.zeros(n, bool)
-    present[at] = True
+    block = 1 if decimate is None else max(1, round(recording.rate_hz / decimate))
+    n = (int(at[-1]) + 1) // block
+    if n < LEAST:
+        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
+    index = at // block
+    kept = index < n
+    used = np.bincount(index[kept], minlength=n)
+    present = 2 * used >= block
+
+    def on_grid(values: Array) -> Array:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(index[kept], values[kept], minlength=n) / used
+        return np.where(present, mean, np.nan)
+
     states: dict[str, State] = {}
     for name in model.axes:
         if name not in recording.columns:
             continue
         group = model.group_of(name)
         values = recording.in_unit(name, group.unit)
-        y = np.full(n, np.nan)
-        y[at] = values
-        y[~np.isfinite(y)] = np.nan
+        if not np.ptp(values) > 0.0:
+            continue
+        y = on_grid(values)
         level = float(np.nanmedian(y))
         states[name] = State(
             axis=name,
             unit=group.unit,
             y=y - level,
-            dt=1.0 / recording.rate_hz,
+            dt=block / recording.rate_hz,
             level=level,
-            r=np.ones(n),
-            lsb=lattice(values),
+            r=np.where(present, block / np.maximum(used, 1), 1.0),
+            lsb=lattice(values) if block == 1 else 0.0,
             stated_lsb=group.lsb,
-            limits=(-group.range - level, group.range - level) if group.range > 0.0 else (-math.inf, math.inf),
         )
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
-    for cause, column in (("temperature", "temp"), ("supply", "supply")):
+    for cause, (column, unit) in CHANNELS.items():
         if column in recording.columns:
-            values = recording.in_unit(column, CHANNELS[cause][0])
+            values = recording.in_unit(column, unit)
             if np.ptp(values) > 0.0:
-                whole = np.full(n, np.nan)
-                whole[at] = values
-                channels[cause] = bridged(whole)
+                channels[cause] = bridged(on_grid(values))
                 names[cause] = column
-    return Record(recording.rate_hz, states, channels, names, present)
+    return Record(recording.rate_hz / block, states, channels, names, present)
 
 
 def bridged(values: Array) -> Array:

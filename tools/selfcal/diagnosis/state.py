@@ -20,6 +20,10 @@ NET_LEAST = -math.log(P_LOOK)
 SCREEN = 2.0
 
 
+#: No term beside white noise and the drift.
+NONE = Terms()
+
+
 @dataclass(frozen=True)
 class Regressor:
     """A column that is in an axis' model. `entry` is the model file's (without prior), `unit` the column's."""
@@ -36,8 +40,7 @@ class State:
     """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
 
     `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
-    theirs. `lsb`: the lattice the values lie on (0: none), `stated_lsb` the model file's. `limits`: readings at or
-    beyond are clipped.
+    theirs. `lsb`: the lattice the values lie on (0: none), `stated_lsb` the model file's.
     """
 
     axis: str
@@ -47,10 +50,9 @@ class State:
     level: float
     r: Array
     regressors: tuple[Regressor, ...] = ()
-    extras: Terms = Terms()
+    extras: Terms = NONE
     lsb: float = 0.0
     stated_lsb: float = 0.0
-    limits: tuple[float, float] = (-math.inf, math.inf)
     fits: tuple[Fit, ...] = ()
     whitened: Array = field(default_factory=lambda: np.empty(0))
     variance: Array = field(default_factory=lambda: np.empty(0))

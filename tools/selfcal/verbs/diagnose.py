@@ -25,6 +25,7 @@ def diagnose(
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
+    decimate: float | None = None,
     json: Path | str | None = None,
     report: Path | str | None = None,
     write_model: Path | str | None = None,
@@ -36,15 +37,20 @@ def diagnose(
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
-    `report`: the page to write; `write_model`: where to write the extended model file; `fail_on` is only checked here. `axes`: those reported on; every other column may explain them. Numbers are in the recording's units. Raises
-    UserError for what the user can put right.
+    `axes`: those reported on; every other column may explain them. `decimate`: look at block means at this rate, Hz.
+    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on` is only checked here.
+    Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if fail_on is not None and fail_on not in ("inadequate", *WORDS):
         raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
     loaded = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)
-    record = of_recording(recording, loaded, names)
+    record = of_recording(recording, loaded, decimate)
+    stuck = [name for name in names if name not in record.axes]
+    names = tuple(name for name in names if name in record.axes)
+    if not names:
+        raise UserError(f"{recording.path}: every reading of {', '.join(stuck)} is the same: choose others with --axis")
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("diagnose", total=None)
