@@ -13,8 +13,8 @@ import numpy as np
 from selfcal.diagnosis.statemodel import Array
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
-WIDTH, HEIGHT = 400, 250
-LEFT, RIGHT, TOP, BOTTOM = 62, 12, 30, 44
+WIDTH, HEIGHT = 340, 220
+LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Rows of a table behind a picture at most.
 ROWS = 40
 #: Ticks on an axis, about.

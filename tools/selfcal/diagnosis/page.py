@@ -54,7 +54,7 @@ dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
 figure{margin:.8rem 0;min-width:0}
 .panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,240px),1fr));gap:.5rem 1rem}
 .finding .panels{grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr))}
-.panels svg{width:100%;max-width:560px;height:auto;display:block}
+.panels svg{width:100%;max-width:480px;height:auto;display:block}
 svg text{fill:var(--ink);font-size:12.5px;font-family:inherit}
 svg .name{font-weight:700;font-size:13.5px}
 svg .tick{fill:var(--soft)}
@@ -78,6 +78,7 @@ th,td{border-bottom:1px solid var(--rule);padding:.25rem .7rem .25rem 0;text-ali
 thead th{border-bottom-width:2px}
 pre{overflow-x:auto;background:var(--card);border:1px solid var(--rule);padding:10px;font-size:.85rem}
 code{font-size:.92em;overflow-wrap:anywhere}
+@media(max-width:600px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}.finding{padding:.2rem 10px 10px}}
 @media print{details{display:none}}
 """
 
@@ -119,24 +120,29 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
         "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline'\">",
         f"<title>Diagnosis of {escape(name)}</title><style>{STYLE}</style></head><body>",
         "<a class=skip href='#findings'>Skip to the findings</a>",
-        *_head(document, name),
+        *_head(document, record, name),
         "<main>",
         *_summary(axes),
         *_contents(axes),
     ]
-    for axis, entry in axes.items():
-        parts += _axis(axis, entry, record, found[axis])
-    parts += [*_gains(axes), *_not_found(axes), *_reproduce(document), *_reading(), "</main>", *_foot(), "</body></html>"]
+    for k, (axis, entry) in enumerate(axes.items()):
+        parts += _axis(k, axis, entry, record, found[axis])
+    parts += [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading(), "</main>", *_foot(), "</body></html>"]
     return "".join(parts)
 
 
-def _head(document: Mapping[str, Any], name: str) -> Iterator[str]:
+def _head(document: Mapping[str, Any], record: Record, name: str) -> Iterator[str]:
     recording = document["recording"]
+    means = f", looked at as means at {number(record.rate_hz)} Hz" if _decimated(document, record) else ""
     yield f"<header><h1>Diagnosis of {escape(name)}</h1>"
     yield (
         f"<p class=soft>{recording['samples']} samples at {number(recording['rate_hz'])} Hz, "
-        f"{number(recording['duration_s'])} s, axes {escape(', '.join(document['axes']))}</p></header>"
+        f"{number(recording['duration_s'])} s{means}; axes {escape(', '.join(document['axes']))}</p></header>"
     )
+
+
+def _decimated(document: Mapping[str, Any], record: Record) -> bool:
+    return record.rate_hz < 0.999 * float(document["recording"]["rate_hz"])
 
 
 def _verdict(entry: Mapping[str, Any]) -> str:
@@ -246,9 +252,8 @@ def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "</ul></nav>"
 
 
-def _axis(axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[str]:
+def _axis(place: int, axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[str]:
     unit = str(entry["unit"])
-    place = list(record.axes).index(axis) if axis in record.axes else 0
     overview, own = pictures.figures(one, record, unit_module.factor(one.state.unit, unit), unit)
     yield f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>"
     for k, finding in enumerate(entry["findings"]):
@@ -464,11 +469,12 @@ def _least(size: Mapping[str, Any]) -> str:
     return ", ".join(told)
 
 
-def _reproduce(document: Mapping[str, Any]) -> Iterator[str]:
+def _reproduce(document: Mapping[str, Any], record: Record) -> Iterator[str]:
     log = shlex.quote(str(document["recording"]["path"]))
     axes = "".join(f" --axis {shlex.quote(axis)}" for axis in document["axes"])
+    rate = f" --decimate {record.rate_hz:g}" if _decimated(document, record) else ""
     lines = [
-        f"selfcal diagnose {log}{axes} --report report.html --json report.json --write-model extended.yaml",
+        f"selfcal diagnose {log}{axes}{rate} --report report.html --json report.json --write-model extended.yaml",
         "selfcal simulate extended.yaml -o simulated.npz --seed 1",
         "selfcal diagnose simulated.npz",
         f"selfcal identify {log}{axes} --model extended.yaml",
