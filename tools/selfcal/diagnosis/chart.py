@@ -16,7 +16,7 @@ from selfcal.diagnosis.statemodel import Array
 WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Rows of a table behind a picture at most.
-ROWS = 40
+ROWS = 25
 #: Ticks on an axis, about.
 TICKS = 5
 
@@ -46,7 +46,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart. `marks`: instants or frequencies that a vertical line points out."""
+    """One chart. `marks`: instants or frequencies that a vertical line points out. `stairs`: a histogram's look."""
 
     title: str
     x_label: str
@@ -56,6 +56,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     marks: Sequence[float] = ()
+    stairs: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class _Scale:
         with np.errstate(invalid="ignore", divide="ignore"):
             v = np.log10(value) if self.log else value
         a, b = (math.log10(self.low), math.log10(self.high)) if self.log else (self.low, self.high)
-        part = np.clip((v - a) / (b - a), -0.02, 1.02)
+        part = np.clip((v - a) / (b - a), 0.0, 1.0)
         return self.start + part * self.length
 
     def ticks(self) -> list[float]:
@@ -146,22 +147,33 @@ def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, floa
     return low - grow, high + grow
 
 
+def _x_limits(figure: Figure) -> tuple[float, float]:
+    first = figure.panels[0]
+    xs = [one.x for panel in figure.panels for one in (*panel.curves, *panel.bands)]
+    low, high = _limits(xs, first.log_x, 0.0)
+    if first.stairs:
+        half = 0.5 * (high - low) / max(1, xs[0].size - 1)
+        return low - half, high + half
+    # Pieces' middles begin half a piece after 0.
+    return (0.0 if not first.log_x and 0.0 < low < 0.05 * high else low), high
+
+
+def _y_limits(figure: Figure) -> tuple[float, float]:
+    values = [one.y for panel in figure.panels for one in panel.curves]
+    values += [edge for panel in figure.panels for one in panel.bands for edge in (one.low, one.high)]
+    return _limits(values, figure.panels[0].log_y, 0.06)
+
+
 def draw(figure: Figure) -> str:
     """The figure in HTML: its panels on one scale, caption, key, and a table behind them."""
-    ys = [part for panel in figure.panels for part in _values(panel)]
-    xs = [one.x for panel in figure.panels for one in (*panel.curves, *panel.bands)]
     first = figure.panels[0]
-    x = _Scale(*_limits(xs, first.log_x, 0.0), first.log_x, LEFT, WIDTH - LEFT - RIGHT)
-    y = _Scale(*_limits(ys, first.log_y, 0.06), first.log_y, HEIGHT - BOTTOM, -(HEIGHT - TOP - BOTTOM))
+    x = _Scale(*_x_limits(figure), first.log_x, LEFT, WIDTH - LEFT - RIGHT)
+    y = _Scale(*_y_limits(figure), first.log_y, HEIGHT - BOTTOM, -(HEIGHT - TOP - BOTTOM))
     pictures = "".join(_panel(panel, x, y) for panel in figure.panels)
     return (
         f"<figure><div class=panels>{pictures}</div>"
         f"<figcaption>{escape(figure.caption)} {_key(figure)}</figcaption>{_tables(figure)}</figure>"
     )
-
-
-def _values(panel: Panel) -> list[Array]:
-    return [one.y for one in panel.curves] + [edge for one in panel.bands for edge in (one.low, one.high)]
 
 
 def _panel(panel: Panel, x: _Scale, y: _Scale) -> str:
@@ -179,11 +191,11 @@ def _panel(panel: Panel, x: _Scale, y: _Scale) -> str:
         anchor = "end" if at > right - 12 else "middle"
         out.append(f"<path class=grid d='M{at:.1f} {TOP}V{bottom}'/>")
         out.append(f"<text class=tick x={at:.1f} y={bottom + 15} text-anchor={anchor}>{number(value)}</text>")
-    out += [_band(band, x, y) for band in panel.bands]
+    out += [_band(band, x, y, panel.stairs) for band in panel.bands]
     for mark in panel.marks:
         at = float(x.at(np.array([mark]))[0])
         out.append(f"<path class=mark d='M{at:.1f} {TOP}V{bottom}'/>")
-    out += [_curve(curve, x, y) for curve in panel.curves]
+    out += [_curve(curve, x, y, panel.stairs) for curve in panel.curves]
     out.append(f"<text class=tick x={right} y={HEIGHT - 8} text-anchor=end>{escape(panel.x_label)}</text>")
     out.append(f"<text class=tick x={right} y=14 text-anchor=end>{escape(panel.y_label)}</text></svg>")
     return "".join(out)
@@ -211,27 +223,46 @@ def outside_of(curve: Curve, band: Band) -> tuple[int, int]:
     return int((out & good).sum()), int(good.sum())
 
 
-def _band(band: Band, x: _Scale, y: _Scale) -> str:
-    good = np.isfinite(band.low) & np.isfinite(band.high)
-    px, low, high = x.at(band.x), y.at(band.low), y.at(band.high)
-    out = []
-    for piece in _pieces(good):
-        upper = [f"{px[k]:.1f} {high[k]:.1f}" for k in piece]
-        lower = [f"{px[k]:.1f} {low[k]:.1f}" for k in piece]
-        out.append(f"<path class={band.kind} d='M{'L'.join(upper)}L{'L'.join(lower[::-1])}Z'/>")
-        if band.kind == "simulated":
-            out.append(f"<path class=edge d='M{'L'.join(upper)}M{'L'.join(lower)}'/>")
-    return "".join(out)
+def _band(band: Band, x: _Scale, y: _Scale, stairs: bool) -> str:
+    low, high = y.at(band.low), y.at(band.high)
+    px = x.at(band.x)
+    out = ""
+    for piece in _pieces(np.isfinite(band.low) & np.isfinite(band.high)):
+        upper, lower = (_stairs(px[piece], edge[piece], stairs) for edge in (high, low))
+        out += _path(np.concatenate([upper[0], lower[0][::-1]]), np.concatenate([upper[1], lower[1][::-1]])) + "z"
+    return f"<path class={band.kind} d='{out}'/>" if out else ""
 
 
-def _curve(curve: Curve, x: _Scale, y: _Scale) -> str:
+def _curve(curve: Curve, x: _Scale, y: _Scale, stairs: bool) -> str:
     px, py = x.at(curve.x), y.at(curve.y)
     good = np.isfinite(py) & np.isfinite(px)
     if curve.kind == "dots":
-        dots = "".join(f"M{px[k] - 3:.1f} {py[k]:.1f}l3 -3 3 3 -3 3z" for k in np.flatnonzero(good))
+        dots = "".join(f"M{px[k] - 3:.1f} {py[k]:.1f}l3-3 3 3-3 3z" for k in np.flatnonzero(good))
         return f"<path class=dots d='{dots}'/>" if dots else ""
-    lines = "".join("M" + "L".join(f"{px[k]:.1f} {py[k]:.1f}" for k in piece) for piece in _pieces(good))
+    lines = "".join(_path(*_stairs(px[piece], py[piece], stairs)) for piece in _pieces(good))
     return f"<path class={curve.kind} d='{lines}'/>" if lines else ""
+
+
+def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
+    """The corners of a histogram's outline, bins about px of equal width; else the points as they are."""
+    if not stairs or px.size < 2:
+        return px, py
+    half = 0.5 * (px[1] - px[0])
+    return np.ravel(np.column_stack([px - half, px + half])), np.repeat(py, 2)
+
+
+def _path(px: Array, py: Array) -> str:
+    """Path data in steps of a tenth, relative: a third shorter than absolute ones."""
+    at = np.rint(10.0 * np.column_stack([px, py])).astype(int)
+    steps = np.diff(at, axis=0)
+    text = "".join(_tenth(int(dx), "") + _tenth(int(dy), " ") + " " for dx, dy in steps if dx or dy)
+    return f"M{_tenth(int(at[0, 0]), '')}{_tenth(int(at[0, 1]), ' ')}" + (f"l{text.rstrip()}" if text else "h0")
+
+
+def _tenth(value: int, before: str) -> str:
+    sign = "-" if value < 0 else before
+    whole, tenth = divmod(abs(value), 10)
+    return f"{sign}{whole}.{tenth}" if tenth and whole else (f"{sign}.{tenth}" if tenth else f"{sign}{whole}")
 
 
 def _pieces(good: Array) -> list[Array]:
@@ -244,7 +275,7 @@ _SWATCH = {
     "measured": "<path class=measured d='M1 8H27'/>",
     "fitted": "<path class=fitted d='M1 8H27'/>",
     "dots": "<path class=dots d='M10 8l4 -4 4 4 -4 4z'/>",
-    "simulated": "<path class=simulated d='M1 2H27V14H1Z'/><path class=edge d='M1 2H27M1 14H27'/>",
+    "simulated": "<path class=simulated d='M1 2H27V14H1Z'/>",
     "spread": "<path class=spread d='M1 2H27V14H1Z'/>",
     "mark": "<path class=mark d='M14 1V15'/>",
 }

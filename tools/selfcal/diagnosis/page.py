@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shlex
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,10 @@ from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.errors import UserError
 
-#: Discrepancies and findings told at the top of the page at most; the rest stand below.
+#: Bytes of the page without its style, at most.
+SIZE_MOST = 990_000
+LEFT_OUT = "<p>This picture is left out to keep the page small: ask for this axis alone with <code>--axis</code>.</p>"
+#: Findings told at the top of the page at most; the rest stand below.
 TOP = 40
 
 STYLE = """
@@ -49,12 +54,11 @@ nav ul,.findings{padding-left:1.2rem}nav ul{display:flex;flex-wrap:wrap;gap:.2re
 .finding h3{margin-top:.8rem}
 dl{display:grid;grid-template-columns:minmax(8rem,max-content) 1fr;gap:.2rem 1rem;margin:.6rem 0}
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
-.figures{display:grid;gap:1rem 2rem}
-.two{grid-template-columns:repeat(auto-fit,minmax(min(100%,520px),1fr))}
 figure{margin:.8rem 0;min-width:0}
-.panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,240px),1fr));gap:.5rem 1rem}
-.finding .panels{grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr))}
-.panels svg{width:100%;max-width:480px;height:auto;display:block}
+.panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,290px),1fr));gap:.5rem 1rem;max-width:860px}
+.panels svg{width:100%;max-width:420px;height:auto;display:block}
+@media(min-width:1150px){figure{display:grid;grid-template-columns:minmax(0,3fr) minmax(0,1fr);gap:0 1.2rem}
+figure details{grid-column:1/-1}.key{display:block;white-space:normal;margin:.4rem 0 0}figcaption{padding-top:1.6rem}}
 svg text{fill:var(--ink);font-size:12.5px;font-family:inherit}
 svg .name{font-weight:700;font-size:13.5px}
 svg .tick{fill:var(--soft)}
@@ -63,8 +67,7 @@ path{fill:none;vector-effect:non-scaling-stroke}
 .measured{stroke:var(--blue);stroke-width:1.8}
 .fitted{stroke:var(--fit);stroke-width:2.6;stroke-dasharray:7 4}
 .dots{fill:var(--blue)}
-.simulated{fill:var(--band);fill-opacity:.45}
-.edge{stroke:var(--edge);stroke-width:1;stroke-dasharray:3 2}
+.simulated{fill:var(--band);fill-opacity:.45;stroke:var(--edge);stroke-width:1;stroke-dasharray:3 2}
 .spread{fill:var(--soft);fill-opacity:.3}
 .mark{stroke:var(--ink);stroke-width:1.2;stroke-dasharray:1 3}
 figcaption{font-size:.88rem;color:var(--soft)}
@@ -111,8 +114,8 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
     """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and `found`.
 
     The same arguments give the same page: the simulated records of the bands have a fixed seed."""
-    axes: Mapping[str, Mapping[str, Any]] = document["axes"]
     name = Path(str(document["recording"]["path"])).name
+    body = _body(document, record, found)
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width,initial-scale=1'>",
@@ -122,13 +125,44 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
         "<a class=skip href='#findings'>Skip to the findings</a>",
         *_head(document, record, name),
         "<main>",
-        *_summary(axes),
-        *_contents(axes),
+        *body,
+        "</main>",
+        *_foot(),
+        "</body></html>",
     ]
-    for k, (axis, entry) in enumerate(axes.items()):
-        parts += _axis(k, axis, entry, record, found[axis])
-    parts += [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading(), "</main>", *_foot(), "</body></html>"]
     return "".join(parts)
+
+
+def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    axes: Mapping[str, Mapping[str, Any]] = document["axes"]
+    sections: list[list[_Part]] = []
+    for k, (axis, entry) in enumerate(axes.items()):
+        sections.append(list(_axis(k, axis, entry, record, found[axis])))
+    rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading()]
+    parts = [_Part(text) for text in (*_summary(axes), *_contents(axes))]
+    parts += [part for section in sections for part in section]
+    parts += [_Part(text) for text in rest]
+    return _within(parts, SIZE_MOST)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A piece of HTML. `nats`: the evidence of the finding that it pictures; infinite for what the page must have."""
+
+    text: str
+    nats: float = math.inf
+
+
+def _within(parts: Sequence[_Part], most: int) -> list[str]:
+    """The texts, without pictures of the weakest findings if they would go beyond `most` bytes."""
+    size = sum(len(part.text.encode()) for part in parts)
+    dropped: set[int] = set()
+    for k in sorted(range(len(parts)), key=lambda k: parts[k].nats):
+        if size <= most or math.isinf(parts[k].nats):
+            break
+        size -= len(parts[k].text.encode()) - len(LEFT_OUT)
+        dropped.add(k)
+    return [LEFT_OUT if k in dropped else part.text for k, part in enumerate(parts)]
 
 
 def _head(document: Mapping[str, Any], record: Record, name: str) -> Iterator[str]:
@@ -217,10 +251,14 @@ def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
 
 
 def _evidence(finding: Mapping[str, Any]) -> str:
-    text = f"{number(_nats(finding), 3)} nats"
+    text = f"{_whole(_nats(finding))} nats"
     if finding.get("net_nats") is not None:
-        text += f", {number(finding['net_nats'], 3)} net of the search"
+        text += f", {_whole(finding['net_nats'])} net of the search"
     return text
+
+
+def _whole(nats: float) -> str:
+    return f"{nats:.0f}" if 100.0 <= nats < 1e7 else number(nats, 3)
 
 
 def _id(axis: str, k: int) -> str:
@@ -252,17 +290,17 @@ def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "</ul></nav>"
 
 
-def _axis(place: int, axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[str]:
+def _axis(place: int, axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[_Part]:
     unit = str(entry["unit"])
     overview, own = pictures.figures(one, record, unit_module.factor(one.state.unit, unit), unit)
-    yield f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>"
+    yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>")
     for k, finding in enumerate(entry["findings"]):
         match = _match(finding, one.findings)
         yield from _finding(_id(axis, k), finding, own[match] if match is not None else [])
-    yield "<h3>Whole record, measured against simulated</h3>"
-    yield f"<div class='figures two'>{''.join(draw(figure) for figure in overview)}</div>"
-    yield from _statistics(entry, one)
-    yield "</section>"
+    yield _Part("<h3>Whole record, measured against simulated</h3>")
+    for figure in overview:
+        yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}")
+    yield _Part("".join(_statistics(entry, one)) + "</section>")
 
 
 def _match(finding: Mapping[str, Any], candidates: Sequence[Finding]) -> int | None:
@@ -273,17 +311,13 @@ def _match(finding: Mapping[str, Any], candidates: Sequence[Finding]) -> int | N
     return min(same, key=lambda k: abs(candidates[k].look.gain - _nats(finding)))
 
 
-def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure]) -> Iterator[str]:
-    yield f"<div class=finding><h3 id={key}>{_cause(finding['cause'])}</h3>"
-    if finding.get("words"):
-        yield f"<p>{escape(str(finding['words']))}</p>"
-    yield "<dl>"
-    for name, text in _facts(finding):
-        yield f"<dt>{name}</dt><dd>{text}</dd>"
-    yield "</dl>"
+def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure]) -> Iterator[_Part]:
+    words = f"<p>{escape(str(finding['words']))}</p>" if finding.get("words") else ""
+    facts = "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in _facts(finding))
+    yield _Part(f"<div class=finding><h3 id={key}>{_cause(finding['cause'])}</h3>{words}<dl>{facts}</dl>")
     for figure in shown:
-        yield f"<h4>{escape(figure.name)}</h4>{draw(figure)}"
-    yield "</div>"
+        yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}", min(_nats(finding), 1e300))
+    yield _Part("</div>")
 
 
 def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -486,7 +520,8 @@ def _reproduce(document: Mapping[str, Any], record: Record) -> Iterator[str]:
     )
     yield f"<pre tabindex=0 aria-label=Commands role=group><code>{escape(chr(10).join(lines))}</code></pre>"
     if document.get("model"):
-        text = yaml.safe_dump(dict(document["model"]), sort_keys=False, allow_unicode=True, width=100)
+        plain = json.loads(json.dumps(document["model"], default=float))  # numpy's numbers too
+        text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=100)
         yield "<details><summary>The extended model file</summary>"
         yield f"<pre tabindex=0 aria-label='Extended model file' role=group><code>{escape(text)}</code></pre></details>"
     yield "</section>"

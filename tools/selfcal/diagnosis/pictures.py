@@ -24,6 +24,8 @@ RECORDS = 20
 POINTS = 400
 #: Averaging times a decade, and frequencies a decade, of the overview.
 TAUS_A_DECADE, BINS_A_DECADE = 8, 24
+#: Pairs of means that an Allan deviation rests on, at most about twice as many.
+PAIRS = 100_000
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
@@ -49,6 +51,7 @@ class Compared:
     log_y: bool = False
     marks: Sequence[float] = ()
     dots: bool = False
+    stairs: bool = False
 
 
 @dataclass
@@ -72,7 +75,8 @@ def figures(one: Diagnosed, record: Record, factor: float, unit: str) -> tuple[l
     def figure(item: Compared | Figure) -> Figure:
         return item if isinstance(item, Figure) else _figure(item, pairs)
 
-    return [figure(item) for item in overview], [[figure(item) for item in plan] for plan in plans]
+    sides = _sides(one, record, factor, unit)
+    return [sides, *(figure(item) for item in overview)], [[figure(item) for item in plan] for plan in plans]
 
 
 def _ensembles(items: Sequence[Compared]) -> dict[tuple[int, int], _Pair]:
@@ -116,6 +120,7 @@ def _figure(item: Compared, pairs: Mapping[tuple[int, int], _Pair]) -> Figure:
                 item.log_x,
                 item.log_y,
                 item.marks,
+                item.stairs,
             )
         )
     return Figure(item.name, item.caption, panels)
@@ -187,20 +192,23 @@ def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
 
 
 def allan_deviation(y: Array, sizes: Array) -> Array:
-    """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples, overlapping by 7/8 or less."""
+    """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
+    its samples. Pairs begin an eighth of a mean apart, in long records further."""
     good = np.isfinite(y)
     total = np.concatenate([[0.0], np.cumsum(np.where(good, y, 0.0))])
-    count = np.concatenate([[0], np.cumsum(good)])
+    count = np.concatenate([[0.0], np.cumsum(good)])
     found = np.full(len(sizes), np.nan)
     for k, m in enumerate(int(size) for size in sizes):
-        at = np.arange(0, y.size - 2 * m + 1, max(1, m // 8))
-        used = [count[at + (j + 1) * m] - count[at + j * m] for j in (0, 1)]
-        both = (2 * used[0] >= m) & (2 * used[1] >= m)
-        if both.sum() < 3:
+        every = max(1, m // 8, y.size // PAIRS)
+        last = y.size - 2 * m + 1
+        first, middle, end = (slice(j * m, last + j * m, every) for j in range(3))
+        before, after = count[middle] - count[first], count[end] - count[middle]
+        both = (2 * before >= m) & (2 * after >= m)
+        if np.count_nonzero(both) < 3:
             continue
-        at = at[both]
-        first, second = ((total[at + (j + 1) * m] - total[at + j * m]) / used[j][both] for j in (0, 1))
-        found[k] = math.sqrt(0.5 * float(np.mean((second - first) ** 2)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = (total[end] - total[middle]) / after - (total[middle] - total[first]) / before
+        found[k] = math.sqrt(0.5 * float(np.mean(step[both] ** 2)))
     return found
 
 
@@ -354,7 +362,7 @@ def _histogram(before: State, after: State) -> Compared:
         0.5 * (edges[1:] + edges[:-1]),
         (before, after),
         (summary, summary),
-        dots=True,
+        stairs=True,
     )
 
 
@@ -363,20 +371,21 @@ def _readings(finding: Finding, factor: float, unit: str) -> Compared:
     before, after = finding.before, finding.after
     y = before.y[np.isfinite(before.y)]
     cause = finding.look.cause
-    estimate = finding.look.estimate
-    low, high = np.quantile(y, [0.001, 0.999])
+    sigma = before.best.sigma
+    low, high = float(y.min()), float(y.max())
+    if high - low > 0.5 * BINS * max(before.lsb, 0.2 * sigma):
+        low, high = (float(value) for value in np.quantile(y, [0.001, 0.999]))
     limit = math.inf
     if cause == "saturation":
-        limit = abs(float(estimate["limit"]["median"]) - before.level)
-        edge = float(estimate["limit"]["median"]) - before.level
-        low, high = min(low, edge), max(high, edge + math.copysign(2.0 * before.best.sigma, edge))
-        low = min(low, edge + math.copysign(2.0 * before.best.sigma, edge))
+        edge = float(finding.look.estimate["limit"]["median"]) - before.level
+        low, high, limit = min(low, edge), max(high, edge), abs(edge)
+    low, high = low - 0.5 * sigma - before.lsb, high + 0.5 * sigma + before.lsb
     if before.lsb > 0.0:
-        # Four bins a code where the codes are few: empty ones between them are the lattice.
-        parts = max(1, min(4, round((BINS * 2) / max(1.0, (high - low) / before.lsb))))
-        width = max(before.lsb / parts, math.ceil((high - low) / before.lsb / (BINS * 2)) * before.lsb / parts)
+        # Whole codes a bin, about each code; four bins a code show that the readings lie on the codes alone.
+        codes = max(1, math.ceil((high - low) / before.lsb / (2 * BINS)))
+        width = codes * before.lsb / (4 if cause == "quantization" and codes == 1 else 1)
         first = math.floor((low + before.level) / before.lsb) * before.lsb - before.level
-        edges = first + (np.arange(math.ceil((high - first) / width) + 2) - 0.5) * width
+        edges = first + (np.arange(math.ceil((high - first) / width) + 1) - 0.5) * width
     else:
         edges = np.linspace(low, high, BINS + 1)
 
@@ -393,13 +402,14 @@ def _readings(finding: Finding, factor: float, unit: str) -> Compared:
     last = replace(after, y=before.y) if cause == "saturation" else after
     return Compared(
         "Histogram of the readings",
-        "Readings about their median.",
-        f"reading less {factor * before.level:.6g}, {unit}",
+        "Before: without a lattice." if cause == "quantization" else "How often each reading comes.",
+        f"reading less {factor * before.level:.6g}, {unit}" if before.level else f"reading, {unit}",
         "count",
         factor * 0.5 * (edges[1:] + edges[:-1]),
         (free, last),
         (counted(False), counted(cause == "saturation")),
         whitened=False,
+        stairs=True,
     )
 
 
@@ -426,7 +436,32 @@ def _effect(finding: Finding) -> Array:
     return effect
 
 
+def _sides(one: Diagnosed, record: Record, factor: float, unit: str) -> Figure:
+    """The record beside one simulated record of the final model."""
+    y = simulated(one.state, np.random.default_rng(20))
+    panels = []
+    for title, values in (("Measured", one.first.y), ("Simulated", y)):
+        x, mean, low, high = envelope(record.time_s, values, POINTS)
+        panels.append(
+            Panel(
+                title,
+                "time, s",
+                unit,
+                [Curve("mean", x, factor * mean)],
+                [Band("lowest to highest reading", x, factor * low, factor * high, "spread")],
+            )
+        )
+    return Figure(
+        "Readings", f"{_about(one.first, factor, unit)} Simulated: one record of the model with all findings.", panels
+    )
+
+
+def _about(state: State, factor: float, unit: str) -> str:
+    return f"Readings less {factor * state.level:.6g} {unit}." if state.level else "Readings."
+
+
 def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figure:
+    """Means of the readings with the effect and without; single readings would hide it."""
     effect = _effect(finding)
     y = finding.before.y
     middle = float(np.nanmean(effect))
@@ -435,7 +470,7 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
         ("Readings and fitted effect", y, effect),
         ("Readings less the effect", y - effect + middle, np.full(y.size, middle)),
     ):
-        x, mean, low, high = envelope(record.time_s, values, POINTS)
+        x, mean, _, _ = envelope(record.time_s, values, POINTS)
         _, fitted, _, _ = envelope(record.time_s, line, POINTS)
         shift = float(np.nanmean(mean)) - float(np.nanmean(fitted))
         panels.append(
@@ -447,10 +482,12 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
                     Curve("mean of the readings", x, factor * mean),
                     Curve("fitted effect", x, factor * (fitted + shift), "fitted"),
                 ],
-                [Band("lowest to highest reading", x, factor * low, factor * high, "spread")],
             )
         )
-    return Figure("Readings", f"Readings less {factor * finding.before.level:.6g} {unit}.", panels)
+    length = y.size / record.rate_hz / panels[0].curves[0].x.size
+    low, high = factor * float(np.nanmin(y)), factor * float(np.nanmax(y))
+    caption = f"{_about(finding.before, factor, unit)} Means over {length:.3g} s; single ones: {low:.4g} to {high:.4g}."
+    return Figure("Means of the readings", caption, panels)
 
 
 def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
