@@ -9,6 +9,7 @@ from html import escape
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from selfcal.diagnosis.statemodel import Array
 
@@ -57,6 +58,10 @@ class Panel:
     log_y: bool = False
     marks: Sequence[float] = ()
     stairs: bool = False
+
+    @property
+    def drawn(self) -> list[Curve | Band]:
+        return [*self.curves, *self.bands]
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, floa
 
 def _x_limits(figure: Figure) -> tuple[float, float]:
     first = figure.panels[0]
-    xs = [one.x for panel in figure.panels for one in (*panel.curves, *panel.bands)]
+    xs = [one.x for panel in figure.panels for one in panel.drawn]
     low, high = _limits(xs, first.log_x, 0.0)
     if first.stairs:
         half = 0.5 * (high - low) / max(1, xs[0].size - 1)
@@ -265,7 +270,7 @@ def _tenth(value: int, before: str) -> str:
     return f"{sign}{whole}.{tenth}" if tenth and whole else (f"{sign}.{tenth}" if tenth else f"{sign}{whole}")
 
 
-def _pieces(good: Array) -> list[Array]:
+def _pieces(good: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """Runs of indices that are good."""
     where = np.flatnonzero(good)
     return [run for run in np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if run.size]
@@ -284,7 +289,7 @@ _SWATCH = {
 def _key(figure: Figure) -> str:
     entries: dict[str, str] = {}
     for panel in figure.panels:
-        for one in (*panel.curves, *panel.bands):
+        for one in panel.drawn:
             entries.setdefault(one.label, one.kind)
         if panel.marks:
             entries.setdefault("where it was found", "mark")
@@ -302,7 +307,7 @@ def _tables(figure: Figure) -> str:
 def _table(panel: Panel, name: str) -> str:
     """One table for all curves and bands on the same x, thinned evenly."""
     groups: list[tuple[Array, list[tuple[str, Array]]]] = []
-    for one in (*panel.curves, *panel.bands):
+    for one in panel.drawn:
         columns = (
             [(one.label, one.y)]
             if isinstance(one, Curve)
@@ -327,13 +332,13 @@ def _rows(panel: Panel, name: str, x: Array, columns: list[tuple[str, Array]]) -
         for k in range(0, x.size, every)
     )
     caption = f"{panel.title}: {panel.y_label} over {panel.x_label}.{thinned}"
-    return scrolled(
-        f"{name}, {panel.title}",
-        f"<table><caption>{escape(caption)}</caption><thead><tr><th scope=col>{escape(panel.x_label)}</th>{head}</tr>"
-        f"</thead><tbody>{body}</tbody></table>",
+    table = f"<thead><tr><th scope=col>{escape(panel.x_label)}</th>{head}</tr></thead><tbody>{body}</tbody>"
+    return scrolled(f"{name}, {panel.title}", caption, table)
+
+
+def scrolled(name: str, caption: str, rows: str) -> str:
+    """A table that scrolls by itself on a narrow screen, with the keyboard too. `rows`: its head and body, HTML."""
+    return (
+        f'<div class=scroll tabindex=0 role=group aria-label="{escape(name)}">'
+        f"<table><caption><span>{escape(caption)}</span></caption>{rows}</table></div>"
     )
-
-
-def scrolled(name: str, table: str) -> str:
-    """A table that scrolls by itself on a narrow screen, with the keyboard too."""
-    return f'<div class=scroll tabindex=0 role=group aria-label="{escape(name)}">{table}</div>'

@@ -21,6 +21,7 @@ from selfcal.diagnosis import pictures
 from selfcal.diagnosis.chart import Figure, draw, number, scrolled
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.words import WORDS
 from selfcal.errors import UserError
 
 #: Bytes of the page without its style, at most.
@@ -77,8 +78,10 @@ details{margin:.4rem 0}summary{cursor:pointer;padding:.25rem 0;font-size:.92rem}
 .scroll{overflow-x:auto;max-width:100%;margin:.4rem 0}
 table{border-collapse:collapse;font-size:.88rem;font-variant-numeric:tabular-nums}
 caption{text-align:left;color:var(--soft);padding:.2rem 0}
+caption span{display:inline-block;position:sticky;left:0;max-width:min(75ch,82vw)}
 th,td{border-bottom:1px solid var(--rule);padding:.25rem .7rem .25rem 0;text-align:left;vertical-align:top}
 thead th{border-bottom-width:2px}
+@media(max-width:600px){main>section>.scroll td{min-width:7.5rem}}
 pre{overflow-x:auto;background:var(--card);border:1px solid var(--rule);padding:10px;font-size:.85rem}
 code{font-size:.92em;overflow-wrap:anywhere}
 @media(max-width:600px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}.finding{padding:.2rem 10px 10px}}
@@ -95,8 +98,8 @@ def write_page(path: Path | str, document: Mapping[str, Any], record: Record, fo
         try:
             with os.fdopen(handle, "w", encoding="utf-8") as file:
                 file.write(text)
-            os.chmod(name, 0o666 & ~_umask())
-            os.replace(name, path)
+            Path(name).chmod(0o666 & ~_umask())
+            Path(name).replace(path)
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
@@ -235,25 +238,29 @@ def _nats(finding: Mapping[str, Any]) -> float:
 
 def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
     """One finding of the summary, with its size on each axis."""
-    first = members[0][2]
+    findings = [finding for _, _, finding in members]
+    first = findings[0]
     links = ", ".join(f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>" for axis, k, _ in members)
-    text = f"<strong>{_cause(first['cause'])}</strong> on {links}: "
-    if len(members) == 1:
-        text += escape(str(first.get("words") or "")) + f" <span class=soft>({_evidence(first)})</span>"
+    sizes = [_sizes(finding) for finding in findings]
+    if len(set(sizes)) == 1:
+        told = escape(str(first.get("words") or sizes[0]))
     else:
-        text += "; ".join(
-            f"{escape(axis)}: {escape(_sizes(finding))} <span class=soft>({_evidence(finding)})</span>"
-            for axis, _, finding in members
-        )
-    if first.get("inflation_words"):
+        told = f"{escape(WORDS.get(first['cause'], ''))} "
+        told += "; ".join(f"{escape(axis)}: {escape(size)}" for (axis, _, _), size in zip(members, sizes, strict=True))
+        told += "."
+    nats = sorted(_nats(finding) for finding in findings)
+    evidence = _evidence(first) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
+    text = f"<strong>{_cause(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
+    if len(members) == 1 and first.get("inflation_words"):
         text += f" {escape(str(first['inflation_words']))}"
     return text
 
 
 def _evidence(finding: Mapping[str, Any]) -> str:
     text = f"{_whole(_nats(finding))} nats"
-    if finding.get("net_nats") is not None:
-        text += f", {_whole(finding['net_nats'])} net of the search"
+    net = finding.get("net_nats")
+    if net is not None and math.isfinite(net):
+        text += f", {_whole(net)} net of the search"
     return text
 
 
@@ -269,7 +276,7 @@ def _sizes(finding: Mapping[str, Any]) -> str:
     """The estimate: each size with its 90 % interval."""
     told = []
     for key, value in finding["estimate"].items():
-        name = key.replace("_", " ")
+        name = _quantity(key)
         if isinstance(value, Mapping) and "median" in value:
             unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
             text = f"{name} {number(value['median'])}{unit}"
@@ -279,6 +286,11 @@ def _sizes(finding: Mapping[str, Any]) -> str:
             text = f"{name} {number(value) if isinstance(value, float) else value}"
         told.append(text)
     return ", ".join(told)
+
+
+def _quantity(key: str) -> str:
+    """The name of an estimate without its unit, which stands with the number."""
+    return key.removesuffix("_hz").removesuffix("_s").replace("_", " ")
 
 
 def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
@@ -379,12 +391,12 @@ def _statistics(entry: Mapping[str, Any], one: Diagnosed) -> Iterator[str]:
     sides = "".join(f"<th scope=colgroup colspan=3>{side}</th>" for side in ("Before", "After"))
     heads = "<th scope=col>measured</th><th scope=col>simulated</th><th scope=col>verdict</th>" * 2
     table = (
-        f"<table><caption>{name}, before and after the findings are in the model. Simulated: 0.5 to 99.5 %.</caption>"
         f"<colgroup></colgroup><colgroup span=3></colgroup><colgroup span=3></colgroup>"
         f"<thead><tr><th scope=col rowspan=2>statistic</th>{sides}</tr><tr>{heads}</tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody></table>"
+        f"<tbody>{''.join(rows)}</tbody>"
     )
-    yield f"<details><summary>Table: {name}</summary>{scrolled(name, table)}</details>"
+    caption = "Before and after the findings are in the model. Simulated: 0.5 to 99.5 %."
+    yield f"<details><summary>Table: {name}</summary>{scrolled(name, caption, table)}</details>"
 
 
 def _gains(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
@@ -424,12 +436,14 @@ def _gains(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             )
         body.append(f"<tr>{cells}</tr>")
     table = (
-        "<table><caption>Log predictive score in nats a sample, and error of the predicted bias (root mean square), "
-        "on time that the fit did not see. ±: one standard deviation.</caption><thead><tr><th scope=col>finding</th>"
-        f"<th scope=col>score before</th><th scope=col>score after</th><th scope=col>gain</th>{heads}</tr></thead>"
-        f"<tbody>{''.join(body)}</tbody></table>"
+        "<thead><tr><th scope=col>finding</th><th scope=col>score before</th><th scope=col>score after</th>"
+        f"<th scope=col>gain</th>{heads}</tr></thead><tbody>{''.join(body)}</tbody>"
     )
-    yield scrolled("Held-out gain", table)
+    caption = (
+        "Log predictive score in nats a sample, and error of the predicted bias (root mean square), "
+        "on time that the fit did not see. ±: one standard deviation."
+    )
+    yield scrolled("Held-out gain", caption, table)
     yield from _inflation(rows)
     yield "</section>"
 
@@ -454,11 +468,8 @@ def _inflation(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Iterator[str]:
         + "</tr>"
         for axis, finding, factors in told
     )
-    table = (
-        "<table><caption>Fitted without the cause, over the same fitted with it.</caption>"
-        f"<thead><tr><th scope=col>finding</th>{heads}</tr></thead><tbody>{body}</tbody></table>"
-    )
-    yield scrolled("Inflation", table)
+    table = f"<thead><tr><th scope=col>finding</th>{heads}</tr></thead><tbody>{body}</tbody>"
+    yield scrolled("Inflation", "Fitted without the cause, over the same fitted with it.", table)
 
 
 def _factor(value: Any) -> str:
@@ -484,22 +495,19 @@ def _not_found(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         + "</tr>"
         for cause, found in sizes.items()
     )
-    table = (
-        "<table><caption>Size that would have been found, by cause and axis.</caption>"
-        f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody></table>"
-    )
-    yield f"{scrolled('Looked for and not found', table)}</section>"
+    table = f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody>"
+    caption = "Size that would have been found, by cause and axis."
+    yield f"{scrolled('Looked for and not found', caption, table)}</section>"
 
 
 def _least(size: Mapping[str, Any]) -> str:
     told = []
     for key, value in size.items():
-        unit = ""
-        if isinstance(value, Mapping):
-            unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
-            value = value.get("value", value.get("median"))
-        text = number(float(value), 3) if isinstance(value, int | float) else str(value)
-        told.append(f"{key.replace('_', ' ')} {text}{unit}")
+        inner = value if isinstance(value, Mapping) else {"value": value}
+        unit = "" if inner.get("unit") in (None, "1") else f" {inner['unit']}"
+        size_of = inner.get("value", inner.get("median"))
+        text = number(float(size_of), 3) if isinstance(size_of, int | float) else str(size_of)
+        told.append(f"{_quantity(key)} {text}{unit}")
     return ", ".join(told)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
@@ -30,6 +31,7 @@ PAIRS = 100_000
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
 Summary = Callable[[Array, Array], Array]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
     )
 
 
-def allan_deviation(y: Array, sizes: Array) -> Array:
+def allan_deviation(y: Array, sizes: Indices) -> Array:
     """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
     its samples. Pairs begin an eighth of a mean apart, in long records further."""
     good = np.isfinite(y)
@@ -280,7 +282,7 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Compar
         x = np.nan_to_num(x - np.nanmean(x))
         size = next_fast_len(x.size + lags + 1, real=True)
         product = irfft(np.abs(rfft(x, size)) ** 2, size)[: lags + 1]
-        return product[1:] / product[0]
+        return np.asarray(product[1:] / product[0])
 
     what = "magnitudes of the residual innovations" if magnitude else "residual innovations"
     return Compared(
@@ -295,18 +297,18 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Compar
     )
 
 
-def _pieces(record: Record, count: int) -> tuple[Array, Array]:
+def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
     n = record.present.size
     edges = np.unique(np.linspace(0, n, min(count, max(1, n // 10)) + 1).astype(int))
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz
 
 
-def _reduced(edges: Array, values: Array) -> Array:
+def _reduced(edges: Indices, values: Array) -> Array:
     """Mean of the finite values in each piece."""
     good = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):
         total = np.add.reduceat(np.where(good, values, 0.0), edges[:-1])
-        return total / np.add.reduceat(good.astype(float), edges[:-1])
+        return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
 
 
 def _level(finding: Finding, record: Record, means: bool = False) -> Compared:
@@ -334,7 +336,7 @@ def _largest(finding: Finding, record: Record) -> Compared:
 
     def summary(y: Array, w: Array) -> Array:
         found = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
-        return np.where(found < 0.0, np.nan, found)
+        return np.asarray(np.where(found < 0.0, np.nan, found))
 
     return Compared(
         "Largest residual innovations",
@@ -352,7 +354,7 @@ def _histogram(before: State, after: State) -> Compared:
 
     def summary(y: Array, w: Array) -> Array:
         counts = np.histogram(np.clip(w[np.isfinite(w)], -7.999, 7.999), edges)[0]
-        return np.log10(np.maximum(counts, 0.3))
+        return np.asarray(np.log10(np.maximum(counts, 0.3)))
 
     return Compared(
         "Histogram of the residual innovations",
@@ -415,8 +417,8 @@ def _readings(finding: Finding, factor: float, unit: str) -> Compared:
 
 def _missing(record: Record) -> Figure:
     edges, middle = _pieces(record, POINTS // 2)
-    share = _reduced(edges, (~record.present).astype(float)) * 100.0
-    gone = np.flatnonzero(~record.present)
+    share = _reduced(edges, (~record.present.astype(bool)).astype(float)) * 100.0
+    gone = np.flatnonzero(~record.present.astype(bool))
     runs = np.split(gone, np.flatnonzero(np.diff(gone) > 1) + 1) if gone.size else []
     longest = max((run.size for run in runs), default=0)
     return Figure(
