@@ -1,4 +1,5 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
+#   make help                   this list
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
@@ -12,6 +13,9 @@
 #   make firmware [TARGET=...] [CFLAGS=...] [ACCEPT=1]   build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above its budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
+#   make setup                  the set-up alone
+#   make lock [UPGRADE=1 | UPGRADE=name]   versions and hashes of the Python packages, from the names in tools/pyproject.toml
+#   make clean                  removes what was made, but for .venv
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
 PYTHON ?= python3
@@ -19,13 +23,22 @@ BUILD := build
 VENV := .venv
 BIN := $(VENV)/bin
 RECORDING ?= tests/data/simulated_adis16405.npz
+# A file's name is data: make expands nothing in it, here or in a make below, and the shell takes it from the environment.
+ifeq ($(origin RECORDING),command line)
+MAKEOVERRIDES :=
+endif
+override RECORDING := $(value RECORDING)
+export RECORDING
 
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix quick test hidden soak tolerances emulate c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden soak tolerances emulate c-tests check clean
 
 all: setup
+
+help:
+	@sed -n 's/^#   //p; /^# Settings/s/^# //p' Makefile
 
 # ------------------------------------------------------------------------------------------------------------- set-up
 
@@ -34,29 +47,47 @@ UNITY := $(UNITY_ROOT)/unity.c
 PACKAGE := $(VENV)/package.stamp
 MODEL := $(BUILD)/model
 
-setup: system python $(UNITY)
+# One at a time: whoever has waited for the lock finds all done.
+setup:
+	@mkdir -p $(BUILD)
+	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 system $(PACKAGE) $(UNITY)
 
 system:
 	@PYTHON="$(PYTHON)" tools/setup/system.sh
 
 python: $(PACKAGE)
 
+ifdef SETTING_UP
+# Of stated hashes, and nothing that would have to be built by what has none. The venv's own pip is replaced as well.
 $(VENV)/requirements.stamp: tools/requirements.txt | system
-	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --requirement tools/requirements.txt
+	@echo "Python packages into $(VENV) (a minute or two)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements.txt
 	@touch $@
 
 # Installed in place: Python sources need no new set-up, C and C++ ones do.
 $(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt $(wildcard tools/bindings/*) \
             $(wildcard host_sim/*) $(wildcard lib/*.[ch])
-	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --editable tools
+	@echo "selfcal into $(VENV): its C and C++ is compiled (a minute)"
+	$(BIN)/python -m pip install --no-build-isolation --no-deps --editable tools
 	@touch $@
 
 ifeq ($(UNITY_ROOT),$(BUILD)/unity)
 $(UNITY): tools/setup/unity.py | system
+	@echo "Unity into $(UNITY_ROOT) (half a minute)"
 	$(PYTHON) tools/setup/unity.py $(UNITY_ROOT)
 	@touch $@
 endif
+else
+$(PACKAGE) $(UNITY): setup ;
+endif
+
+# Versions and hashes anew, from the names in tools/pyproject.toml. What has a version keeps it: UPGRADE=1 takes the newest of all, UPGRADE=numpy of one.
+lock:
+	@mkdir -p $(BUILD) && $(PYTHON) -m venv --clear $(BUILD)/lock
+	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: --requirement tools/setup/lock.txt
+	cd tools && ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group dev --custom-compile-command "make lock" \
+	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements.txt pyproject.toml
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
@@ -65,7 +96,7 @@ $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal
 
 run: setup
 	@mkdir -p $(BUILD)/run
-	$(BIN)/selfcal replay $(RECORDING) --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png
+	$(BIN)/selfcal replay --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png -- "$$RECORDING"
 
 # The firmware for this machine, of the default model; `selfcal replay` builds its own for each recording's rate.
 posix: $(MODEL)/selfcal_model.c
@@ -200,7 +231,7 @@ flash: setup
 BENCH := $(BUILD)/bench
 BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
-ARM_FAST += $(CURDIR)/tests/bench/%
+ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part has: the measuring and its records take some of it.
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
@@ -221,8 +252,7 @@ $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
-	cd $$(@D)/objects && $$(call arm_objects,$(ARM_$(1)) -I$(CURDIR)/lib -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D), \
-	    $(patsubst %,$(CURDIR)/%,$(filter-out lib/%,$(BENCH_C))) $(CURDIR)/$$(@D)/selfcal_model.c)
+	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),$(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
@@ -246,8 +276,8 @@ bench-images: $(BENCH)/$(1)/$(2).elf
 $(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS='$(MORE_$(2))'
-	cd $$(@D)/$(2) && $$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -I$(CURDIR)/lib -I$$(CURDIR)/$$(@D), \
-	    $(addprefix $(CURDIR)/,$(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
+	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),$(addprefix tests/bench/,count.c image.c more.c record.c) \
+	    $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
 	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))

@@ -123,6 +123,8 @@ def load(
         raise UserError(f"the rate must be above 0 Hz, not {rate:g}")
     header = _Header(path, columns, units, by_name, sensors)
     name = path.name.lower()
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder: name a recording in it (.csv, .csv.gz or .npz)")
     try:
         with path.open("rb") as stream:
             if not stream.read(1):

@@ -121,6 +121,11 @@ class Tables:
     half_life_s: float = 0.0
 
     @property
+    def rate_hz(self) -> float:
+        """Of the samples."""
+        return self.block / self.dt_s
+
+    @property
     def nodes(self) -> int:
         """Filters of all hypotheses."""
         return sum(h.nodes for h in self.hypotheses)
@@ -157,7 +162,7 @@ def gate_table(model: Model, tables: Tables) -> GateTable | None:
     """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
     if model.gate is None or tables.block < 2:
         return None
-    gate, rate_hz = model.gate, tables.block / tables.dt_s
+    gate, rate_hz = model.gate, tables.rate_hz
     wanted = gate.window_s * rate_hz
     divisors = [n for n in range(2, tables.block + 1) if tables.block % n == 0]
     groups = [model.group_of(axis.name) for axis in tables.axes]

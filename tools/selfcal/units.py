@@ -24,6 +24,8 @@ from selfcal.errors import UserError
 STANDARD_GRAVITY = 9.80665
 #: A two-sided density is this many times the one-sided one.
 ONE_SIDED_TO_TWO_SIDED = 1.0 / math.sqrt(2.0)
+#: Allan deviation of flicker noise over its coefficient, the bias instability: sqrt(2 ln 2 / pi).
+FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Counts of the sensor's least significant bit; a scale turns them into a unit.
 LSB = "LSB"
 
@@ -159,3 +161,31 @@ def parameter_unit(parameter: str, unit: str) -> str:
         case "spectral_ratio" | "markov_ratio":
             return "1"
     raise ValueError(f"no such parameter: {parameter}")
+
+
+#: Units of data sheets, of a parameter of an angular rate and of an acceleration.
+_DATASHEET = {
+    "bias": ("deg/h", "ug"),
+    "sigma_m": ("deg/h", "ug"),
+    "B": ("deg/h", "ug"),
+    "N": ("deg/sqrt(h)", "ug/sqrt(Hz)"),
+    "K": ("deg/h/sqrt(h)", "ug/sqrt(h)"),
+}
+
+
+def datasheet_unit(parameter: str, unit: str) -> str:
+    """The unit that data sheets state a model parameter in, of an axis that reads in `unit`; that of `parameter_unit`
+    for what they do not state."""
+    if parameter in _DATASHEET:
+        for reading, of_kind in zip(("rad/s", "m/s^2"), _DATASHEET[parameter], strict=True):
+            if same_kind(unit, reading):
+                return of_kind
+    return parameter_unit(parameter, unit)
+
+
+def typeset(unit: str) -> str:
+    """A unit as print has it: `deg/s/sqrt(Hz)` -> `°/s/√Hz`."""
+    text = re.sub(r"sqrt\((\w+)\)", r"√\1", unit)
+    for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³"), ("°C", "°C")):
+        text = text.replace(plain, print_)
+    return text

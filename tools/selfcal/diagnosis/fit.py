@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from selfcal import _likelihood
@@ -73,7 +72,6 @@ class Fit:
     n: float
     dt: float
     duration_s: float
-    information: Array | None = field(default=None, compare=False)
 
     def value(self, name: str) -> float:
         """One parameter of the vector."""
@@ -161,12 +159,10 @@ def best(fits: Sequence[Fit]) -> Fit:
     return max(fits, key=lambda one: one.ln_likelihood)
 
 
-def moved(fit_: Fit, terms: Terms) -> Array:
-    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small."""
-    known = dict(zip(fit_.terms.names, fit_.theta, strict=True))
+def moved(fit_: Fit, terms: Terms, other: Fit | None = None) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, then those of `other`; new ones begin
+    small."""
+    known = {} if other is None else dict(zip(other.terms.names, other.theta, strict=True))
+    known |= dict(zip(fit_.terms.names, fit_.theta, strict=True))
     fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
     return np.array([known.get(name, fresh.get(name, -2.0 if name.startswith("ln_") else 0.0)) for name in terms.names])
-
-
-Progress = Callable[[str], None]
-Mask = NDArray[np.bool_]

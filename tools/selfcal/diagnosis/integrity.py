@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import ndtr
-from scipy.stats import chi2, truncnorm
+from scipy.stats import chi2, poisson, truncnorm
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
-from selfcal.diagnosis.statemodel import Array
+from selfcal.diagnosis.statemodel import Array, Mask
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
@@ -26,13 +26,14 @@ BURST_LEAST = 1.5
 REST_PRICE = 4.0
 
 
-def missing(record: Record) -> Look | None:
-    """Gaps in the stamps."""
-    gone = int((~record.present).sum())
+def missing(record: Record) -> tuple[Look, Mask] | None:
+    """Gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is those."""
+    held = _held(record)
+    gone = int((~record.present).sum() + held.sum())
     if gone <= MISSING_LEAST * record.present.size:
         return None
-    where = np.flatnonzero(~record.present) / record.rate_hz
-    return Look(
+    where = np.flatnonzero(~record.present | held) / record.rate_hz
+    look = Look(
         "missing_samples",
         float(gone),
         float(gone),
@@ -40,6 +41,24 @@ def missing(record: Record) -> Look | None:
         {},
         when=(float(where[0]), float(where[-1])),
     )
+    return look, held
+
+
+def _held(record: Record) -> Mask:
+    """Rows all of whose axes repeat, where their lattices make fewer such rows by chance."""
+    none = np.zeros(record.present.size, bool)
+    repeats = []
+    for state in record.axes.values():
+        same = np.zeros(record.present.size, bool)
+        same[1:] = np.diff(state.y) == 0.0
+        repeats.append(same)
+    if not repeats:
+        return none
+    held = np.all(repeats, axis=0)
+    shares = [(float(same.sum()) - float(held.sum())) / same.size for same in repeats]
+    expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
+    # Chance repeats of coarse axes are not quite independent: three times the expectation.
+    return held if poisson.logsf(int(held.sum()) - 1, 3.0 * expected + 0.05) < -NET_LEAST else none
 
 
 def quantization(state: State) -> Look | None:
@@ -77,14 +96,14 @@ def saturation(state: State) -> tuple[Look, State] | None:
     for sign in (1, -1):
         edge = float(np.nanmax(sign * y))
         at_edge = finite & (sign * y >= edge - 1e-9 * max(1.0, abs(edge)))
-        if at_edge.sum() < 5:
+        if at_edge.sum() < 3:
             continue
         half = 0.5 * state.lsb
         predicted = sign * (y - state.whitened * np.sqrt(state.variance))
         beyond = ndtr((predicted - edge - half) / np.sqrt(state.variance))
         expected = float(np.nansum(beyond))
-        # Heavy tails inside the limit make the expectation uncertain by its root: ask for a clear excess.
-        if expected - 2.0 * math.sqrt(expected) < NET_LEAST or at_edge.sum() < 0.5 * expected:
+        # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
+        if expected < NET_LEAST + math.log(2.0) or at_edge.sum() < 0.5 * expected:
             continue
         sides.append((sign * edge, int(at_edge.sum())))
         gain += expected
@@ -106,7 +125,7 @@ def saturation(state: State) -> tuple[Look, State] | None:
     return look, found
 
 
-def _unclipped(state: State, at_edge: Array, edge: float, sign: int) -> State:
+def _unclipped(state: State, at_edge: Mask, edge: float, sign: int) -> State:
     random = np.random.default_rng(1)
     for _ in range(4):
         s = np.sqrt(state.variance[at_edge])
@@ -119,7 +138,7 @@ def _unclipped(state: State, at_edge: Array, edge: float, sign: int) -> State:
     return state
 
 
-def motion(record: Record) -> dict[str, tuple[Look, Array]]:
+def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
     """Bursts of energy on two axes or more at once, 0.5 to 16 s long, against each axis' own level about it."""
     # On a lattice coarser than the noise a rare change of code looks like a burst.
     names = [name for name, state in record.axes.items() if state.lsb < 1.5 * state.best.sigma]
@@ -137,8 +156,6 @@ def motion(record: Record) -> dict[str, tuple[Look, Array]]:
         squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
     count = len(names)
-    # Looks: windows of every length, half a length apart.
-    ln_looks = math.log(max(2.0, n / rate)) + 1.0
     worth, half = np.zeros(n), np.zeros(n, np.int64)
     for length in MOTION_S:
         window = round(length * rate)
@@ -147,12 +164,15 @@ def motion(record: Record) -> dict[str, tuple[Look, Array]]:
         mean = uniform_filter1d(power, window, axis=1, mode="reflect") if window > 1 else power
         gain = 0.5 * window * _excess(mean)
         # One axis alone is an outlier or a change of its own noise: the others together must show the burst too.
+        strongest = gain.argmax(axis=0)
         rest = gain.sum(axis=0) - gain.max(axis=0)
+        others = (mean.sum(axis=0) - np.take_along_axis(mean, strongest[None], axis=0)[0]) / (count - 1)
+        # Windows half a length apart, of every length.
+        ln_looks = math.log(2.0 * n / window) + math.log(len(MOTION_S))
         each = -chi2.logsf(2.0 * gain.sum(axis=0), count)  # a size of its own on every axis
         common = -chi2.logsf(window * count * _excess(mean.mean(axis=0)), 1)  # one size on all
-        told = np.minimum(
-            np.maximum(each, common) - math.log(2.0) - ln_looks, -chi2.logsf(2.0 * rest, count - 1) - REST_PRICE
-        )
+        beside = np.maximum(-chi2.logsf(2.0 * rest, count - 1), -chi2.logsf(window * (count - 1) * _excess(others), 1))
+        told = np.minimum(np.maximum(each, common) - math.log(2.0) - ln_looks, beside - REST_PRICE)
         better = told > worth
         worth[better], half[better] = told[better], (window + 1) // 2
     bursts: list[tuple[int, int]] = []
@@ -171,15 +191,15 @@ def motion(record: Record) -> dict[str, tuple[Look, Array]]:
     mask = np.zeros(n, bool)
     for a, b in joined:
         mask[max(0, a - pad) : b + pad] = True
-    found: dict[str, tuple[Look, Array]] = {}
+    found: dict[str, tuple[Look, Mask]] = {}
     for k, name in enumerate(names):
-        gain = sum(_burst(power[k, a:b]) for a, b in joined)
+        worth_here = sum(_burst(power[k, a:b]) for a, b in joined)
         shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 2.0]
         if not shown:
             continue
         look = Look(
             "motion",
-            gain,
+            worth_here,
             total,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
@@ -224,8 +244,8 @@ def _robust_level(square: Array, block: int, around: int) -> Array:
     return np.maximum(level, 1e-9)
 
 
-def masked(state: State, mask: Array) -> State:
+def masked(state: State, mask: Mask) -> State:
     """The state without the samples of `mask`."""
     y = state.y.copy()
-    y[mask.astype(bool)] = np.nan
+    y[mask] = np.nan
     return replace(state, y=y)

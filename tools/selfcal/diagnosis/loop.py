@@ -22,6 +22,9 @@ LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
     noise.variance_change,
     noise.outliers,
 )
+#: Those that motion must not be taken for, and what they must show to be taken first.
+STATIONARY = (periodic.looks, noise.colored)
+CERTAIN = 50.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 10
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
@@ -68,6 +71,12 @@ def diagnose_record(
         states[name] = state.refit()
     record = replace(record, axes=states)
     found = {name: Diagnosed(states[name], states[name]) for name in axes}
+    # Lines and colour first: motion is what stands out of the noise once these are known.
+    for name in states:
+        one = found.get(name) or Diagnosed(states[name], states[name])
+        _rounds(record, one, advance, STATIONARY, CERTAIN)
+        states[name] = one.state
+    record = replace(record, axes=states)
     record = _integrity(record, found)
     for name in axes:
         _rounds(record, found[name], advance)
@@ -82,20 +91,23 @@ def diagnose_record(
 
 
 def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+    gone = integrity.missing(record)
+    if gone is not None and gone[1].any():
+        masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
+        record = replace(record, axes=masked)
     states = dict(record.axes)
     moved = integrity.motion(record)
     if moved:
         mask = next(iter(moved.values()))[1]
         for name in states:
             states[name] = integrity.masked(states[name], mask).refit()
-    gone = integrity.missing(record)
     for name, one in found.items():
         if name in moved:
             one.findings.append(
                 Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
             )
         if gone is not None:
-            one.findings.append(Finding(gone, 0, one.state, states[name]))
+            one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
         clipped = integrity.saturation(states[name])
         if clipped is not None:
@@ -113,14 +125,21 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     return replace(record, axes=states)
 
 
-def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None]) -> None:
-    for number in range(1, ROUNDS + 1):
+def _rounds(
+    record: Record,
+    one: Diagnosed,
+    advance: Callable[[str], None],
+    causes: tuple[Callable[[State, Record], list[Look]], ...] = LOOKS,
+    least: float = NET_LEAST,
+) -> None:
+    first = 1 + max((finding.round for finding in one.findings), default=0)
+    for number in range(first, ROUNDS + 1):
         advance(f"{one.state.axis}: round {number}")
         looks = sorted(
-            (look for cause in LOOKS for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
+            (look for cause in causes for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
         )
         one.refused = looks
-        if not looks or looks[0].net < NET_LEAST:
+        if not looks or looks[0].net < least:
             return
         best = looks[0]
         rivals = tuple(

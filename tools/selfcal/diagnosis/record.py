@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array
+from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import Recording
@@ -29,7 +29,7 @@ class Record:
     axes: Mapping[str, State]
     channels: Mapping[str, Array]
     channel_names: Mapping[str, str]
-    present: Array
+    present: Mask
 
     @property
     def time_s(self) -> Array:

@@ -14,7 +14,7 @@ from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 8e-4
+P_LOOK = 3e-4
 NET_LEAST = -math.log(P_LOOK)
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
@@ -116,8 +116,9 @@ def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     if same:
         return fit(series, terms, same[0].theta, step=0.5)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
-    if near:
-        return fit(series, terms, moved(near[0], terms))
+    richest = max(known, key=lambda one: len(one.terms.names), default=None)
+    if near and richest is not None:
+        return fit(series, terms, moved(near[0], terms, richest))
     return fit(series, terms)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 #: A Gauss-Markov drift keeps within these correlation rates, 1/s: faster ones are coloured noise.
 ALPHA_LIMITS = (2e-4, 0.2)

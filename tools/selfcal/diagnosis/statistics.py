@@ -111,13 +111,14 @@ def all_statistics(w: Array, y: Array, lsb: float) -> dict[str, float]:
 def _lagged(x: Array, count: int) -> Array:
     """sum x_i x_(i+k) for k below `count`."""
     size = next_fast_len(x.size + count, real=True)
-    return irfft(np.abs(rfft(x, size)) ** 2, size)[:count]
+    found: Array = irfft(np.abs(rfft(x, size)) ** 2, size)[:count]
+    return found
 
 
 def _root(value: float, freedom: int) -> float:
     """A chi-square as a normal deviate (Wilson and Hilferty)."""
     a = 2.0 / (9.0 * freedom)
-    return ((max(value, 1e-12) / freedom) ** (1.0 / 3.0) - 1.0 + a) / math.sqrt(a)
+    return (float(max(value, 1e-12)) / freedom ** (1.0 / 3.0) - 1.0 + a) / math.sqrt(a)
 
 
 def _largest(x: Array) -> float:

@@ -32,12 +32,19 @@ def codegen(
     Raises UserError for a bad model file or a folder that cannot be written.
     """
     loaded = Model.load(model)
-    tables = make_tables(loaded, rate or loaded.sensor_rate_hz, tuple(axes) if axes else None, target)
+    tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     write_tables(loaded, tables, Path(output))
     if loaded.gate is not None and gate_table(loaded, tables) is None:
         said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables
+
+
+def assumption(tables: Tables) -> str:
+    """What the tables take for granted of the samples that they are fed with."""
+    samples = "1 sample" if tables.block == 1 else f"{tables.block} samples"
+    make = "makes" if tables.block == 1 else "make"
+    return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
 
 
 def write_tables(model: Model, tables: Tables, folder: Path) -> None:
@@ -76,7 +83,9 @@ def _header(model: Model, tables: Tables) -> str:
      SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) + \
      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
 /* Rate of the samples, Hz. */
-#define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+#define SELFCAL_MODEL_RATE_HZ {_f(tables.rate_hz)}
+/* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */
+#define SELFCAL_MODEL_RATE_MILLIHZ {round(1000.0 * tables.rate_hz)}UL
 /* 1: every axis is one of lib/selfcal.dbc, in the unit that it has there. The library alone takes any. */
 #define SELFCAL_MODEL_UNITS_SENT {int(all(carries(axis.name, axis.unit) for axis in tables.axes))}
 /* 1: selfcal_model_gate is there. */

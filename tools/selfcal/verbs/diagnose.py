@@ -14,10 +14,11 @@ from selfcal.diagnosis.extend import as_text, extended
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.words import WORDS
+from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import Scale, load
-from selfcal.verbs.identify import chosen_axes, write_json
+from selfcal.verbs.identify import chosen_axes
 
 
 def diagnose(
@@ -43,6 +44,7 @@ def diagnose(
     """
     if fail_on is not None and fail_on not in ("inadequate", *WORDS):
         raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
+    check_writable(json, report, write_model)
     loaded = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)

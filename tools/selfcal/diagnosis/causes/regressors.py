@@ -6,13 +6,19 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.fft import rfft
+from scipy.stats import chi2
 
+from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, net
+from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, net
+from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does.
 SMOOTHING_S = (1.0, 10.0, 60.0)
+#: Bands of equal information that must agree on another axis' coefficient.
+BANDS = 16
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
 LN_SMOOTHINGS = math.log(2.0)
 
@@ -59,6 +65,33 @@ def looks(state: State, record: Record) -> list[Look]:
     return found
 
 
+def _inconstancy(state: State, column: Array) -> float:
+    """-ln p of a coefficient that is the same at every frequency.
+
+    A reading that follows another axis does so at all frequencies alike. Two axes that share a line, a temperature or a
+    shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
+    Bands hold equal information; in each the coefficient is estimated by itself.
+    """
+    fit = state.best
+    _, white, _ = run(state.series.beside(column), fit.terms, fit.theta, innovations=True)
+    white = np.nan_to_num(white)
+    q, _ = np.linalg.qr(white[:, 1:-1])
+    u = white[:, -1] - q @ (q.T @ white[:, -1])
+    w = white[:, 0] - q @ (q.T @ white[:, 0])
+    c = float(u @ w) / float(u @ u)
+    U, W = rfft(u), rfft(w - c * u)
+    A, B = np.abs(U) ** 2, (np.conj(U) * W).real
+    edges = np.searchsorted(np.cumsum(A) / A.sum(), np.linspace(0.0, 1.0, BANDS + 1)[1:-1])
+    edges = np.unique(np.concatenate([[0], edges + 1, [A.size]]))
+    information = np.add.reduceat(A, edges[:-1])
+    score = np.add.reduceat(B, edges[:-1])
+    # The transform doubles every bin but the first: half of the bins' power is in the real part.
+    noise = float(np.var(w - c * u)) * u.size / 2.0
+    chi = float((score**2 / np.maximum(information, 1e-300)).sum()) / noise
+    freedom = information.size - 1
+    return float(-chi2.logsf(chi, freedom)) if freedom > 0 else 0.0
+
+
 def _linear(state: State, cause: str, options: list[Regressor], key: str, ln_looks: float = 0.0) -> list[Look]:
     usable = [one for one in options if np.ptp(one.values) > 0.0]
     if not usable:
@@ -71,7 +104,10 @@ def _linear(state: State, cause: str, options: list[Regressor], key: str, ln_loo
     worth = net(gain, 1, ln_looks)
     if worth < 1.0:
         return []
-    if cause != "cross_axis":
+    if cause == "cross_axis":
+        if net(gain, 1, ln_looks) > 3.0 and _inconstancy(state, chosen.values) > NET_LEAST:
+            return []
+    else:
         gain = min(gain, state.rich_gain(chosen.values))
         worth = net(gain, 1, ln_looks)
     unit = coefficient_unit(state.unit, chosen.unit)
