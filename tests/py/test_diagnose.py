@@ -139,7 +139,8 @@ def test_the_whole_loop_for_temperature(tmp_path: Path) -> None:
     truth = meta["effects"][0]["axes"]["gx"]["coefficient"]
     assert found["cause"] == "temperature"
     c = found["estimate"]["coefficient"]
-    assert abs(c["median"] - truth) < 4.0 * c["sd"]
+    # The recorded temperature has noise and a lattice of 0.14 degC: they cost up to 3 % of the size.
+    assert abs(c["median"] - truth) < 3.0 * c["sd"] + 0.03 * truth
     assert document["axes"]["gy"]["verdict"] == "adequate"
     assert "temperature" in page.read_text(encoding="utf-8")
     # The library agrees that the column is in use, with the same coefficient.
@@ -153,7 +154,7 @@ def test_the_whole_loop_for_temperature(tmp_path: Path) -> None:
     simulate(extended, again, seed=5)
     repeated = diagnose(again, axes=["gx"])["axes"]["gx"]["findings"][0]
     assert repeated["cause"] == "temperature"
-    assert abs(repeated["estimate"]["coefficient"]["median"] - c["median"]) < 5.0 * c["sd"]
+    assert abs(repeated["estimate"]["coefficient"]["median"] - c["median"]) < 3.0 * c["sd"] + 0.03 * truth
 
 
 def test_the_gain_is_on_time_that_was_not_fitted(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Mask
@@ -104,7 +105,7 @@ def lattice(values: Array) -> float:
     """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
     where every difference is a whole multiple of it."""
     unique = np.unique(values)
-    if unique.size < 3 or unique.size > max(50, values.size // 4):
+    if unique.size < 3:
         return 0.0
     gaps = np.diff(unique)
     gaps = gaps[gaps > 1e-9 * max(np.ptp(unique), np.abs(unique).max())]
@@ -114,3 +115,8 @@ def lattice(values: Array) -> float:
     steps = np.rint(gaps / least)
     q = float(gaps.sum() / steps.sum())
     return q if np.all(np.abs(gaps - steps * q) < 0.02 * q) else 0.0
+
+
+def smoothed(values: Array, window: int) -> Array:
+    """Centred mean over `window` samples. It has no lag: the size that it shows is the cause's own."""
+    return values if window <= 1 else np.asarray(uniform_filter1d(values, window, mode="nearest"))

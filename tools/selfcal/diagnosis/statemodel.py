@@ -75,9 +75,10 @@ class Matrices:
 
 
 def flicker_rates(duration_s: float, dt: float) -> Array:
-    """Correlation rates, 1/s, a decade apart, of the Gauss-Markov terms that together make 1/f noise over a record."""
-    low, high = math.log10(0.5 / duration_s), math.log10(1.0 / dt)
-    count = max(2, min(7, math.ceil(high - low)))
+    """Correlation rates, 1/s, of the Gauss-Markov terms that together make 1/f noise over a record: a decade apart or a
+    little less, from a third of a turn in the record to beyond half the sampling rate."""
+    low, high = math.log10(2.0 / duration_s), math.log10(4.0 / dt)
+    count = max(2, min(8, 1 + math.ceil(high - low)))
     return np.logspace(low, high, count)
 
 

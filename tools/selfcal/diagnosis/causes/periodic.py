@@ -24,6 +24,8 @@ BAND_LEAST = 12.0
 BAND_DEARER = 6.0
 #: Bands that one model may have.
 BANDS_MOST = 3
+#: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
+NARROW = 4
 
 
 def looks(state: State, record: Record) -> list[Look]:
@@ -47,7 +49,7 @@ def _band(state: State, record: Record) -> list[Look]:
             break
         mean = uniform_filter1d(power, width, mode="reflect")
         gain = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
-        gain[: low + width] = 0.0
+        gain[: max(low + width, NARROW * width)] = 0.0
         at = int(np.argmax(gain))
         if best is None or gain[at] > best[0]:
             best = (float(gain[at]), at, width)
@@ -70,6 +72,8 @@ def _band(state: State, record: Record) -> list[Look]:
         return []
     centre = f * math.exp(chosen.value(f"shift{k}"))
     half_width = math.exp(chosen.value(f"ln_width{k}"))
+    if half_width * NARROW > centre:
+        return []
     rms = chosen.sigma * math.exp(chosen.value(f"ln_band{k}"))
     turns = max(1.0, half_width * n * state.dt)
     fits = tuple(one for one in (*state.fits, chosen))

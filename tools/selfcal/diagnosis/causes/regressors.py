@@ -10,13 +10,14 @@ from scipy.fft import rfft
 from scipy.stats import chi2
 
 from selfcal.diagnosis.fit import run
-from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, net
 from selfcal.diagnosis.statemodel import Array
-from selfcal.regressors import coefficient_unit, trailing_mean
+from selfcal.regressors import coefficient_unit
 
-#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does.
-SMOOTHING_S = (1.0, 10.0, 60.0)
+#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The window in
+#: the model file is as wide and trails: a module has no later values.
+SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
 #: Bands of equal information that must agree on another axis' coefficient.
 BANDS = 16
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
@@ -41,12 +42,12 @@ def looks(state: State, record: Record) -> list[Look]:
         options = []
         for width in SMOOTHING_S:
             window = max(1, round(width * record.rate_hz))
-            smooth = trailing_mean(values, window)
+            smooth = smoothed(values, window)
             reference = float(np.round(smooth.mean(), 3))
             entry = {"kind": "column", "column": column, "unit": unit, "reference": reference}
             entry |= {"window_s": width} if window > 1 else {}
             options.append(Regressor(cause, cause, smooth - reference, unit, entry))
-            if window >= 60.0 * record.rate_hz or window >= values.size // 10:
+            if window >= values.size // 10:
                 break
         found += _linear(state, cause, options, "coefficient", LN_SMOOTHINGS)
     others = record.other_axes(state.axis)
