@@ -15,8 +15,8 @@ from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, i
 from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
-#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The window in
-#: the model file is as wide and trails: a module has no later values.
+#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
+#: file's window is as wide and trails: a module has no later values.
 SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
 #: Bands of equal information that must agree on another axis' coefficient.
 BANDS = 16
