@@ -134,6 +134,8 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
     if cause in ("temperature", "supply", "cross_axis", "ramp", "step"):
         return [_series(finding, record, factor, unit), *_evidence(finding, record)]
     if cause == "periodic":
+        if not np.ptp(_effect(finding)) > 0.0:  # a band about a frequency that wanders, a term of the noise
+            return [_spectrum(before, after, factor, unit), _correlation(before, after)]
         return [_line(finding, factor, unit), *_evidence(finding, record)]
     if cause == "flicker":
         return [_allan(before, after, factor, unit)]
@@ -148,7 +150,7 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
     if cause in ("quantization", "saturation"):
         return [_readings(finding, factor, unit)]
     if cause == "missing_samples":
-        return [_missing(record)]
+        return [_missing(finding, record)]
     return [_unexplained(finding, record, factor, unit)]
 
 
@@ -303,7 +305,7 @@ def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz
 
 
-def _reduced(edges: Indices, values: Array) -> Array:
+def _reduced(edges: Indices, values: Array | NDArray[np.bool_]) -> Array:
     """Mean of the finite values in each piece."""
     good = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -415,16 +417,19 @@ def _readings(finding: Finding, factor: float, unit: str) -> Compared:
     )
 
 
-def _missing(record: Record) -> Figure:
+def _missing(finding: Finding, record: Record) -> Figure:
+    """Gaps in the stamps, and rows that the logger held."""
     edges, middle = _pieces(record, POINTS // 2)
-    share = _reduced(edges, (~record.present.astype(bool)).astype(float)) * 100.0
-    gone = np.flatnonzero(~record.present.astype(bool))
-    runs = np.split(gone, np.flatnonzero(np.diff(gone) > 1) + 1) if gone.size else []
+    before, after = finding.before.y, finding.after.y
+    held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
+    gone = held | ~record.present.astype(bool)
+    where = np.flatnonzero(gone)
+    runs = np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if where.size else []
     longest = max((run.size for run in runs), default=0)
     return Figure(
         "Missing samples",
-        f"{gone.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
-        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, share)])],
+        f"{where.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
+        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * _reduced(edges, gone))])],
     )
 
 
