@@ -144,7 +144,7 @@ emulate: setup
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
-	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py
+	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py tests/py/test_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)

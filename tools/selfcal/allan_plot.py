@@ -11,6 +11,7 @@ import numpy as np
 
 from selfcal import units
 from selfcal.errors import UserError
+from selfcal.output import whole
 
 #: The model's colour, and that of what does not fit.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
@@ -60,8 +61,9 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=110)
+    except ValueError as error:
         raise UserError(f"{path}: cannot save the plot: {error}") from error
     finally:
         pyplot.close(figure)

@@ -12,7 +12,7 @@ import typer
 from typer.exceptions import TyperException
 
 from selfcal.ending import install, last_signal
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
@@ -215,7 +215,7 @@ def simulate(
     """Write a simulated recording, read out as the sensor would, with its truth in its metadata."""
     from selfcal.verbs import simulate as verb
 
-    verb.simulate(model, output, seed=seed, effects=effect or ())
+    verb.show(verb.simulate(model, output, seed=seed, effects=effect or ()), output)
 
 
 @app.command()
@@ -396,7 +396,7 @@ def _usage(error: TyperException) -> str:
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"selfcal: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"selfcal: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     sys.exit(USER_ERROR)
 
 

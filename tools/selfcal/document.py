@@ -14,6 +14,7 @@ from selfcal import units
 from selfcal.allan import Sampled
 from selfcal.checks import Judged, allan_limit
 from selfcal.errors import UserError
+from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
 from selfcal.regressors import Scored
 from selfcal.result import AxisResult
@@ -151,15 +152,10 @@ def _regressors(scored: Scored | None) -> dict[str, Any]:
 
 
 def check_writable(*files: Path | str | None) -> None:
-    """Raise UserError now, before the work, for a file that could not be written after it: its folder is not there, or
-    it is one. None and '-' are no files."""
+    """Raise UserError now, before the work, for a file that could not be written after it. None and '-' are none."""
     for file in files:
-        if file is None or str(file) == "-":
-            continue
-        if not Path(file).parent.is_dir():
-            raise UserError(f"{file}: cannot write: there is no such folder; make it first")
-        if Path(file).is_dir():
-            raise UserError(f"{file}: cannot write: it is a folder; name a file in it")
+        if file is not None and str(file) != "-":
+            check_place(file)
 
 
 def write_json(document: Mapping[str, Any], path: Path | str) -> None:
@@ -168,10 +164,7 @@ def write_json(document: Mapping[str, Any], path: Path | str) -> None:
     if str(path) == "-":
         sys.stdout.write(text)
         return
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot write: {error.strerror}") from error
+    write_text(path, text)
 
 
 def _finite(value: Any) -> Any:

@@ -17,6 +17,7 @@ import numpy as np
 
 from selfcal import units
 from selfcal.errors import UserError
+from selfcal.output import write_text
 from selfcal.overbound import overbound, upper_limit
 
 #: Probability of the overbound where none is asked for.
@@ -71,10 +72,7 @@ def write_export(
     UserError where axes or laws are missing."""
     gyro, accel = (_kind(document, unit, overbound_level) for unit in ("rad/s", "m/s^2"))
     text = FORMS[form](gyro, accel, document["recording"])
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot write: {error.strerror}") from error
+    write_text(path, text)
 
 
 def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:

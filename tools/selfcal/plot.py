@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.model import LAWS
+from selfcal.output import whole
 from selfcal.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire import AxisReport, axis_unit
 
@@ -78,7 +79,7 @@ def plot_run(
         sharex=True,
         layout="constrained",
     )
-    figure.suptitle(title, parse_math=False)
+    figure.suptitle(printable(title), parse_math=False)
     for row, axis in zip(grid, axes, strict=True):
         reports = history[axis]
         time = np.array([report.time_s for report in reports])
@@ -134,8 +135,9 @@ def plot_run(
     for panel in grid[-1]:
         panel.set_xlabel("time, s")
     try:
-        figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=100)
+    except ValueError as error:
         raise UserError(f"{path}: cannot save the plot: {error}") from error
     finally:
         pyplot.close(figure)

@@ -8,9 +8,11 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from selfcal import units
+from selfcal.errors import printable
 from selfcal.model import LAWS, RATIOS, SUMS
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
@@ -50,7 +52,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         box=box.SIMPLE_HEAD,
         collapse_padding=left_out > 0,
         pad_edge=left_out == 0,
-        title=f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        title=f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s",
         title_justify="left",
         caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "

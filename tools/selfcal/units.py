@@ -18,7 +18,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, short
 
 #: m/s^2 per g (3rd CGPM, 1901: exact by definition).
 STANDARD_GRAVITY = 9.80665
@@ -46,7 +46,10 @@ _ACCELERATION = _dimension(length=1, time=-2)
 _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "1": (_NONE, 1.0),
     "rad": (_dimension(angle=1), 1.0),
+    "mrad": (_dimension(angle=1), 1e-3),
     "deg": (_dimension(angle=1), math.pi / 180.0),
+    "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
+    "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
     "m": (_dimension(length=1), 1.0),
     "s": (_TIME, 1.0),
     "ms": (_TIME, 1e-3),
@@ -72,7 +75,8 @@ _ZERO = {"degC": 273.15}
 
 #: What a recording's header may say, for error messages.
 RECORDING_UNITS = (
-    "deg/s", "rad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV", "s", "ms", "us", "ns",
+    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV",
+    "s", "ms", "us", "ns",
 )  # fmt: skip
 
 
@@ -86,24 +90,38 @@ class Unit:
     zero: float
 
 
-_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d+(?:\.\d+)?))?)\Z")
+_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
+#: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
+_LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
+#: Signs that a data sheet has, as this module writes them.
+_SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u"})
+
+
+def plain(name: str) -> str:
+    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²` -> `m/s^2`; what it does not know stays."""
+    return name.translate(_SIGNS)
 
 
 @cache
 def parse(name: str) -> Unit:
     """The unit called `name`. Raises UserError if it is not one."""
     dimension, size = _NONE, 1.0
+    unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
+    if len(name) > _LONGEST:
+        raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
         atom = match and (match["root"] or match["atom"])
         if match is None or atom not in _ATOMS:
-            raise UserError(f"unknown unit '{name}' (known: {', '.join(RECORDING_UNITS)})")
+            raise unknown
         power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
         if sign == "/":
             power = -power
         kind, scale = _ATOMS[atom]
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
+        if not _LEAST < size < _MOST:
+            raise unknown
     return Unit(name, dimension, size, _ZERO.get(name, 0.0))
 
 

@@ -240,7 +240,7 @@ def _robust_level(square: Array, block: int, around: int) -> Array:
     middle = median_filter(means, size, mode="reflect")
     # The median of a mean of `block` squares of normals, against its mean of 1 (Wilson and Hilferty).
     ratio = (1.0 - 2.0 / (9.0 * block)) ** 3
-    level = np.interp(np.arange(square.size), (np.arange(count) + 0.5) * block, middle / ratio)
+    level: Array = np.interp(np.arange(square.size), (np.arange(count) + 0.5) * block, middle / ratio)
     return np.maximum(level, 1e-9)
 
 

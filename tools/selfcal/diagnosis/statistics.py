@@ -118,7 +118,7 @@ def _lagged(x: Array, count: int) -> Array:
 def _root(value: float, freedom: int) -> float:
     """A chi-square as a normal deviate (Wilson and Hilferty)."""
     a = 2.0 / (9.0 * freedom)
-    return (float(max(value, 1e-12)) / freedom ** (1.0 / 3.0) - 1.0 + a) / math.sqrt(a)
+    return (math.cbrt(max(value, 1e-12) / freedom) - 1.0 + a) / math.sqrt(a)
 
 
 def _largest(x: Array) -> float:

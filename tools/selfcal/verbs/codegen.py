@@ -10,6 +10,7 @@ from rich.console import Console
 
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
+from selfcal.output import whole
 from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
 
@@ -51,10 +52,11 @@ def write_tables(model: Model, tables: Tables, folder: Path) -> None:
     """Write both files into `folder`. Raises UserError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "selfcal_model.h").write_text(_header(model, tables))
-        (folder / "selfcal_model.c").write_text(_source(model, tables))
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
+    with whole(folder / "selfcal_model.h") as header, whole(folder / "selfcal_model.c") as source:
+        header.write_text(_header(model, tables), encoding="utf-8")
+        source.write_text(_source(model, tables), encoding="utf-8")
 
 
 def _header(model: Model, tables: Tables) -> str:

@@ -15,8 +15,9 @@ from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.words import WORDS
 from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.model import Model
+from selfcal.output import write_text
 from selfcal.recording import Scale, load
 from selfcal.verbs.identify import chosen_axes
 
@@ -61,7 +62,7 @@ def diagnose(
         tree = extended(loaded, record, found)
         document = to_document(recording, record, found, tree)
     if write_model is not None:
-        _write_text(write_model, as_text(tree, recording.path))
+        write_text(write_model, as_text(tree, recording.path))
     if report is not None:
         from selfcal.diagnosis.page import write_page
 
@@ -69,13 +70,6 @@ def diagnose(
     if json is not None:
         write_json(document, json)
     return document
-
-
-def _write_text(path: Path | str, text: str) -> None:
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def failing(document: Mapping[str, Any], wanted: str) -> bool:
@@ -93,7 +87,7 @@ def show(document: Mapping[str, Any]) -> None:
     recording = document["recording"]
     console = Console()
     console.print(
-        f"{recording['path']}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s\n",
         highlight=False,
         markup=False,

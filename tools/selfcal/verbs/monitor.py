@@ -13,6 +13,7 @@ from typing import Any, cast
 
 from rich.console import Console
 
+from selfcal.checks import Judged
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError
@@ -183,7 +184,10 @@ def _document(history: Mapping[str, Sequence[AxisReport]], status: Mapping[str, 
         samples=int(status["samples"]) if "samples" in status else None,
         duration_s=max(reports[-1].time_s for reports in history.values()),
     )
-    found = {axis: Identified(axis_unit(axis), reports[-1].result(), {}, {}) for axis, reports in history.items()}
+    found = {
+        axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(), Judged({}, None), {})
+        for axis, reports in history.items()
+    }
     document = to_document(cast(Any, run), found)
     for axis in document["axes"].values():
         axis["adequate"] = None

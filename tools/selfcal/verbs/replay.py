@@ -25,7 +25,7 @@ from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
-from selfcal.errors import UserError
+from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
 from selfcal.plot import check_picture, plot_run
@@ -138,7 +138,7 @@ def replay(
         truth = recording.meta.get("truth") if simulated else None
         units = {name: recording.columns[name].unit for name in history}
         plot_run(history, plot, title, truth if isinstance(truth, dict) else None, units)
-        Console(stderr=True).print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
+        note(f"plot: {plot}")
     return document
 
 
