@@ -362,7 +362,7 @@ def test_the_page_is_written_whole_or_not_at_all(case: Case, tmp_path: Path, mon
     path = tmp_path / "report.html"
     write_page(path, case.document, case.record, case.found)
     assert path.read_text(encoding="utf-8") == case.text
-    with pytest.raises(UserError, match="cannot write the report"):
+    with pytest.raises(UserError, match="cannot be written"):
         write_page(tmp_path / "none" / "report.html", case.document, case.record, case.found)
 
     def full(self: Path, target: Path) -> Path:

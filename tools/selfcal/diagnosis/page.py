@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shlex
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -22,7 +20,7 @@ from selfcal.diagnosis.chart import Figure, draw, number, scrolled
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.words import WORDS
-from selfcal.errors import UserError
+from selfcal.output import write_text
 
 #: Bytes of the page without its style, at most.
 SIZE_MOST = 990_000
@@ -91,26 +89,7 @@ code{font-size:.92em;overflow-wrap:anywhere}
 
 def write_page(path: Path | str, document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    text = page(document, record, found)
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o666 & ~_umask())
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise UserError(f"{path}: cannot write the report: {error.strerror or error}") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    write_text(path, page(document, record, found))
 
 
 def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> str:
