@@ -146,7 +146,7 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
     if cause == "outliers":
         return [_largest(finding, record), _histogram(before, after)]
     if cause == "motion":
-        return [_largest(finding, record)]
+        return [_largest(finding, record), _level(finding, record, pieces=POINTS // 2)]
     if cause in ("quantization", "saturation"):
         return [_readings(finding, factor, unit)]
     if cause == "missing_samples":
@@ -313,8 +313,8 @@ def _reduced(edges: Indices, values: Array | NDArray[np.bool_]) -> Array:
         return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
 
 
-def _level(finding: Finding, record: Record, means: bool = False) -> Compared:
-    edges, middle = _pieces(record, PIECES)
+def _level(finding: Finding, record: Record, means: bool = False, pieces: int = PIECES) -> Compared:
+    edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
 
     def summary(y: Array, w: Array) -> Array:
@@ -329,7 +329,9 @@ def _level(finding: Finding, record: Record, means: bool = False) -> Compared:
         middle,
         (finding.before, finding.after),
         (summary, summary),
-        marks=finding.look.when[:1] if finding.look.when and finding.look.cause == "variance_change" else (),
+        marks=finding.look.when[:1]
+        if finding.look.when and finding.look.cause in ("variance_change", "motion")
+        else (),
     )
 
 
