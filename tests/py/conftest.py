@@ -6,6 +6,8 @@ import os
 import signal
 import socket
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 ROOT = Path(__file__).resolve().parents[2]
 #: The recordings' licence keeps them out of this repository.
 SHARED_DATA = Path(os.environ.get("SELFCAL_DATA", ROOT.parent / "shared" / "data"))
+COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
+
+
+def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command as a user starts it."""
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=cwd)
 
 
 def _multicast() -> bool:

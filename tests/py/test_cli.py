@@ -13,15 +13,9 @@ import pytest
 
 import selfcal
 
-from conftest import ROOT
+from conftest import COMMAND, ROOT, run
 
 DEFAULT = ROOT / "tools" / "selfcal" / "models" / "default.yaml"
-COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
-
-
-def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [*COMMAND, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=cwd)
 
 
 def one_error(*arguments: str | Path, cwd: Path | None = None) -> str:

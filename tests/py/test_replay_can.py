@@ -23,9 +23,9 @@ from test_replay import SHIPPED, part_of_shipped
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import load
+from selfcal.table import show
 from selfcal.verbs import identify as identify_module
 from selfcal.verbs.demo import demo
-from selfcal.verbs.identify import show
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import build, can_bus, replay, write_rows
 

@@ -10,10 +10,10 @@ import numpy as np
 from selfcal.diagnosis.causes.noise import LN_CHANGES
 from selfcal.diagnosis.causes.step import LN_PLACES
 from selfcal.diagnosis.fit import run
-from selfcal.diagnosis.record import Record, smoothed
+from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, State
 from selfcal.diagnosis.statemodel import Array
-from selfcal.regressors import coefficient_unit
+from selfcal.regressors import coefficient_unit, trailing_mean
 
 
 def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, Any]]:
@@ -38,7 +38,7 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         "periodic": np.sin(2.0 * math.pi * frequency * t),
     }
     for cause, values in record.channels.items():
-        columns[cause] = smoothed(values, max(1, round(record.rate_hz))) - float(values.mean())
+        columns[cause] = trailing_mean(values, round(10.0 * record.rate_hz)) - float(values.mean())
     for name, values in record.other_axes(state.axis).items():
         columns[f"axis_{name}"] = values
     least = {cause: _least(state, values, NET_LEAST) for cause, values in columns.items()}

@@ -29,8 +29,8 @@ CERTAIN = 50.0
 ROUNDS = 10
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
-#: The statistics together call an axis inadequate by chance once in so many records.
-P_UNEXPLAINED = 1.5e-3
+#: Probability that the statistics together call an axis of a fitting record inadequate.
+P_UNEXPLAINED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,7 @@ def diagnose_record(
         states[name] = state.refit()
     record = replace(record, axes=states)
     found = {name: Diagnosed(states[name], states[name]) for name in axes}
-    # Lines and colour first: motion is what stands out of the noise once these are known.
-    for name in states:
-        one = found.get(name) or Diagnosed(states[name], states[name])
-        _rounds(record, one, advance, STATIONARY, CERTAIN)
-        states[name] = one.state
-    record = replace(record, axes=states)
-    record = _integrity(record, found)
+    record = _integrity(record, found, advance)
     for name in axes:
         _rounds(record, found[name], advance)
     _directions(record, found)
@@ -90,13 +84,21 @@ def diagnose_record(
     return found
 
 
-def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+def _provisional(state: State, record: Record, advance: Callable[[str], None]) -> State:
+    """The state with the lines and the colour that are beyond doubt: motion is what stands out of such noise."""
+    one = Diagnosed(state, state)
+    _rounds(record, one, advance, STATIONARY, CERTAIN)
+    return one.state
+
+
+def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
         masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
-    moved = integrity.motion(record)
+    quiet = {name: _provisional(state, record, advance) for name, state in states.items()}
+    moved = integrity.motion(replace(record, axes=quiet)) if len(states) > 1 else {}
     if moved:
         mask = next(iter(moved.values()))[1]
         for name in states:

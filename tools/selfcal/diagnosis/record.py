@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Mask
@@ -115,8 +114,3 @@ def lattice(values: Array) -> float:
     steps = np.rint(gaps / least)
     q = float(gaps.sum() / steps.sum())
     return q if np.all(np.abs(gaps - steps * q) < 0.02 * q) else 0.0
-
-
-def smoothed(values: Array, window: int) -> Array:
-    """Centred mean over `window` samples."""
-    return values if window <= 1 else uniform_filter1d(values, window, mode="nearest")

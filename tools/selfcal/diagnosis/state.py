@@ -14,7 +14,7 @@ from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 3e-4
+P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
@@ -40,7 +40,8 @@ class State:
     """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
 
     `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
-    theirs. `lsb`: the lattice the values lie on (0: none), `stated_lsb` the model file's.
+    theirs. `redrawn`: clipped readings were drawn anew. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
+    the model file's.
     """
 
     axis: str
@@ -56,7 +57,7 @@ class State:
     fits: tuple[Fit, ...] = ()
     whitened: Array = field(default_factory=lambda: np.empty(0))
     variance: Array = field(default_factory=lambda: np.empty(0))
-    causes: tuple[str, ...] = ()
+    redrawn: bool = False
 
     @property
     def series(self) -> Series:

@@ -94,10 +94,11 @@ def show(document: Mapping[str, Any]) -> None:
     )
     for name, axis in document["axes"].items():
         colour = "green" if axis["verdict"] == "adequate" else "bold red"
-        console.print(f"{name} [{axis['unit']}]: {axis['verdict']}", style=colour, highlight=False, markup=False)
+        heading = f"{name} [{axis['unit']}]: {axis['verdict']}"
+        console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):
-                console.print(f"  {line}", highlight=False, markup=False)
+                console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:
