@@ -342,6 +342,12 @@ def test_keys_that_the_document_lacks_are_left_out(case: Case) -> None:
     assert "temperature" in text and "None" not in text and "nan" not in text.lower().split()
 
 
+def test_an_axis_without_a_result_is_told(case: Case) -> None:
+    document = {**case.document, "axes": {**case.document["axes"], "gz": {"error": "every reading is the same"}}}
+    text = Page(page(document, case.record, case.found)).text
+    assert "Not diagnosed: gz. every reading is the same" in text and "Not adequate: gx." in text
+
+
 def test_a_page_with_many_findings_stays_small(case: Case) -> None:
     """Ten findings on each of six axes: pictures of the weakest are left out, their words stay."""
     one = case.found["gx"]

@@ -116,12 +116,13 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
 
 
 def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    axes: Mapping[str, Mapping[str, Any]] = document["axes"]
+    axes = {axis: entry for axis, entry in document["axes"].items() if "error" not in entry}
+    failed = {axis: str(entry["error"]) for axis, entry in document["axes"].items() if "error" in entry}
     sections: list[list[_Part]] = []
     for k, (axis, entry) in enumerate(axes.items()):
         sections.append(list(_axis(k, axis, entry, record, found[axis])))
     rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading()]
-    parts = [_Part(text) for text in (*_summary(axes), *_contents(axes))]
+    parts = [_Part(text) for text in (*_summary(axes, failed), *_contents(axes))]
     parts += [part for section in sections for part in section]
     parts += [_Part(text) for text in rest]
     return _within(parts, SIZE_MOST)
@@ -172,7 +173,7 @@ def _cause(cause: str) -> str:
     return escape(cause.replace("_", " "))
 
 
-def _summary(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _summary(axes: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> Iterator[str]:
     bad = [name for name, entry in axes.items() if entry["verdict"] != "adequate"]
     good = [name for name in axes if name not in bad]
     yield "<section aria-labelledby=findings><h2 id=findings>What was found</h2>"
@@ -186,6 +187,8 @@ def _summary(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             f"<p><span class=good>✓ Adequate: {escape(', '.join(good))}.</span> "
             "Nothing in the recording speaks against the model.</p>"
         )
+    for axis, error in failed.items():
+        yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
     groups = _grouped(axes)
     if groups:
         yield "<ol class=findings>"
