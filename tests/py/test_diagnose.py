@@ -46,7 +46,7 @@ def written(record: Record, path: Path) -> Path:
         Terms(walk=True),
         Terms(markov=True, color="ma"),
         Terms(walk=True, markov=True, flicker=True),
-        Terms(walk=True, color="ar", bands=(0.1,)),
+        Terms(walk=True, color="ar", bands=((0.1, 0.01, -0.5),), trial=0.2),
     ],
 )
 def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
@@ -57,8 +57,8 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     y[[11, 12, 40]] = np.nan
     r = np.where(np.arange(n) < 50, 1.0, 2.5)
     columns = np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)])
-    guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -0.7, "color": 0.3, "ln_band0": -0.4}
-    theta = np.array([guess.get(name, -3.0 if name == "ln_width0" else 0.02) for name in terms.names])
+    guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -0.7, "color": 0.3, "ln_band": -0.4}
+    theta = np.array([guess.get(name, -3.0 if name == "ln_width" else 0.02) for name in terms.names])
     series = Series(y, dt, r, columns)
     m = matrices(terms, theta, dt, series.duration_s)
     # Covariance of h x_i and h x_j from the state model itself, by its definition.

@@ -118,6 +118,8 @@ def mask_of(regressors: Choice, choice: Choice) -> int:
 def coefficient_unit(unit: str, regressor: str) -> str:
     """Unit of a coefficient: `unit` of the axis per unit of the `regressor`; deg/s per degC/s is deg/s/degC*s."""
     swap = str.maketrans("*/", "/*")
+    if unit == regressor:  # another axis of the same kind
+        return "1"
     return unit if regressor == "1" else f"{unit}/{regressor.translate(swap)}"
 
 

@@ -80,6 +80,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             r=np.where(present, block / np.maximum(used, 1), 1.0),
             lsb=lattice(values) if block == 1 else 0.0,
             stated_lsb=group.lsb,
+            redrawn=block > 1,
         )
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}

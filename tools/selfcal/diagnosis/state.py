@@ -40,7 +40,8 @@ class State:
     """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
 
     `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
-    theirs. `redrawn`: clipped readings were drawn anew. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
+    theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
+    they are block means. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
     the model file's.
     """
 
@@ -117,9 +118,8 @@ def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     if same:
         return fit(series, terms, same[0].theta, step=0.5)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
-    richest = max(known, key=lambda one: len(one.terms.names), default=None)
-    if near and richest is not None:
-        return fit(series, terms, moved(near[0], terms, richest))
+    if near:
+        return fit(series, terms, moved(near[0], terms))
     return fit(series, terms)
 
 
