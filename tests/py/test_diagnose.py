@@ -21,6 +21,7 @@ from selfcal.diagnosis.statemodel import Terms, matrices
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT
 from selfcal.recording import save
+from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose, failing
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
@@ -189,3 +190,20 @@ def test_fail_on_for_a_production_line(tmp_path: Path) -> None:
         done = run("diagnose", "log.npz", "--axis", "gx", "--fail-on", wanted, cwd=tmp_path)
         assert done.returncode == code, done
         assert "step:" in done.stdout
+
+
+def test_compare_tells_what_changed_and_no_more(tmp_path: Path) -> None:
+    """Two records of one law and parameters: the second has a step, and nothing else may be told as a change of N."""
+    model = tmp_path / "model.yaml"
+    default = DEFAULT.read_text(encoding="utf-8")
+    axes = "{gx: {hypothesis: random_walk, bias: 0.1, N: 0.04, K: 1.0e-3}}"
+    text = default.replace("rate_hz: 10.0", f"rate_hz: {RATE_HZ}").replace("duration_s: 3600", "duration_s: 1800")
+    model.write_text(text.replace("axes: {}", f"axes: {axes}"), encoding="utf-8")
+    simulate(model, tmp_path / "a.npz", seed=11)
+    simulate(model, tmp_path / "b.npz", seed=12, effects=["step:axis=gx,time_s=900,amplitude=0.6"])
+    document = compare([tmp_path / "a.npz", tmp_path / "b.npz"], axes=["gx"])
+    rows = {row["quantity"]: row["what"] for row in document["axes"]["gx"]}
+    assert rows["step"] == "appeared"
+    assert "N" not in rows
+    with pytest.raises(UserError, match="two recordings or more"):
+        compare([tmp_path / "a.npz"])

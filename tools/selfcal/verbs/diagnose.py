@@ -82,10 +82,10 @@ def failing(document: Mapping[str, Any], wanted: str) -> bool:
     return False
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
     recording = document["recording"]
-    console = Console()
+    console = Console(stderr=to_stderr)
     console.print(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s\n",
