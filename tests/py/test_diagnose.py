@@ -184,6 +184,23 @@ def test_what_the_user_got_wrong_is_one_line(tmp_path: Path) -> None:
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+def test_an_axis_below_its_lattice_stops_no_other(tmp_path: Path) -> None:
+    """gx alternates between two codes of the stated lattice, as a sensor whose noise is far below it does."""
+    random = np.random.default_rng(1)
+    n = 1500
+    gx = np.where(random.random(n) < 0.02, 0.05, 0.0)
+    log = tmp_path / "log.npz"
+    save(log, {"gx": ("deg/s", gx), "gy": ("deg/s", 0.1 * random.standard_normal(n))}, 1.0)
+    for decimate in (None, 0.5):
+        document = diagnose(log, decimate=decimate)
+        assert "below the lattice" in document["axes"]["gx"]["error"]
+        assert document["axes"]["gy"]["verdict"] == "adequate"
+    assert failing(document, "inadequate")  # what cannot be judged has not passed
+    for decimate in (0.0, -1.0, math.nan, math.inf, 2.0):
+        with pytest.raises(UserError, match="--decimate must be a rate above 0 Hz, at most the recording's 1 Hz"):
+            diagnose(log, decimate=decimate)
+
+
 def test_fail_on_for_a_production_line(tmp_path: Path) -> None:
     effect(tmp_path, "step:axis=gx,time_s=900,amplitude=0.6")
     for wanted, code in (("step", 1), ("supply", 0)):

@@ -20,7 +20,15 @@ from rich.console import Console
 from rich.progress import wrap_file
 
 from selfcal.errors import UserError, note, short
-from selfcal.limits import BLOCK_BYTES, LONGEST_HEADING, MOST_COLUMNS, MOST_LEADING_LINES, MOST_NUMBERS, reading
+from selfcal.limits import (
+    BLOCK_BYTES,
+    LONGEST_HEADING,
+    MOST_COLUMNS,
+    MOST_GROWTH,
+    MOST_LEADING_LINES,
+    MOST_NUMBERS,
+    reading,
+)
 
 #: Bytes of a file from which on reading it shows its progress.
 _SLOW_BYTES = 1 << 26
@@ -210,12 +218,17 @@ class _Lines:
         self.path, self.stream = path, stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
+        self._packed, self._unpacked = path.stat().st_size if path.suffix.lower() == ".gz" else 0, 0
 
     def more(self) -> list[str]:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
         while not self.unfinished:
             with reading(self.path, "not a whole gzip file"):
                 block = self.stream.read(BLOCK_BYTES)
+            self._unpacked += len(block)
+            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
+                more = f"unpacks to more than {MOST_GROWTH} times its size"
+                raise UserError(f"{self.path}: {more}: no sensor's readings do")
             data = self._carry + block
             end = data.rfind(b"\n") + 1 if block else len(data)
             self.unfinished = not block and bool(data)

@@ -17,9 +17,15 @@ SCHEMA = "selfcal.diagnose/1"
 
 
 def to_document(
-    recording: Recording, record: Record, found: Mapping[str, Diagnosed], model: Mapping[str, Any]
+    recording: Recording,
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    errors: Mapping[str, str],
+    model: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The document, in the units of the recording's columns. `model`: the extended model file's tree."""
+    """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
+    model file's tree."""
+    axes = {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()}
     return {
         "schema": SCHEMA,
         "recording": {
@@ -28,7 +34,7 @@ def to_document(
             "samples": recording.samples,
             "duration_s": recording.duration_s,
         },
-        "axes": {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()},
+        "axes": {**axes, **{name: {"error": reason} for name, reason in errors.items()}},
         "model": dict(model),
     }
 

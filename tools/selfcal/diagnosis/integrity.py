@@ -22,6 +22,8 @@ LATTICE_LEAST = 0.5
 MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 #: A burst counts from this worth on, net of the search; several that each could be chance are none together.
 BURST_LEAST = 2.5
+#: All bursts together, nats net: more than for another cause, since lattices and drifts of several axes join in.
+MOTION_LEAST = 11.0
 #: What the axes beside the strongest must show, nats: an event of one axis meets chance on the others.
 REST_PRICE = 4.0
 
@@ -29,10 +31,11 @@ REST_PRICE = 4.0
 def missing(record: Record) -> tuple[Look, Mask] | None:
     """Gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is those."""
     held = _held(record)
-    gone = int((~record.present).sum() + held.sum())
-    if gone <= MISSING_LEAST * record.present.size:
-        return None
+    gone = record.missing + int(held.sum())
+    span = max(record.present.size, record.missing)
     where = np.flatnonzero(~record.present | held) / record.rate_hz
+    if gone <= MISSING_LEAST * span or not where.size:
+        return None
     look = Look(
         "missing_samples",
         float(gone),
@@ -184,7 +187,7 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         total += float(left[at])
         margin = max(1, round(2.0 * rate))
         left[max(0, a - margin) : b + margin] = 0.0
-    if total < NET_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
+    if total < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
     pad = max(1, round(0.5 * rate))

@@ -70,6 +70,10 @@ def diagnose_record(
     advance("fit")
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         states = dict(zip(record.axes, pool.map(lambda state: state.refit(), record.axes.values()), strict=True))
+    # An axis below its stated lattice is judged by nobody, and explains nobody.
+    left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
+    states = {name: state for name, state in states.items() if name not in left_out}
+    axes = [name for name in axes if name not in left_out]
     record = replace(record, axes=states)
     found = {name: Diagnosed(states[name], states[name]) for name in axes}
     record = _integrity(record, found, advance)
@@ -82,11 +86,16 @@ def diagnose_record(
     return found
 
 
+def _stated(state: State) -> bool:
+    """Whether the model file states the lattice."""
+    return state.stated_lsb > 0.0 and abs(state.lsb / state.stated_lsb - 1.0) < 0.02
+
+
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     """What is left over, and the statistics of the model that the loop began with."""
     advance(f"{one.state.axis}: statistics")
     _unexplained(one)
-    one.before = judged(one.first, seed=1) if one.findings else one.after
+    one.before = judged(one.first, seed=1) if one.findings and not one.first.below_lattice else one.after
 
 
 def _provisional(state: State, record: Record, advance: Callable[[str], None]) -> State:
@@ -118,7 +127,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
-        clipped = integrity.saturation(states[name])
+        clipped = None if states[name].below_lattice else integrity.saturation(states[name])
         if clipped is not None:
             if name in found:
                 found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
@@ -143,6 +152,8 @@ def _rounds(
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
     for number in range(first, ROUNDS + 1):
+        if one.state.below_lattice:
+            return
         advance(f"{one.state.axis}: round {number}")
         looks = sorted(
             (look for cause in causes for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
@@ -196,6 +207,8 @@ def _same(a: Look, b: Look) -> bool:
 
 
 def _unexplained(one: Diagnosed) -> None:
+    if one.state.below_lattice:
+        return
     one.after = judged(one.state, seed=1)
     p = combined(one.after)
     if p < P_UNEXPLAINED:

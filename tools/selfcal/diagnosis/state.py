@@ -41,7 +41,8 @@ class State:
 
     `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
     theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
-    they are block means. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
+    they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
+    noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
     the model file's.
     """
 
@@ -59,6 +60,7 @@ class State:
     whitened: Array = field(default_factory=lambda: np.empty(0))
     variance: Array = field(default_factory=lambda: np.empty(0))
     redrawn: bool = False
+    below_lattice: bool = False
 
     @property
     def series(self) -> Series:
