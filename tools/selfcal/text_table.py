@@ -225,10 +225,6 @@ class _Lines:
         while not self.unfinished:
             with reading(self.path, "not a whole gzip file"):
                 block = self.stream.read(BLOCK_BYTES)
-            self._unpacked += len(block)
-            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
-                more = f"unpacks to more than {MOST_GROWTH} times its size"
-                raise UserError(f"{self.path}: {more}: no sensor's readings do")
             data = self._carry + block
             end = data.rfind(b"\n") + 1 if block else len(data)
             self.unfinished = not block and bool(data)
@@ -237,6 +233,10 @@ class _Lines:
                 if b"\0" in self._carry:
                     self._text(self._carry)  # says so
                 raise UserError(f"{self.path}: line {self._next + 1}: longer than {BLOCK_BYTES:,} bytes")
+            self._unpacked += len(block)
+            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
+                more = f"unpacks to more than {MOST_GROWTH} times its size"
+                raise UserError(f"{self.path}: {more}: no sensor's readings do")
             if end:
                 lines = self._text(data[:end]).replace("\r\n", "\n").removesuffix("\n").split("\n")
                 self.number, self._next = self._next, self._next + len(lines)
