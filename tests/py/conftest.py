@@ -18,6 +18,8 @@ from selfcal.result import AxisResult
 
 # A shell's background job ignores an interrupt, and so would every program that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# So does one under nohup a hang-up.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 ROOT = Path(__file__).resolve().parents[2]
 #: The recordings' licence keeps them out of this repository.

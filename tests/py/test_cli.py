@@ -15,6 +15,7 @@ import selfcal
 
 from conftest import COMMAND, ROOT, run
 
+NO_FOLDER = "no/out.json: cannot be written: there is no folder 'no'; make it first"
 DEFAULT = ROOT / "tools" / "selfcal" / "models" / "default.yaml"
 
 
@@ -87,12 +88,12 @@ def test_verbs_are_functions() -> None:
         (["identify"], "Missing argument 'LOG' (Recording: .csv, .csv.gz or .npz); see `selfcal identify --help`"),
         (["identify", "."], ".: is a folder: name a recording in it (.csv, "),
         (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),
-        (["identify", "log.csv", "--json", "no/out.json"], "no/out.json: cannot be written: there is no folder 'no'; make it first"),
+        (["identify", "log.csv", "--json", "no/out.json"], NO_FOLDER),
         (["identify", "log.csv", "--json", "."], ".: cannot be written: it is a folder; give a file name"),
         (["identify", "log.csv", "--plot", "out.xls"], "out.xls: a plot is one of .png, .pdf, .svg, .jpg"),
         (["identify", "log.csv", "--overbound", "0.9"], "--overbound is for --export FORMAT FILE"),
         (["identify", "log.csv", "--units", "metric"], "Invalid value for '--units': 'metric' is not "),
-        (["montecarlo", "--json", "no/out.json"], "no/out.json: cannot be written: there is no folder 'no'; make it first"),
+        (["montecarlo", "--json", "no/out.json"], NO_FOLDER),
         (["simulate", "m.yaml", "-o", "log.csv", "--seed", "abc"], "Invalid value for '--seed': must be a whole"),
         (["identify", "log.csv", "--rate", "fast"], "Invalid value for '--rate'"),
         (["identify", "log.csv", "--engine", "steam"], "Invalid value for '--engine'"),
