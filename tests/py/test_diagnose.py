@@ -184,6 +184,15 @@ def test_what_the_user_got_wrong_is_one_line(tmp_path: Path) -> None:
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+def test_the_axis_that_is_followed_is_not_blamed(tmp_path: Path) -> None:
+    """gx has half of gy in it. The two correlate, but gy is clean."""
+    log, _ = effect(tmp_path, "cross_axis:axis=gx,other=gy,coefficient=0.5")
+    axes = diagnose(log, axes=["gx", "gy"])["axes"]
+    assert [finding["cause"] for finding in axes["gx"]["findings"]] == ["cross_axis"]
+    assert axes["gx"]["findings"][0]["estimate"]["other"] == "gy"
+    assert axes["gy"]["verdict"] == "adequate"
+
+
 def test_an_axis_below_its_lattice_stops_no_other(tmp_path: Path) -> None:
     """gx alternates between two codes of the stated lattice, as a sensor whose noise is far below it does."""
     random = np.random.default_rng(1)

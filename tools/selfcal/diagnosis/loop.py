@@ -170,7 +170,10 @@ def _rounds(
 
 
 def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Two axes that each blame the other: the reading that follows is the one that gains more by it."""
+    """Two axes that each blame the other: the reading that follows is the one that gains more by it.
+
+    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
+    coupling is kept: a mechanical one is below 1."""
     pairs = {
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
@@ -179,8 +182,17 @@ def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
     }
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
-        if back is not None and back.look.gain > finding.look.gain:
-            found[name].findings.remove(finding)
+        if back is None:
+            continue
+        ahead = back.look.gain - finding.look.gain
+        if abs(ahead) < ALIKE:
+            sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
+            ahead = sizes[0] - sizes[1]
+        if ahead > 0.0:
+            one = found[name]
+            one.findings.remove(finding)
+            kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
+            one.state = one.state.refit(regressors=kept)
 
 
 def _share(found: Mapping[str, Diagnosed]) -> None:
