@@ -153,7 +153,7 @@ def test_the_fitted_step_is_drawn_where_it_is() -> None:
 def test_missing_samples_are_counted_where_they_are() -> None:
     y = np.random.default_rng(3).standard_normal(N)
     y[500:600] = np.nan
-    record = record_of(y)
+    record = replace(record_of(y), missing=100)
     found_missing = integrity.missing(record)
     assert found_missing is not None
     finding = Finding(found_missing[0], 0, record.axes["gx"], record.axes["gx"])
@@ -255,7 +255,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     recording = load(path)
     record = of_recording(recording, Model.load(None))
     found = diagnose_record(record, ("gx", "gy"))
-    document = to_document(recording, record, found, {"name": "extended"})
+    document = to_document(recording, record, found, {}, {"name": "extended"})
     return Case(document, record, found, page(document, record, found))
 
 
