@@ -11,6 +11,7 @@ from selfcal.diagnosis import findable, words
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
+from selfcal.document import recording_entry
 from selfcal.recording import Recording
 
 SCHEMA = "selfcal.diagnose/1"
@@ -28,12 +29,7 @@ def to_document(
     axes = {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()}
     return {
         "schema": SCHEMA,
-        "recording": {
-            "path": str(recording.path),
-            "rate_hz": recording.rate_hz,
-            "samples": recording.samples,
-            "duration_s": recording.duration_s,
-        },
+        "recording": recording_entry(recording),
         "axes": {**axes, **{name: {"error": reason} for name, reason in errors.items()}},
         "model": dict(model),
     }
