@@ -21,11 +21,16 @@ using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::
 using Matrix = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, double>;
 
-constexpr int states_max = 12;
+constexpr int states_max = 20;
 constexpr int columns_max = 40;
 // The covariance counts as settled after this many samples in a row that change s by less than `settled` of itself.
 constexpr int settled_samples = 8;
 constexpr double settled = 1e-12;
+
+// Columns go through the filter side by side, so many at a time.
+constexpr int lanes = 4;
+constexpr int groups_max = columns_max / lanes;
+typedef double Lanes __attribute__((vector_size(lanes * sizeof(double))));
 
 struct Input {
     const double *y, *z, *r; // z: [p, n]
@@ -47,26 +52,36 @@ struct Sums {
 };
 
 // Sums are folded every so many samples: plain double would lose digits over 10^7.
-constexpr std::size_t fold = 512;
+constexpr std::size_t fold = 256;
 
+// F is block diagonal with blocks of one and two states: three diagonals hold it, and a step costs of the order of D.
 template <int D> struct Filter {
     const Input &in;
     const Sums &out;
-    double P[D][D], x[columns_max][D] = {}, FK[D] = {}, M[D][D] = {};
-    double s = 0.0, s_before = -1.0, scale = 0.0, ln_now = 0.0;
+    const int groups;
+    double below[D + 1] = {}, on[D] = {}, above[D + 1] = {}; // F[a][a-1], F[a][a], F[a][a+1]
+    double P[D][D], FK[D] = {};
+    double s = 0.0, s_before = -1.0, r = -1.0, scale = 0.0, ln_now = 0.0;
     int quiet = 0;
-    double nu[columns_max][fold]; // whitened innovations of the samples since `start`
+    Lanes x[groups_max][D] = {};
+    Lanes nu[groups_max][fold] = {}; // whitened innovations of the samples since `start`
     std::size_t start = 0;
     double G[columns_max][columns_max] = {}, ln_s = 0.0;
     std::size_t counted = 0;
 
-    Filter(const Input &input, const Sums &output) : in(input), out(output) {
-        for (int i = 0; i < D; i++)
+    Filter(const Input &input, const Sums &output)
+        : in(input), out(output), groups((input.columns + lanes - 1) / lanes) {
+        for (int i = 0; i < D; i++) {
+            on[i] = in.F[i * D + i];
+            below[i] = i > 0 ? in.F[i * D + i - 1] : 0.0;
+            above[i] = i < D - 1 ? in.F[i * D + i + 1] : 0.0;
             for (int j = 0; j < D; j++)
                 P[i][j] = in.P0[i * D + j];
+        }
     }
 
-    bool plain(std::size_t i) const { return std::isfinite(in.y[i]) && in.r[i] == 1.0; }
+    // Whether the sample may be read with the last one's gain, once that has settled.
+    bool alike(std::size_t i) const { return std::isfinite(in.y[i]) && in.r[i] == r; }
 
     // Covariance, gain and s of sample i; the covariance goes on to the next one.
     void covariance(std::size_t i) {
@@ -76,75 +91,77 @@ template <int D> struct Filter {
         for (int a = 0; a < D; a++) {
             Ph[a] = 0.0;
             for (int b = 0; b < D; b++)
-                Ph[a] += P[a][b] * in.h[b];
+                Ph[a] += P[b][a] * in.h[b];
             s += in.h[a] * Ph[a];
         }
+        const double inverse = present ? 1.0 / s : 0.0;
         for (int a = 0; a < D; a++)
-            K[a] = present ? Ph[a] / s : 0.0;
+            K[a] = Ph[a] * inverse;
         for (int a = 0; a < D; a++)
             for (int b = 0; b < D; b++)
                 A[a][b] = P[a][b] - K[a] * Ph[b];
-        for (int a = 0; a < D; a++)
-            for (int b = 0; b < D; b++) {
-                FA[a][b] = 0.0;
-                for (int k = 0; k < D; k++)
-                    FA[a][b] += in.F[a * D + k] * A[k][b];
-            }
         for (int a = 0; a < D; a++) {
-            FK[a] = 0.0;
+            const int before = a > 0 ? a - 1 : 0, after = a < D - 1 ? a + 1 : a;
+            FK[a] = below[a] * K[before] + on[a] * K[a] + above[a] * K[after];
             for (int b = 0; b < D; b++)
-                FK[a] += in.F[a * D + b] * K[b];
-            for (int b = 0; b < D; b++)
-                M[a][b] = in.F[a * D + b] - FK[a] * in.h[b];
-            for (int b = a; b < D; b++) {
-                double sum = in.Q[a * D + b];
-                for (int k = 0; k < D; k++)
-                    sum += FA[a][k] * in.F[b * D + k];
-                P[a][b] = P[b][a] = sum;
-            }
+                FA[a][b] = below[a] * A[before][b] + on[a] * A[a][b] + above[a] * A[after][b];
         }
+        for (int a = 0; a < D; a++)
+            for (int b = a; b < D; b++) {
+                const int before = b > 0 ? b - 1 : 0, after = b < D - 1 ? b + 1 : b;
+                P[a][b] = P[b][a] = in.Q[a * D + b] + FA[a][before] * below[b] + FA[a][b] * on[b] + FA[a][after] * above[b];
+            }
         scale = 1.0 / std::sqrt(s);
         ln_now = std::log(s);
-        quiet = plain(i) && std::fabs(s - s_before) <= settled * s ? quiet + 1 : 0;
-        s_before = plain(i) ? s : -1.0;
+        quiet = alike(i) && std::fabs(s - s_before) <= settled * s ? quiet + 1 : 0;
+        s_before = present ? s : -1.0;
+        r = in.r[i];
     }
 
-    // Innovations of column k over the samples from `from` to `to`, all with one gain.
-    void column(int k, std::size_t from, std::size_t to) {
-        const double *value = k == 0 ? in.y : in.z + static_cast<std::size_t>(k - 1) * in.n;
-        double X[D];
+    // Value of every column of a group at sample i; a missing reading is 0 and moves nothing, since its gain is.
+    Lanes values(int group, std::size_t i) const {
+        Lanes v = {};
+        for (int k = 0; k < lanes && group * lanes + k < in.columns; k++) {
+            const int column = group * lanes + k;
+            const double value = column == 0 ? in.y[i] : in.z[static_cast<std::size_t>(column - 1) * in.n + i];
+            v[k] = column == 0 && !std::isfinite(value) ? 0.0 : value;
+        }
+        return v;
+    }
+
+    // Innovations of a group over the samples from `from` to `to`, all with one gain.
+    void advance(int group, std::size_t from, std::size_t to) {
+        Lanes X[D + 2] = {}; // a zero on either side: no edges in the loop
         for (int a = 0; a < D; a++)
-            X[a] = x[k][a];
+            X[a + 1] = x[group][a];
         for (std::size_t i = from; i < to; i++) {
-            const double v = k == 0 && !std::isfinite(value[i]) ? 0.0 : value[i];
-            double predicted = 0.0, next[D];
+            Lanes sum[2] = {};
             for (int a = 0; a < D; a++)
-                predicted += in.h[a] * X[a];
-            nu[k][i - start] = (v - predicted) * scale;
+                sum[a & 1] += in.h[a] * X[a + 1];
+            const Lanes e = values(group, i) - (sum[0] + sum[1]);
+            nu[group][i - start] = e * scale;
+            Lanes left = {};
             for (int a = 0; a < D; a++) {
-                next[a] = FK[a] * v;
-                for (int b = 0; b < D; b++)
-                    next[a] += M[a][b] * X[b];
+                const Lanes here = X[a + 1];
+                X[a + 1] = below[a] * left + on[a] * here + above[a] * X[a + 2] + FK[a] * e;
+                left = here;
             }
-            for (int a = 0; a < D; a++)
-                X[a] = next[a];
         }
         for (int a = 0; a < D; a++) // no denormals: they cost a hundred times as much
-            x[k][a] = std::fabs(X[a]) < 1e-250 ? 0.0 : X[a];
+            for (int k = 0; k < lanes; k++)
+                x[group][a][k] = std::fabs(X[a + 1][k]) < 1e-250 ? 0.0 : X[a + 1][k];
     }
 
     void flush(std::size_t end) {
         for (int a = 0; a < in.columns; a++)
-            for (int b = 0; b <= a; b++) {
-                double sum[4] = {};
-                std::size_t i = 0;
-                for (; i + 4 <= end - start; i += 4)
-                    for (int k = 0; k < 4; k++)
-                        sum[k] += nu[a][i + k] * nu[b][i + k];
-                for (; i < end - start; i++)
-                    sum[0] += nu[a][i] * nu[b][i];
-                G[a][b] += sum[0] + sum[1] + sum[2] + sum[3];
-                G[b][a] = G[a][b];
+            for (int group = 0; group <= a / lanes; group++) {
+                Lanes sum = {};
+                for (std::size_t i = 0; i < end - start; i++)
+                    sum += nu[a / lanes][i][a % lanes] * nu[group][i];
+                for (int k = 0; k < lanes && group * lanes + k <= a; k++) {
+                    G[a][group * lanes + k] += sum[k];
+                    G[group * lanes + k][a] = G[a][group * lanes + k];
+                }
             }
         start = end;
     }
@@ -159,7 +176,7 @@ template <int D> struct Filter {
                         out.G[(mark * in.columns + a) * in.columns + b] = G[a][b];
                 for (int k = 0; k < in.columns; k++)
                     for (int a = 0; a < D; a++)
-                        out.x[(mark * in.columns + k) * D + a] = x[k][a];
+                        out.x[(mark * in.columns + k) * D + a] = x[k / lanes][a][k % lanes];
                 out.D[mark] = ln_s;
                 out.counted[mark++] = static_cast<double>(counted);
             }
@@ -167,22 +184,22 @@ template <int D> struct Filter {
                 return;
             std::size_t end = i + 1;
             const bool present = std::isfinite(in.y[i]);
-            if (quiet >= settled_samples && plain(i)) {
+            if (quiet >= settled_samples && alike(i)) {
                 const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
-                while (end < stop && end < start + fold && plain(end))
+                while (end < stop && end < start + fold && alike(end))
                     end++;
             } else {
                 covariance(i);
             }
-            for (int k = 0; k < in.columns; k++)
-                column(k, i, end);
-            for (std::size_t j = i; j < end; j++)
-                for (int k = 0; k < in.columns; k++) {
-                    if (out.white != nullptr)
-                        out.white[j * in.columns + k] = present ? nu[k][j - start] : std::nan("");
-                    if (!present)
-                        nu[k][j - start] = 0.0;
-                }
+            for (int group = 0; group < groups; group++)
+                advance(group, i, end);
+            if (out.white != nullptr)
+                for (std::size_t j = i; j < end; j++)
+                    for (int k = 0; k < in.columns; k++)
+                        out.white[j * in.columns + k] = present ? nu[k / lanes][j - start][k % lanes] : std::nan("");
+            if (!present)
+                for (int group = 0; group < groups; group++)
+                    nu[group][i - start] = Lanes{};
             if (out.s != nullptr)
                 for (std::size_t j = i; j < end; j++)
                     out.s[j] = s;
@@ -197,7 +214,13 @@ template <int D> struct Filter {
     }
 };
 
-template <int D> void filter(const Input &in, const Sums &out) { Filter<D>(in, out).run(); }
+// The filter of `states` states.
+template <int D> void filter(std::size_t states, const Input &in, const Sums &out) {
+    if (states == D)
+        Filter<D>(in, out).run();
+    else if constexpr (D < states_max)
+        filter<D + 1>(states, in, out);
+}
 
 double *fresh(std::size_t size) { return new double[size > 0 ? size : 1]; }
 
@@ -210,13 +233,17 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
               const Matrix &P0, double R, const std::vector<std::size_t> &marks, bool innovations) {
     const std::size_t n = y.shape(0), d = h.shape(0), p = z.shape(0);
     if (d < 1 || d > states_max || p + 1 > columns_max)
-        throw std::invalid_argument("1 to 12 states and at most 39 columns");
+        throw std::invalid_argument("1 to 20 states and at most 39 columns");
     if (z.shape(1) != n || r.shape(0) != n || F.shape(0) != d || F.shape(1) != d || Q.shape(0) != d ||
         Q.shape(1) != d || P0.shape(0) != d || P0.shape(1) != d)
         throw std::invalid_argument("shapes do not fit");
     for (std::size_t k = 0; k < marks.size(); k++)
         if (marks[k] > n || (k > 0 && marks[k] < marks[k - 1]))
             throw std::invalid_argument("marks must rise, up to the length of y");
+    for (std::size_t a = 0; a < d; a++)
+        for (std::size_t b = 0; b < d; b++)
+            if (F.data()[a * d + b] != 0.0 && (a > b + 1 || b > a + 1))
+                throw std::invalid_argument("F must be block diagonal with blocks of one or two states");
     const int c = static_cast<int>(p) + 1;
     const std::size_t m = marks.size();
     Sums out{fresh(m * c * c), fresh(m), fresh(m), fresh(m * c * d), innovations ? fresh(n * c) : nullptr, innovations ? fresh(n) : nullptr};
@@ -227,20 +254,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
     const Input in{y.data(), z.data(), r.data(), n, c, F.data(), Q.data(), h.data(), P0.data(), R, marks.data(), m};
     {
         nb::gil_scoped_release released;
-        switch (d) {
-        case 1: filter<1>(in, out); break;
-        case 2: filter<2>(in, out); break;
-        case 3: filter<3>(in, out); break;
-        case 4: filter<4>(in, out); break;
-        case 5: filter<5>(in, out); break;
-        case 6: filter<6>(in, out); break;
-        case 7: filter<7>(in, out); break;
-        case 8: filter<8>(in, out); break;
-        case 9: filter<9>(in, out); break;
-        case 10: filter<10>(in, out); break;
-        case 11: filter<11>(in, out); break;
-        default: filter<12>(in, out); break;
-        }
+        filter<1>(d, in, out);
     }
     return nb::make_tuple(G, D, counted, x, white, s);
 }
