@@ -51,21 +51,26 @@ def written(record: Record, path: Path) -> Path:
     ],
 )
 def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
-    """Against the dense covariance of the record, gaps and uneven noise included. Both are exact: 1e-8 is rounding."""
+    """Against the dense covariance of the record, gaps and uneven noise included.
+
+    The filter keeps its gain while s moves by less than 6e-6: over 500 samples 1e-4 nats, and coefficients to 1e-5."""
     random = np.random.default_rng(7)
-    n, dt = 80, 1.0
+    n, dt = 500, 1.0
     y = random.standard_normal(n).cumsum() * 0.2 + random.standard_normal(n)
     y[[11, 12, 40]] = np.nan
-    r = np.where(np.arange(n) < 50, 1.0, 2.5)
+    r = np.where(np.arange(n) < 280, 1.0, 2.5)
     columns = np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -0.7, "color": 0.3, "ln_band": -0.4}
     theta = np.array([guess.get(name, -3.0 if name == "ln_width" else 0.02) for name in terms.names])
     series = Series(y, dt, r, columns)
     m = matrices(terms, theta, dt, series.duration_s)
     # Covariance of h x_i and h x_j from the state model itself, by its definition.
-    P = [m.P0]
-    for _ in range(n - 1):
-        P.append(m.F @ P[-1] @ m.F.T + m.Q)
+    driven = np.zeros_like(m.Q)
+    if m.driver >= 0:
+        driven[m.driver, m.driver] = m.Q[m.driver, m.driver]
+    P = [m.P0 + driven * (r[0] - 1.0)]
+    for i in range(1, n):
+        P.append(m.F @ P[-1] @ m.F.T + m.Q + driven * (r[i] - 1.0))
     cov = np.diag(m.R * r)
     for i in range(n):
         ahead = P[i] @ m.h
@@ -82,8 +87,8 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     count = int(good.sum())
     expected = -0.5 * (count * (math.log(2.0 * math.pi * rss / count) + 1.0) + np.linalg.slogdet(V)[1])
     sums = run_filter(series, terms, theta)[0][0]
-    assert ln_likelihood(sums) == pytest.approx(expected, abs=1e-6)
-    assert sums.coefficients()[0] == pytest.approx(c, rel=1e-6, abs=1e-9)
+    assert ln_likelihood(sums) == pytest.approx(expected, abs=2e-4)
+    assert sums.coefficients()[0] == pytest.approx(c, rel=1e-5, abs=1e-6)
 
 
 def test_a_fit_finds_the_parameters() -> None:
@@ -233,3 +238,20 @@ def test_compare_tells_what_changed_and_no_more(tmp_path: Path) -> None:
     assert "N" not in rows
     with pytest.raises(UserError, match="two recordings or more"):
         compare([tmp_path / "a.npz"])
+
+
+def test_a_change_of_the_sampling_clock_is_told(tmp_path: Path) -> None:
+    """Truth: from the 1500th of 3000 samples on an interval is 1.02 s instead of 1 s; without it nothing is found."""
+    random = np.random.default_rng(5)
+    n = 3000
+    columns = {name: ("deg/s", 0.01 * random.standard_normal(n)) for name in ("gx", "gy", "gz")}
+    for interval in (1.0, 1.02):
+        t = np.concatenate([np.arange(1500.0), 1500.0 + interval * np.arange(n - 1500.0)])
+        save(tmp_path / "log.npz", columns, 1.0, t=t)
+        axis = diagnose(tmp_path / "log.npz", axes=["gx"])["axes"]["gx"]
+        if interval == 1.0:
+            assert axis["verdict"] == "adequate"
+            continue
+        (finding,) = axis["findings"]
+        assert finding["estimate"] == {"statistic": "sampling_interval", "measured": pytest.approx(1.02, rel=1e-3)}
+        assert finding["when"][0] == pytest.approx(1500.0, rel=0.02)

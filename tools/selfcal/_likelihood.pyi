@@ -17,6 +17,7 @@ def run(
     h: NDArray[np.float64],
     P0: NDArray[np.float64],
     R: float,
+    driver: int,
     marks: Sequence[int],
     innovations: bool,
 ) -> tuple[

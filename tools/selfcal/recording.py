@@ -69,13 +69,16 @@ class Column:
 
 @dataclass(frozen=True)
 class Recording:
-    """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row."""
+    """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row.
+
+    `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps."""
 
     path: Path
     rate_hz: float
     columns: Mapping[str, Column]
     missing_before: NDArray[np.int64]
     meta: Mapping[str, Any]
+    off_grid_s: NDArray[np.float64] | None = None
 
     @property
     def samples(self) -> int:
@@ -450,6 +453,7 @@ def _checked(
     _check_truth(path, meta)
     rows = table[0].size
     stamps = columns.pop("t", None)
+    off_grid = None
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(path, meta)
         if rate is None:
@@ -467,7 +471,8 @@ def _checked(
         if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
             what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
             raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
-    return Recording(path, rate, columns, missing, meta)
+        off_grid = time - (np.arange(rows) + np.cumsum(missing) - missing[0]) / rate
+    return Recording(path, rate, columns, missing, meta, off_grid)
 
 
 def _sampling(

@@ -85,7 +85,7 @@ def run(
     m = matrices(terms, theta, series.dt, series.duration_s)
     at = list(marks) or [series.y.size]
     G, D, n, x, white, s = _likelihood.run(
-        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, at, innovations
+        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, innovations
     )
     return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
 

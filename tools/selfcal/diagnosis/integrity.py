@@ -16,6 +16,8 @@ from selfcal.diagnosis.statemodel import Array, Mask
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
+#: A change of the sampling clock is told of from this share on; a crystal keeps 1e-4.
+CLOCK_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
 #: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
@@ -62,6 +64,37 @@ def _held(record: Record) -> Mask:
     expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
     # Chance repeats of coarse axes are not quite independent: three times the expectation.
     return held if poisson.logsf(int(held.sum()) - 1, 3.0 * expected + 0.05) < -NET_LEAST else none
+
+
+def clock(record: Record) -> Look | None:
+    """The sampling interval changes once: the time stamps, laid on one even grid, have a bend."""
+    off = record.off_grid_s
+    if off is None or off.size < 60:
+        return None
+    k = np.arange(off.size)
+    off = off - np.interp(k, [0, k[-1]], [off[0], off[-1]])  # a bend is farthest from the chord
+    edge = max(10, off.size // 50)
+    at = edge + int(np.argmax(np.abs(off[edge:-edge])))
+    halves = (slice(None, at), slice(at, None))
+    lines = [np.polyfit(k[half], off[half], 1) for half in halves]
+    bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
+    scatter = float((off - bent).std())
+    interval_s = 1.0 / record.recorded_hz
+    change = float(lines[1][0] - lines[0][0]) / interval_s
+    bend = float(np.abs(off).max())
+    if abs(change) < CLOCK_LEAST or bend < 3.0 * interval_s or bend < 5.0 * scatter:
+        return None
+    time = float(at * interval_s)
+    nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * interval_s)) ** 2)
+    return Look(
+        "unexplained",
+        nats,
+        nats,
+        {"statistic": "sampling_interval", "measured": 1.0 + change},
+        {},
+        when=(time, time),
+        shown_by="sampling_interval",
+    )
 
 
 def quantization(state: State) -> Look | None:

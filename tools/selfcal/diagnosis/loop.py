@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -28,7 +29,11 @@ LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
 STATIONARY = (periodic.looks, noise.colored)
 CERTAIN = 50.0
 #: Rounds at most: a recording that holds more is told as it is then.
-ROUNDS = 10
+ROUNDS = 12
+#: From this finding on, a cause that shows nothing waits until the others show nothing either.
+BUSY = 3
+#: Times that one cause is named on an axis: more jumps or changes of the noise are none of single ones.
+MOST = {"step": 3, "variance_change": 3}
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
 #: Probability that the statistics together call an axis of a fitting record inadequate.
@@ -81,6 +86,8 @@ def diagnose_record(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(lambda name: _rounds(record, found[name], advance), axes))
         _directions(record, found)
+        for one in found.values():
+            _harmonics(one)
         _share(found)
         list(pool.map(lambda name: _end(found[name], advance), axes))
     return found
@@ -119,7 +126,11 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
         mask = next(iter(moved.values()))[1]
         for name in states:
             states[name] = integrity.masked(states[name], mask).refit()
+    bent = integrity.clock(record)
     for name, one in found.items():
+        if bent is not None:
+            others = tuple(other for other in found if other != name)
+            one.findings.append(Finding(bent, 0, one.state, one.state, shared_with=others))
         if name in moved:
             one.findings.append(
                 Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
@@ -151,22 +162,75 @@ def _rounds(
     least: float = NET_LEAST,
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
+    idle: set[Callable[[State, Record], list[Look]]] = set()
     for number in range(first, ROUNDS + 1):
         if one.state.below_lattice:
             return
         advance(f"{one.state.axis}: round {number}")
-        looks = sorted(
-            (look for cause in causes for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
-        )
+        looks = _looked(one, record, [cause for cause in causes if cause not in idle], idle)
+        if idle and (not looks or looks[0].net < least):
+            waiting, idle = list(idle), set()
+            looks = sorted([*looks, *_looked(one, record, waiting, set())], key=lambda look: -look.net)
         one.refused = looks
         if not looks or looks[0].net < least:
             return
+        if len(one.findings) < BUSY:
+            idle = set()
         best = looks[0]
         rivals = tuple(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )
         before, one.state = one.state, one.state.refit(**best.changes)
         one.findings.append(Finding(best, number, before, one.state, also_possible=rivals))
+
+
+def _looked(
+    one: Diagnosed,
+    record: Record,
+    causes: Sequence[Callable[[State, Record], list[Look]]],
+    idle: set[Callable[[State, Record], list[Look]]],
+) -> list[Look]:
+    """The looks of `causes`, the most worth first; those without any are added to `idle`."""
+    named = Counter(finding.look.cause for finding in one.findings)
+    found: list[Look] = []
+    for cause in causes:
+        looks = [look for look in cause(one.state, record) if named[look.cause] < MOST.get(look.cause, ROUNDS)]
+        found += looks
+        if not looks:
+            idle.add(cause)
+    return sorted(found, key=lambda look: -look.net)
+
+
+def _harmonics(one: Diagnosed) -> None:
+    """Lines at multiples of a stronger one's frequency are one finding with it: their gains are added."""
+    lines = sorted((f for f in one.findings if f.look.cause == "periodic"), key=lambda f: -f.look.gain)
+    for base in lines:
+        if base not in one.findings:
+            continue
+        f = base.look.estimate["frequency_hz"]
+        harmonics: list[int] = []
+        gain, worth = base.look.gain, base.look.net
+        for other in lines:
+            g = other.look.estimate["frequency_hz"]
+            k = round(g["median"] / f["median"])
+            if other is base or other not in one.findings or k < 2:
+                continue
+            if abs(g["median"] - k * f["median"]) < k * _breadth(base.look) + _breadth(other.look):
+                harmonics.append(k)
+                gain, worth = gain + other.look.gain, worth + other.look.net
+                one.findings.remove(other)
+        if harmonics:
+            estimate = {**base.look.estimate, "harmonics": sorted(harmonics)}
+            one.findings[one.findings.index(base)] = replace(
+                base, look=replace(base.look, gain=gain, net=worth, estimate=estimate)
+            )
+
+
+def _breadth(line: Look) -> float:
+    """How far off the frequency may be, Hz: half the width of a band, three standard deviations of a line."""
+    if "width_hz" in line.estimate:
+        return float(line.estimate["width_hz"]["median"])
+    return 3.0 * float(line.estimate["frequency_hz"]["sd"])
 
 
 def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:

@@ -28,7 +28,7 @@ LEAST = 200
 class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `missing` samples of the
-    recording, at its own rate."""
+    recording, at its own rate `recorded_hz`. `off_grid_s`: of its time stamps, [rows], None without."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -36,6 +36,8 @@ class Record:
     channel_names: Mapping[str, str]
     present: Mask
     missing: int = 0
+    off_grid_s: Array | None = None
+    recorded_hz: float = 1.0
 
     @property
     def time_s(self) -> Array:
@@ -100,7 +102,16 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             if np.ptp(values) > 0.0:
                 channels[cause] = bridged(on_grid(values))
                 names[cause] = column
-    return Record(recording.rate_hz / block, states, channels, names, present, int(recording.missing_before.sum()))
+    return Record(
+        recording.rate_hz / block,
+        states,
+        channels,
+        names,
+        present,
+        int(recording.missing_before.sum()),
+        recording.off_grid_s,
+        recording.rate_hz,
+    )
 
 
 def bridged(values: Array) -> Array:

@@ -100,7 +100,7 @@ def _pass(series: Series, chosen: Fit, marks: list[int] | None = None) -> tuple[
     m = matrices(chosen.terms, chosen.theta, chosen.dt, chosen.duration_s)
     at = marks or [series.y.size]
     G, D, n, x, white, s = _likelihood.run(
-        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, at, marks is None
+        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, marks is None
     )
     return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
 

@@ -16,6 +16,8 @@ from selfcal.diagnosis.statemodel import Array, Terms
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
 P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
+#: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
+FAR = 40.0
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
 
@@ -75,6 +77,12 @@ class State:
         """The drifts that the model may have, with its extras: the paper's laws; walk includes the constant."""
         return (replace(self.extras, walk=True), replace(self.extras, markov=True))
 
+    def near(self) -> tuple[Terms, ...]:
+        """Those that a candidate may make the best."""
+        least = self.best.ln_likelihood - FAR
+        far = {one.terms for one in self.fits if one.ln_likelihood < least}
+        return tuple(terms for terms in self.bases() if terms not in far)
+
     def refit(self, **changes: Any) -> State:
         """The state with `changes`, fitted."""
         state = replace(self, **changes)
@@ -89,7 +97,7 @@ class State:
     def with_columns(self, more: Array) -> tuple[float, Fit]:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
         series = self.series.beside(more)
-        fits = [_fit_from(series, terms, self.fits) for terms in self.bases()]
+        fits = [_fit_from(series, terms, self.fits) for terms in self.near()]
         return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
 
     def rich_gain(self, more: Array) -> float:
@@ -118,7 +126,7 @@ class State:
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     same = [one for one in known if one.terms == terms]
     if same:
-        return fit(series, terms, same[0].theta, step=0.5)
+        return fit(series, terms, same[0].theta, step=0.25)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
     if near:
         return fit(series, terms, moved(near[0], terms))

@@ -68,13 +68,16 @@ class Terms:
 
 @dataclass(frozen=True)
 class Matrices:
-    """Transition F, process noise Q, observation h, first covariance P0, and the variance R of the white noise."""
+    """Transition F, process noise Q, observation h, first covariance P0, and the variance R of the white noise.
+
+    `driver`: the state that white noise with memory enters by, -1 without."""
 
     F: Array
     Q: Array
     h: Array
     P0: Array
     R: float
+    driver: int = -1
 
 
 def flicker_rates(duration_s: float, dt: float) -> Array:
@@ -116,9 +119,10 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         apart = math.log(rates[1] / rates[0])
         for rate in rates:
             markov(math.exp(2.0 * value["ln_flicker"]) * apart / (2.0 * math.pi), float(rate))
-    R = 1.0
+    R, driver = 1.0, -1
     if terms.color == "ar":  # the white noise itself is a first-order process
         f = math.tanh(value["color"])
+        driver = len(phi)
         phi.append(f)
         q.append(1.0 - f * f)
         p0.append(1.0)
@@ -128,6 +132,7 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
     if terms.color == "ma":  # e_i + theta e_(i-1)
         m = math.tanh(value["color"])
         unit = 1.0 / (1.0 + m * m)
+        driver = len(F)
         F, Q, P0 = (
             _joined(F, [[0.0, 0.0], [1.0, 0.0]]),
             _joined(Q, [[unit, 0.0], [0.0, 0.0]]),
@@ -148,7 +153,7 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         h += [1.0, 0.0]
     if not h:
         F, Q, P0, h = np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), [0.0]
-    return Matrices(np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R)
+    return Matrices(np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R, driver)
 
 
 def _joined(a: Array, b: object) -> Array:

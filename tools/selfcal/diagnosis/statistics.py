@@ -16,7 +16,7 @@ from scipy.stats import t as student
 
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array, matrices
+from selfcal.diagnosis.statemodel import Array, Matrices, matrices
 
 #: Simulated records a band rests on.
 ENSEMBLE = 48
@@ -48,22 +48,27 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
     sd = float(x.std())
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
-    lagged = _lagged(filled, min(1 + max(LAGS), n // 8)) / math.sqrt(n)
+    power = _power(filled, min(1 + max(LAGS), n // 8))
+    lagged = _lagged(power, min(1 + max(LAGS), n // 8)) / math.sqrt(n)
     for lag in LAGS:
         if lag < lagged.size:
             found[f"innovation_lag{lag}"] = float(lagged[lag])
     found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
-    found["innovation_excess_kurtosis"] = float(np.mean(np.clip(x, -12, 12) ** 4) - 3.0) * math.sqrt(n / 24.0)
-    found["innovation_skewness"] = float(np.mean(np.clip(x, -12, 12) ** 3)) * math.sqrt(n / 6.0)
+    clipped = np.clip(x, -12.0, 12.0)
+    squared = clipped * clipped
+    found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
+    found["innovation_skewness"] = float(squared @ clipped) / n * math.sqrt(n / 6.0)
     found["innovation_largest"] = _largest(x)
     # Spread of the noise level over the record, in pieces of three lengths.
+    energies = np.minimum(squared, 16.0)
+    variance = float(energies.var())
     for pieces in (8, 40, 200):
         size = n // pieces
         if size < 10:
             break
-        energy = np.minimum(x[: size * pieces] ** 2, 16.0).reshape(pieces, size).mean(axis=1)
+        energy = energies[: size * pieces].reshape(pieces, size).mean(axis=1)
         # In units of the pieces' own expected spread, from the fourth moment.
-        spread = float(np.var(np.minimum(x * x, 16.0))) / size
+        spread = variance / size
         found[f"noise_level_of_{pieces}_pieces"] = _root(
             float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1
         )
@@ -71,7 +76,8 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
     square = np.minimum(np.abs(filled), 3.5)
     square = np.where(present, square - square[present].mean(), 0.0)
     scale = math.sqrt(n) * float(square[present].var())
-    lagged = _lagged(square, min(101, n // 8)) / scale
+    count = min(101, n // 8)
+    lagged = _lagged(_power(square, count), count) / scale
     for lag in (1, 3, 10, 30, 100):
         if lag < lagged.size:
             found[f"innovation_magnitude_lag{lag}"] = float(lagged[lag])
@@ -83,15 +89,15 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
         means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
         found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
     # The spectrum in bands of a third of an octave.
-    power = np.abs(rfft(filled)) ** 2 / n
     worst, places = 0.0, 0
     high = power.size - 1
     while high > 8:
         low = max(1, int(high / 2 ** (1.0 / 3.0)))
         if high - low < 4:
             break
-        part = power[low:high]
-        z = _root(2.0 * float(part.sum()), 2 * part.size)
+        # The padding makes a few more points of as much information.
+        points = (high - low) * w.size / (2 * (power.size - 1))
+        z = _root(2.0 * float(power[low:high].mean()) / n * points, 2.0 * points)
         places += 1
         worst = z if abs(z) > abs(worst) else worst
         high = low
@@ -107,20 +113,26 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
     if lsb > 0.0:
         runs = _longest_run(y)
         found["longest_repeat"] = math.log(runs)
-        remainder = np.rint((y[np.isfinite(y)] + 0.0) / lsb).astype(np.int64)
-        _, counts = np.unique(remainder % 2, return_counts=True)
-        found["odd_even_codes"] = float(counts[0] - counts[-1]) / math.sqrt(counts.sum()) if counts.size == 2 else 9.0
+        codes = np.rint(y[np.isfinite(y)] / lsb).astype(np.int64)
+        odd = int((codes & 1).sum())
+        found["odd_even_codes"] = (codes.size - 2 * odd) / math.sqrt(codes.size) if 0 < odd < codes.size else 9.0
     return found
 
 
-def _lagged(x: Array, count: int) -> Array:
-    """sum x_i x_(i+k) for k below `count`."""
-    size = next_fast_len(x.size + count, real=True)
-    found: Array = irfft(np.abs(rfft(x, size)) ** 2, size)[:count]
+def _power(x: Array, count: int) -> Array:
+    """Power spectrum of `x`, padded for `count` lags of the correlation."""
+    z = rfft(x, 2 * next_fast_len((x.size + count + 1) // 2))
+    found: Array = z.real**2 + z.imag**2
     return found
 
 
-def _root(value: float, freedom: int) -> float:
+def _lagged(power: Array, count: int) -> Array:
+    """sum x_i x_(i+k) for k below `count`, from the padded power spectrum."""
+    found: Array = irfft(power, 2 * (power.size - 1))[:count]
+    return found
+
+
+def _root(value: float, freedom: float) -> float:
     """A chi-square as a normal deviate (Wilson and Hilferty)."""
     a = 2.0 / (9.0 * freedom)
     return (math.cbrt(max(value, 1e-12) / freedom) - 1.0 + a) / math.sqrt(a)
@@ -146,7 +158,7 @@ def simulated(state: State, random: np.random.Generator) -> Array:
     # Reading out on the lattice adds lsb^2 / 12, which the fitted white noise holds already.
     white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
     y = np.sqrt(white * state.r) * random.standard_normal(n)
-    y += _states(m.F, m.Q, m.h, m.P0, n, random) * fit.sigma
+    y += _states(m, np.sqrt(state.r), random) * fit.sigma
     y += fit.c @ state.series.columns
     y = np.where(np.isfinite(state.y), y, np.nan)
     if state.lsb > 0.0:
@@ -154,11 +166,12 @@ def simulated(state: State, random: np.random.Generator) -> Array:
     return y
 
 
-def _states(F: Array, Q: Array, h: Array, P0: Array, n: int, random: np.random.Generator) -> Array:
-    """h x over n steps. Diagonal and small blocks: each is filtered by itself."""
+def _states(m: Matrices, level: Array, random: np.random.Generator) -> Array:
+    """h x over n steps; `level` [n] scales white noise with memory. Small blocks: each is filtered by itself."""
     from scipy.signal import lfilter
 
-    d = len(F)
+    F, Q, h, P0 = m.F, m.Q, m.h, m.P0
+    d, n = len(F), level.size
     out = np.zeros(n)
     k = 0
     while k < d:
@@ -167,12 +180,14 @@ def _states(F: Array, Q: Array, h: Array, P0: Array, n: int, random: np.random.G
             start = math.sqrt(max(P0[k, k], 0.0)) * random.standard_normal()
             noise = math.sqrt(max(Q[k, k], 0.0)) * random.standard_normal(n)
             noise[0] = start
+            if k == m.driver:
+                noise *= level
             out += h[k] * lfilter([1.0], [1.0, -F[k, k]], noise)
             k += 1
             continue
         f = F[k : k + 2, k : k + 2]
         if f[0, 0] == 0.0:  # the moving average: e_i and e_(i-1)
-            e = math.sqrt(Q[k, k]) * random.standard_normal(n + 1)
+            e = math.sqrt(Q[k, k]) * random.standard_normal(n + 1) * np.append(level[0], level)
             out += h[k] * e[1:] + h[k + 1] * e[:-1]
         else:  # an oscillator, as a complex first-order process
             pole = complex(f[0, 0], -f[0, 1])

@@ -24,6 +24,11 @@ WORDS: Mapping[str, str] = {
     "unexplained": "The readings differ from every model tried, and no known cause explains it.",
 }
 
+#: What a statistic says by itself where no cause is named.
+STATISTICS: Mapping[str, str] = {
+    "sampling_interval": "The sampling clock changes its rate: rates, drifts and lines before and after do not agree.",
+}
+
 NEXT: Mapping[str, str] = {
     "temperature": "Cycle the temperature up and down, so that it does not only rise with time.",
     "supply": "Change the supply by 0.1 V and back, twice, at a constant temperature.",
@@ -60,7 +65,8 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
-    return f"{WORDS[cause]} {text[:1].upper()}{text[1:]}."
+    words = STATISTICS.get(str(estimate.get("statistic")), WORDS[cause])
+    return f"{words} {text[:1].upper()}{text[1:]}."
 
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from selfcal.diagnosis.fit import best, fit, moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State, interval, net
+from selfcal.diagnosis.statemodel import Array
 
 #: The best place of a change of the noise gains about this much of noise alone.
 LN_CHANGES = 2.6
@@ -21,13 +22,18 @@ def colored(state: State, record: Record) -> list[Look]:
         return []
     w = np.nan_to_num(state.whitened)
     n = max(1, int(np.isfinite(state.y).sum()))
-    lags = np.array([float(w[k:] @ w[:-k]) / n for k in (1, 2)])
+    lags: Array = np.array([float(w[k:] @ w[:-k]) / n for k in (1, 2)])
     if 0.5 * n * float(lags @ lags) < 2.0:
         return []
     found: list[Look] = []
     for color in ("ma", "ar"):
-        changed = state.refit(extras=replace(state.extras, color=color))
-        chosen = changed.best
+        fits = []
+        for drift in state.near():
+            terms = replace(drift, color=color)
+            start = moved(next(one for one in state.fits if one.terms == drift), terms)
+            start[terms.names.index("color")] = math.atanh(min(0.9, max(-0.9, float(lags[0]))))
+            fits.append(fit(state.series, terms, start, step=0.25))
+        chosen = best(fits)
         gain = chosen.ln_likelihood - state.best.ln_likelihood
         m = math.tanh(chosen.value("color"))
         lag1 = m / (1.0 + m * m) if color == "ma" else m

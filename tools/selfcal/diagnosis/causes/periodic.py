@@ -23,7 +23,7 @@ BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
 BAND_LEAST = 12.0
 BAND_DEARER = 6.0
 #: Bands that one model may have.
-BANDS_MOST = 3
+BANDS_MOST = 5
 #: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
 NARROW = 4
 
