@@ -159,10 +159,12 @@ SANITIZED := -O1 $(FMA) -g -fno-omit-frame-pointer -fsanitize=address,undefined 
 $(BUILD)/c/sanitized/%: C := $(SANITIZED)
 $(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
 $(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
+# From a folder four levels below to this one, whose path may have spaces.
+BACK := ../../../..
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
-	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(CURDIR)/%) -c $(TESTED:%=$(CURDIR)/%)
+	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(BACK)/%) -c $(TESTED:%=$(BACK)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
 $(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h
@@ -287,7 +289,7 @@ $(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma
 $(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/bench/record.c $(wildcard lib/*.c) $(MODEL)/selfcal_model.c \
                        $(BENCH_H) $(wildcard host_sim/*.hpp)
 	@mkdir -p $(@D)
-	cd $(@D) && gcc $(HOST) -std=c99 -ffp-contract=off $(WARNINGS) -I$(CURDIR)/lib -I$(CURDIR)/$(MODEL) -c $(filter %.c,$(^:%=$(CURDIR)/%))
+	cd $(@D) && gcc $(HOST) -std=c99 -ffp-contract=off $(WARNINGS) -I$(BACK)/lib -I$(BACK)/$(MODEL) -c $(filter %.c,$(^:%=$(BACK)/%))
 	g++ $(HOST) -std=c++17 $(filter-out -Wdouble-promotion,$(WARNINGS)) -Ilib -Ihost_sim -I$(MODEL) -isystem /usr/include/eigen3 $(filter %.cpp,$^) $(@D)/*.o -pthread -o $@
 
 # ------------------------------------------------------------------------------------------------------------- checks

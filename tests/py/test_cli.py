@@ -85,7 +85,11 @@ def test_verbs_are_functions() -> None:
     ("arguments", "expected"),
     [
         (["nonsense"], "No such command 'nonsense'; see `selfcal --help`"),
-        (["identify"], "Missing argument 'LOG' (Recording: .csv, .csv.gz or .npz); see `selfcal identify --help`"),
+        (
+            ["identify"],
+            "Missing argument 'LOG' (Recording: .csv, .tsv, .txt, .npz, .mat, .rda, .rdata, .rds; .gz of text); "
+            "see `selfcal identify --help`",
+        ),
         (["identify", "."], ".: is a folder: name a recording in it (.csv, "),
         (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),
         (["identify", "log.csv", "--json", "no/out.json"], NO_FOLDER),

@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -399,3 +400,36 @@ def test_a_bias_prior_that_the_library_cannot_hold(tmp_path: Path) -> None:
         Model.load(path)
     path.write_text(text.replace("bias: {law: normal, sd: 10.0}", "bias: {law: normal, sd: 0.99e+5}"))
     assert Model.load(path).groups[0].priors["bias"].sd == 0.99e5
+
+
+def quantized(tmp_path: Path, sd: float, level: float) -> dict[str, Any]:
+    """gx of 600 s at 10 Hz: white noise of `sd` a reading about `level`, both in steps of a lattice of 0.05 deg/s."""
+    log = tmp_path / "quantized.csv"
+    steps = level + sd * np.random.default_rng(1).standard_normal(6000)
+    save(log, {"gx": ("deg/s", 0.05 * np.rint(steps))}, 10.0, {})
+    return dict(identify(log)["axes"]["gx"])
+
+
+@pytest.mark.parametrize(("sd", "level"), [(0.03, 3.5), (0.1, 3.4), (0.24, 3.5), (0.3, 3.2)])
+def test_noise_below_the_lattice_is_never_adequate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sd: float, level: float
+) -> None:
+    """N is then that of the rounding, up to 16 times the true one, and a reading that toggles looks white."""
+    axis = quantized(tmp_path, sd, level)
+    check = axis["checks"]["lattice"]
+    assert not check["passed"] and not axis["adequate"]
+    assert check["step"] == pytest.approx(0.05)
+    show(identify(tmp_path / "quantized.csv"))
+    said = f"not adequate: gx: lattice: {check['distinct']} distinct readings 0.05 deg/s apart"
+    assert said in capsys.readouterr().out.replace("\n", " ")
+
+
+@pytest.mark.parametrize("level", [3.0, 3.25, 3.5])
+def test_noise_of_half_a_step_and_more_passes_the_lattice(tmp_path: Path, level: float) -> None:
+    """Rounding then adds step^2 / 12 to each reading's variance, whatever the level: N is that to 4 sd of 6000."""
+    for sd in (0.5, 1.0, 3.0):
+        axis = quantized(tmp_path, sd, level)
+        assert axis["checks"]["lattice"]["passed"] and axis["adequate"]
+        n = 0.05 * math.sqrt((sd**2 + 1.0 / 12.0) / 10.0)
+        # beside the statistical error the rounding's variance swings by exp(-2 pi^2 sd^2), 0.7 % at half a step
+        assert axis["parameters"]["constant"]["N"]["median"] == pytest.approx(n, rel=4.0 / math.sqrt(1200.0) + 0.01)

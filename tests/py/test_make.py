@@ -268,3 +268,12 @@ while [ $# -gt 1 ]; do [ "$1" = -o ] && : >"$2" && : >"${2%.o}.su"; shift; done
     assert flags.stat().st_mode & 0o777 == 0o600
     assert flags.parent.stat().st_mode & 0o077 == 0
     assert "gcc" not in make(*command, f"CFLAGS={build_flag(bytes(range(16)))}", cwd=checkout, PATH=path).stdout
+
+
+def test_compiler_commands_hold_no_path_of_the_checkout() -> None:
+    """A checkout's path may have spaces, and make cannot quote them: sources are named from where they are compiled."""
+    targets = ("build/c/plain/test_slots", "build/bench/host/O2/bench")
+    said = make("--dry-run", "--always-make", *targets).stdout
+    compiled = [line for line in said.splitlines() if " -c " in line and ("/objects && " in line or "host/" in line)]
+    assert compiled
+    assert not [line for line in compiled if str(ROOT) in line]

@@ -198,20 +198,20 @@ def test_contact_is_lost_after_3_s_or_three_times_the_longest_interval() -> None
     assert not contact.lost
     for at in (1.0, 1.1, 1.2):
         now[0] = at
-        contact.heard(in_a_row=True)
+        contact.heard(in_a_row=True, paced=True)
     now[0] = 4.1
     assert not contact.lost
     now[0] = 4.3
     assert contact.lost
     now[0] = 11.2  # the module speaks every 10 s: from here on 30 s
-    contact.heard(in_a_row=True)
+    contact.heard(in_a_row=True, paced=True)
     assert not contact.lost
     now[0] = 41.1
     assert not contact.lost
     now[0] = 41.3
     assert contact.lost
     now[0] = 1000.0  # frames were lost in this silence: it says nothing of how often the module speaks
-    contact.heard(in_a_row=False)
+    contact.heard(in_a_row=False, paced=True)
     now[0] = 1031.0
     assert contact.lost
 
@@ -225,7 +225,7 @@ def test_a_dead_module_is_not_shown_as_running() -> None:
     contact = Contact(lambda: now[0])
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
         view = View(decoder, Link(bus), "test", contact=contact)
-        contact.heard(in_a_row=True)
+        contact.heard(in_a_row=True, paced=True)
         view.show([AxisReport("gx", 60.0, True, {"count": 60.0})])
         assert "running" in shown(view)
         assert " 0 s" in shown(view)
@@ -233,15 +233,49 @@ def test_a_dead_module_is_not_shown_as_running() -> None:
         assert "running" not in shown(view)
         assert "lost contact: no word for 7 s" in shown(view)
         assert " 7 s" in shown(view).splitlines()[-2]
-        contact.heard(in_a_row=False)
+        contact.heard(in_a_row=False, paced=True)
         assert "running" in shown(view)
+
+
+def test_a_module_is_waited_for_until_its_second_status() -> None:
+    """One that reports every 10 s is silent between its first report and the second, and healthy."""
+    now = [0.0]
+    decoder = Decoder()
+    decoder.status["state"] = 1.0
+    contact = Contact(lambda: now[0])
+    with can.Bus(interface="virtual", channel="selfcal-waiting") as bus:
+        view = View(decoder, Link(bus), "test", contact=contact)
+        for at in (0.5, 0.6):
+            now[0] = at
+            contact.heard(in_a_row=True, paced=False)
+        now[0] = 7.6
+        assert not contact.lost
+        assert "waiting: no word for 7 s" in shown(view)
+        now[0] = 12.7  # no module is silent for so long
+        assert "lost contact: no word for 12 s" in shown(view)
+        now[0] = 10.6
+        contact.heard(in_a_row=True, paced=True)
+        now[0] = 40.5  # the interval of 10 s is known
+        assert "running" in shown(view)
+        now[0] = 40.7
+        assert contact.lost
+
+
+def test_a_module_between_its_first_two_reports_is_no_loss() -> None:
+    """The exit code says the same as the view: one report, 6 s of silence."""
+    with serial_line(text_of(lines(stream(21, 3))[:300])) as path:
+        done = subprocess.run(
+            [*COMMAND, "--channel", path, "--duration", "6"], capture_output=True, text=True, timeout=60, check=False
+        )
+    assert done.returncode == 0, done.stderr
+    assert "contact lost" not in done.stderr
 
 
 def test_a_module_that_falls_silent_is_told_by_the_exit_code() -> None:
     """The pseudo-terminal stays; nobody writes to it any more."""
     with serial_line(text_of(lines(stream(21, 3))[:300])) as path:  # the last status would say that it has finished
         done = subprocess.run(
-            [*COMMAND, "--channel", path, "--duration", "8"], capture_output=True, text=True, timeout=60, check=False
+            [*COMMAND, "--channel", path, "--duration", "14"], capture_output=True, text=True, timeout=60, check=False
         )
     assert done.returncode == 1
     assert "contact lost, no word for" in done.stderr

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from selfcal.errors import UserError
 from selfcal.recording import load, parse_scales, save
+from selfcal.suffixes import ARRAYS, TEXT
 
 from conftest import shared_recording
 
@@ -528,3 +529,15 @@ def test_save_says_what_it_cannot_write(tmp_path: Path) -> None:
             save(tmp_path / name, columns, 1.0)
     with pytest.raises(UserError, match=r"ends in \.csv, \.csv\.gz or \.npz"):
         save(tmp_path / "log.txt", columns, 1.0)
+
+
+def test_help_names_every_form_that_is_read() -> None:
+    """The loaders, the complaint about another name and the help say one list."""
+    from typer.testing import CliRunner
+
+    from selfcal.cli import app
+
+    for verb in ("identify", "diagnose", "replay", "compare", "demo"):
+        shown = " ".join(CliRunner().invoke(app, [verb, "--help"]).output.split())
+        for suffix in (*TEXT, *ARRAYS, ".gz of text"):
+            assert suffix in shown, (verb, suffix)

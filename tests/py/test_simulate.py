@@ -7,6 +7,7 @@ or from the normal theory; 4.5 of them leave a wrong alarm 7e-6, and the seeds a
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy import stats
 
 from selfcal import _reference, recording
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model
+from selfcal.model import DEFAULT, LAWS, Model
 from selfcal.verbs.simulate import show, simulate
 
 DATA = Path(__file__).parents[1] / "data"
@@ -421,3 +422,25 @@ def test_what_was_written_is_printed(tmp_path: Path, capsys: pytest.CaptureFixtu
         said = capsys.readouterr().out
         assert said.startswith(f"{tmp_path / name}: 60 samples at 2 Hz, seed 7\n{place}")
         assert "N 0.1 deg/s/sqrt(Hz)\n  gy: " in said
+
+
+WRONG_NUMBERS = [
+    ("duration_s: 3600.0", "duration_s: -1", "simulate.duration_s"),
+    ("  rate_hz: 10.0", "  rate_hz: nan", "simulate.rate_hz"),
+    ("  axes: {}", "  axes: {gx: {N: -1}}", "simulate.axes.gx.N"),
+    ("  axes: {}", "  axes: {gx: {bias: no}}", "simulate.axes.gx.bias"),
+    ("  axes: {}", "  axes: {gx: {hypothesis: walk}}", "simulate.axes.gx.hypothesis"),
+    ("  axes: {}", "  axes: {hx: {N: 1}}", "simulate.axes"),
+    ("  axes: {}", "  effects: [1]", "simulate.effects"),
+]
+
+
+@pytest.mark.parametrize(("good", "wrong", "where"), WRONG_NUMBERS)
+def test_every_verb_checks_what_the_model_simulates(tmp_path: Path, good: str, wrong: str, where: str) -> None:
+    """`codegen` and `identify` read the model as `simulate` does: a wrong number is no surprise for later."""
+    text = DEFAULT.read_text(encoding="utf-8")
+    assert good in text
+    path = tmp_path / "model.yaml"
+    path.write_text(text.replace(good, wrong), encoding="utf-8")
+    with pytest.raises(UserError, match=re.escape(f"{path}: {where}: ")):
+        Model.load(path)

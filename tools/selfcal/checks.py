@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from selfcal.allan import Curve, curve_of, ratio_at
-from selfcal.blocks import MOST_DENSE, Blocks
+from selfcal.blocks import MOST_DENSE, Blocks, kept_out
+from selfcal.lattice import BELOW_LATTICE, lattice_of
 from selfcal.model import LAWS, Group
+from selfcal.recording import Recording, as_float
 from selfcal.result import AxisResult
 from selfcal.tables import Tables
 
@@ -53,6 +55,19 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
     )
     checks = innovation_checks(blocks, tables, group, result, list(used))
     return Judged({**checks, **(allan_checks(curve) if curve else {})}, curve)
+
+
+def with_lattice(judged: Judged, recording: Recording, axis: str, group: Group) -> Judged:
+    """The same with one check more: is the noise of the usable readings above their lattice, if they lie on one?
+
+    `value`: steps in the noise of a reading; `step` in the recording's unit; `distinct` readings."""
+    unused = np.logical_or.reduce(list(kept_out(as_float(recording.in_unit(axis, group.unit)), group).values()))
+    found = lattice_of(recording.columns[axis].values[~unused], recording.rate_hz)
+    if found is None:
+        return judged
+    told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse}
+    check = {**told, "step": found.step, "distinct": found.distinct}
+    return replace(judged, checks={**judged.checks, "lattice": check})
 
 
 def coefficients_of(result: AxisResult) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from typer.exceptions import TyperException
 
 from selfcal.ending import install, last_signal
 from selfcal.errors import UserError, printable
+from selfcal.suffixes import READ, WRITTEN
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
@@ -74,7 +75,7 @@ class Transport(StrEnum):
     can = "can"
 
 
-Log = Annotated[Path, typer.Argument(metavar="LOG", help="Recording: .csv, .csv.gz or .npz", show_default=False)]
+Log = Annotated[Path, typer.Argument(metavar="LOG", help=f"Recording: {READ}", show_default=False)]
 ModelFile = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
 ]
@@ -203,7 +204,7 @@ def diagnose(
 @app.command()
 def compare(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG LOG...", help="Recordings of one part", show_default=False)
+        list[Path], typer.Argument(metavar="LOG LOG...", help=f"Recordings of one part: {READ}", show_default=False)
     ],
     axis: Axis = None,
     model: ModelFile = None,
@@ -223,7 +224,7 @@ def compare(
 def simulate(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="LOG", help="Recording to write", show_default=False)
+        Path, typer.Option("-o", "--output", metavar="LOG", help=f"Recording to write: {WRITTEN}", show_default=False)
     ],
     seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same recording", min=0)] = 0,
     effect: Annotated[
@@ -320,7 +321,8 @@ def monitor(
 @app.command()
 def demo(
     log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="Recording; default: the shipped one", show_default=False)
+        Path | None,
+        typer.Argument(metavar="[LOG]", help=f"Recording: {READ}; default: the shipped one", show_default=False),
     ] = None,
     speed: Annotated[float, typer.Option(metavar="X", help="Times real time")] = 10.0,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,

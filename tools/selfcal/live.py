@@ -38,6 +38,9 @@ INDENT = 2
 STATUS_LINES = 2
 #: s without a byte after which contact is lost, and how often the longest interval that was seen has to pass.
 SILENT_S, INTERVALS = 3.0, 3.0
+#: s that a module may be silent before its second status has shown how often it speaks: it sends one every 10 s
+#: (STATUS_MS in port/app/app.c), and a save takes up to 2 s.
+FIRST_S = 12.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 
 
@@ -52,7 +55,8 @@ class Contact:
     """When the module was heard last, by the host's clock (`clock`, s).
 
     Contact is lost after SILENT_S, or after three times the longest interval that lay between two frames in a row,
-    whichever is longer. Intervals in which frames were lost tell nothing of how often the module speaks.
+    whichever is longer. Intervals in which frames were lost tell nothing of how often the module speaks. Before its
+    second status nothing tells: contact is then lost after FIRST_S.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -60,9 +64,12 @@ class Contact:
         self._since = clock()
         self._longest = 0.0
         self.ever = False
+        self._paced = False
 
-    def heard(self, *, in_a_row: bool) -> None:
-        """Something came. `in_a_row`: a frame, and no other was lost before it."""
+    def heard(self, *, in_a_row: bool, paced: bool) -> None:
+        """Something came. `in_a_row`: a frame, and no other was lost before it. `paced`: a second status has come,
+        more than SILENT_S of module time after the first."""
+        self._paced = paced
         if in_a_row and self.ever:
             self._longest = max(self._longest, self.silent_s)
         self._since = self._clock()
@@ -76,7 +83,12 @@ class Contact:
     @property
     def lost(self) -> bool:
         """The module is not heard any more, or never was."""
-        return self.silent_s > max(SILENT_S, INTERVALS * self._longest)
+        return self.silent_s > max(FIRST_S if self.waiting else SILENT_S, INTERVALS * self._longest)
+
+    @property
+    def waiting(self) -> bool:
+        """Silent, and it is not known yet how often the module speaks."""
+        return self.ever and not self._paced and self.silent_s > SILENT_S
 
 
 class View:
@@ -164,6 +176,8 @@ class View:
         if contact is not None and contact.lost and not self._decoder.finished:
             word = "lost contact: no word" if contact.ever else "no word"
             return Text(f"{word} for {contact.silent_s:.0f} s", "bold red")
+        if contact is not None and contact.waiting and not self._decoder.finished:
+            return Text(f"waiting: no word for {contact.silent_s:.0f} s, a status comes every 10 s", "yellow")
         end = contact is None and self._total_s is None and self._source.closed
         return Text(f"{said}, end of the log" if end else said, "bold")
 

@@ -140,7 +140,8 @@ class GridNodes:
 
 @dataclass(frozen=True)
 class Model:
-    """A checked model file. `hypotheses` holds prior probabilities that sum to 1."""
+    """A checked model file. `hypotheses` holds prior probabilities that sum to 1; `simulate` the entry of that name,
+    its `axes` and `effects` always."""
 
     name: str
     path: Path
@@ -440,6 +441,32 @@ class _Reader:
             )
         return GridNodes(self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", *NODES), pairs)
 
+    def simulate(self, tree: Any, axes: Collection[str]) -> dict[str, Any]:
+        fields = dict(self.only(tree, ("rate_hz", "duration_s", "axes", "effects"), "simulate"))
+        if "rate_hz" in fields:
+            fields["rate_hz"] = self.rate(fields["rate_hz"], "simulate.rate_hz")
+        if "duration_s" in fields:
+            fields["duration_s"] = self.number(fields["duration_s"], "simulate.duration_s")
+        texts = fields.get("effects") or []
+        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+            raise self.fail("simulate.effects", "must be a list of texts ID[:key=value,...]")
+        stated = fields.get("axes") or {}
+        if not isinstance(stated, dict):
+            raise self.fail("simulate.axes", "must be a mapping of axes")
+        for name in stated:
+            if name not in axes:
+                raise self.fail("simulate.axes", f"the model has no axis {shown(name)} (it has {', '.join(axes)})")
+        known = ("hypothesis", "bias", *PLACES)
+        truths = {name: dict(self.only(one or {}, known, f"simulate.axes.{name}")) for name, one in stated.items()}
+        for name, truth in truths.items():
+            where = f"simulate.axes.{name}"
+            law = truth.get("hypothesis", "constant")
+            if not isinstance(law, str) or law not in LAWS:
+                raise self.fail(f"{where}.hypothesis", f"unknown {shown(law)} (known: {', '.join(LAWS)})")
+            for key in truth.keys() - {"hypothesis"}:
+                truth[key] = self.number(truth[key], f"{where}.{key}", low=-math.inf if key == "bias" else 0.0)
+        return {**fields, "axes": truths, "effects": texts}
+
     def model(self) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
         raw = self.tree()
@@ -471,7 +498,6 @@ class _Reader:
         targets = self.entry(tree, "nodes", "")
         if not isinstance(targets, dict) or "host" not in targets:
             raise self.fail("nodes", "must be a mapping of targets, 'host' among them")
-        simulate = tree.get("simulate") or {}
         return Model(
             name=name,
             path=self.path,
@@ -482,7 +508,7 @@ class _Reader:
             groups=groups,
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
             nodes={name: self.nodes(fields, f"nodes.{name}", weights) for name, fields in targets.items()},
-            simulate=self.only(simulate, ("rate_hz", "duration_s", "axes", "effects"), "simulate"),
+            simulate=self.simulate(tree.get("simulate") or {}, axes),
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,

@@ -35,6 +35,7 @@ from selfcal.limits import (
 )
 from selfcal.output import whole
 from selfcal.sampling import Ambiguous, sampling
+from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
 from selfcal.text_table import TextTable
 
 #: Sensor columns unless a model names others; a recording needs at least one.
@@ -44,11 +45,8 @@ _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
 
-#: Suffixes of text, each with .gz too, and what reads the others.
-_TEXT = (".csv", ".tsv", ".txt")
-_ARRAYS: Mapping[str, Callable[[Path], Members]] = {
-    ".npz": npz, ".mat": mat, ".rda": r_data, ".rdata": r_data, ".rds": r_data,
-}  # fmt: skip
+#: What reads a file of arrays, by its suffix.
+_ARRAYS: Mapping[str, Callable[[Path], Members]] = dict(zip(ARRAYS, (npz, mat, r_data, r_data, r_data), strict=True))
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
@@ -145,7 +143,7 @@ def load(
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
     header = _Header(path, columns, units, by_name, sensors)
     if path.is_dir():
-        raise UserError(f"{path}: is a folder: name a recording in it ({', '.join((*_TEXT, *_ARRAYS))})")
+        raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
     suffix = path.suffix.lower()
     with reading(path, "not a sound recording"):
         if suffix in _ARRAYS:
@@ -153,11 +151,10 @@ def load(
                 if not stream.read(1):
                     raise UserError(f"{path}: the file is empty")
             return _load_arrays(path, rate, header, _ARRAYS[suffix](path))
-        if path.name.lower().removesuffix(".gz").endswith(_TEXT):
+        if path.name.lower().removesuffix(".gz").endswith(TEXT):
             return _load_text(path, rate, header)
         path.open("rb").close()
-    known = ", ".join((*_TEXT, *_ARRAYS))
-    raise UserError(f"{path}: not a recording: its name ends in none of {known}, .csv.gz")
+    raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
 
 
 def save(
@@ -180,7 +177,7 @@ def save(
         _save_npz(path, columns, described, t, lsb or {})
         return
     if not path.name.lower().endswith((".csv", ".csv.gz")):
-        raise UserError(f"{path}: a recording's name ends in .csv, .csv.gz or .npz")
+        raise UserError(f"{path}: a written recording's name ends in {WRITTEN}")
     n = len(next(iter(columns.values()))[1])
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])

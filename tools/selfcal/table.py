@@ -108,7 +108,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         if counts:
             kept.append(f"kept out: {name}: {', '.join(counts)}")
         for check, outcome in axis["checks"].items():
-            if not outcome["passed"] and not check.startswith("allan_"):
+            if not outcome["passed"] and check == "lattice":
+                step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {bias['unit']} apart"
+                meaning = "noise is below that, N includes the rounding, the bias may stick"
+                failed.append(f"not adequate: {name}: lattice: {step}: {meaning}")
+            elif not outcome["passed"] and not check.startswith("allan_"):
                 failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
         off = [
             f"{check.removeprefix('allan_')} {100.0 * outcome['value']:+.0f} %"

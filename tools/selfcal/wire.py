@@ -196,6 +196,8 @@ class Decoder:
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
         self.finished = False
+        #: Module time of the first status, ms, and of the last.
+        self.status_ms: tuple[int, int] | None = None
         self._counter: int | None = COUNTER - 1 if from_start else None
         self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
         self._sent = 0  # frames sent since then, as far as known
@@ -255,6 +257,7 @@ class Decoder:
             if "frames_sent" in values:
                 self._exact(int(values["frames_sent"]))
                 self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+                self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
             return self.flush()
         if definition.name == CORRECTED:
             if "time_ms" in values:

@@ -12,14 +12,12 @@ from scipy.ndimage import uniform_filter1d
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
+from selfcal.lattice import lattice_of
 from selfcal.model import Model
 from selfcal.recording import Recording
 
 #: Columns that are no axis but may explain one, by cause: name and unit.
 CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
-#: LSB over the noise of a reading from which on an axis counts as below its lattice: rounding alone has a standard
-#: deviation of lsb / sqrt(12), so the white noise itself is then below a third of an LSB.
-BELOW_LATTICE = 2.2
 #: Samples that a diagnosis needs at least.
 LEAST = 200
 
@@ -80,7 +78,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if not np.ptp(values) > 0.0:
             continue
         y = on_grid(values)
-        q = lattice(values)
+        found = lattice_of(values, recording.rate_hz)
         level = float(np.nanmedian(y))
         states[name] = State(
             axis=name,
@@ -89,10 +87,10 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             dt=block / recording.rate_hz,
             level=level,
             r=np.where(present, block / np.maximum(used, 1), 1.0),
-            lsb=q if block == 1 else 0.0,
+            lsb=found.step if found is not None and block == 1 else 0.0,
             stated_lsb=group.lsb,
             redrawn=block > 1,
-            below_lattice=q > BELOW_LATTICE * float(np.diff(values).std()) / math.sqrt(2.0),
+            below_lattice=found is not None and found.too_coarse,
         )
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
@@ -121,22 +119,6 @@ def bridged(values: Array) -> Array:
         return values
     where = np.arange(values.size)
     return np.interp(where, where[good], values[good])
-
-
-def lattice(values: Array) -> float:
-    """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
-    where every difference is a whole multiple of it."""
-    unique = np.unique(values)
-    if unique.size < 2:
-        return 0.0
-    gaps = np.diff(unique)
-    gaps = gaps[gaps > 1e-9 * max(np.ptp(unique), np.abs(unique).max())]
-    if not gaps.size:
-        return 0.0
-    least = float(gaps.min())
-    steps = np.rint(gaps / least)
-    q = float(gaps.sum() / steps.sum())
-    return q if np.all(np.abs(gaps - steps * q) < 0.02 * q) else 0.0
 
 
 def smoothed(values: Array, window: int) -> Array:

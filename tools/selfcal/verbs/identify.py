@@ -16,7 +16,7 @@ from rich.progress import Progress
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, kept_out, usable_blocks
-from selfcal.checks import coefficients_of, judge
+from selfcal.checks import coefficients_of, judge, with_lattice
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
@@ -177,7 +177,7 @@ def identify_axis(
             advance()
     unit = recording.columns[name].unit
     if not regressors:
-        judged = judge(blocks, tables, group, results[0])
+        judged = with_lattice(judge(blocks, tables, group, results[0]), recording, name, group)
         curve = curve_of_samples(samples) if draw else None
         return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, blocks.kept_out, None, curve)
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
@@ -186,7 +186,7 @@ def identify_axis(
         raise UserError(outside_priors(tables.axes[0]))
     inside = combine(choices, results, model.hypotheses, group.unit)
     used = _used(mask_of(regressors, choices[inside.best]))
-    judged = judge(blocks, tables, group, results[inside.best], used)
+    judged = with_lattice(judge(blocks, tables, group, results[inside.best], used), recording, name, group)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)

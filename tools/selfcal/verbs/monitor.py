@@ -18,7 +18,7 @@ from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError
 from selfcal.framelog import WRITTEN, FrameLog
-from selfcal.live import Contact, View
+from selfcal.live import SILENT_S, Contact, View
 from selfcal.plot import check_picture, plot_run
 from selfcal.wire import AXES, AxisReport, Decoder, Link, Statistics, axis_unit, open_bus, serial_ports
 
@@ -117,7 +117,8 @@ def monitor(
                     reports = [] if frame is None else decoder.feed(frame)
                     in_a_row = (decoder.statistics.received, decoder.statistics.lost) == (received + 1, lost)
                     if contact is not None and (frame is not None or source.malformed > malformed):
-                        contact.heard(in_a_row=in_a_row)
+                        first, last = decoder.status_ms or (0, 0)
+                        contact.heard(in_a_row=in_a_row, paced=abs(last - first) > 1000.0 * SILENT_S)
                     if frame is None:
                         if contact is not None and min(contact.silent_s, time.monotonic() - opened) > REOPEN_S:
                             cast(Link, source).open_again()  # a module that has restarted waits for that

@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 
 from selfcal.blocks import usable_blocks
-from selfcal.checks import Judged, judge
+from selfcal.checks import Judged, judge, with_lattice
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError, note
@@ -418,5 +418,7 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
-    judged = Judged({}, None) if gate else judge(blocks, tables, group, result)
+    judged = Judged({}, None)
+    if not gate:
+        judged = with_lattice(judge(blocks, tables, group, result), recording, name, group)
     return Identified(unit, group.unit, in_unit(result, group.unit, unit), judged, blocks.kept_out)

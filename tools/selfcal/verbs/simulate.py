@@ -13,8 +13,8 @@ import numpy as np
 from rich.console import Console
 
 from selfcal import _reference, recording, units
-from selfcal.errors import UserError, printable, shown
-from selfcal.model import LARGEST, LAWS, PARAMETERS, PLACES, Group, Model, Prior
+from selfcal.errors import UserError, printable
+from selfcal.model import LAWS, PARAMETERS, Group, Model, Prior
 from selfcal.output import check_place
 from selfcal.tables import bank_block
 
@@ -104,7 +104,7 @@ def simulate(
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = _truth(model, seed)
     axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
-    applied = [_apply(text, model, scene, axes) for text in (*_own_effects(model), *effects)]
+    applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
@@ -144,21 +144,13 @@ def show(meta: Mapping[str, Any], output: Path | str) -> None:
         print(f"  {axis}: {truth['hypothesis']}, {', '.join(values)}")
 
 
-def _own_effects(model: Model) -> list[str]:
-    """The effects that the model file's `simulate` entry states, as a diagnosis writes them."""
-    texts = model.simulate.get("effects") or []
-    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
-        raise UserError(f"{model.path}: simulate.effects: must be a list of texts ID[:key=value,...]")
-    return texts
-
-
 def _scene(model: Model, seed: int) -> _reference.Scene:
     scene = _reference.Scene()
     scene.seed = seed
-    scene.rate_hz = _positive(model, model.simulate.get("rate_hz", model.bank_rate_hz), "rate_hz")
+    scene.rate_hz = model.simulate.get("rate_hz", model.bank_rate_hz)
     if scene.rate_hz > 1.01 * model.sensor_rate_hz:
         raise UserError(f"{model.path}: simulate.rate_hz: the sensor gives {model.sensor_rate_hz:g} Hz at most")
-    duration_s = _positive(model, model.simulate.get("duration_s", 3600.0), "duration_s")
+    duration_s = model.simulate.get("duration_s", 3600.0)
     scene.samples = round(min(duration_s * scene.rate_hz, 1e18))
     if scene.samples < 2:
         raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold fewer than two samples")
@@ -173,35 +165,12 @@ def _scene(model: Model, seed: int) -> _reference.Scene:
     return scene
 
 
-def _positive(model: Model, value: Any, where: str, *, signed: bool = False) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not abs(number) <= LARGEST or isinstance(value, bool) or (number <= 0.0 and not signed):
-        what = "a number" if signed else "a number above 0"
-        raise UserError(f"{model.path}: simulate.{where}: must be {what}, not {shown(value)}")
-    return number
-
-
 def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
     """Per axis: hypothesis, unit, bias, and the parameters of its law; drawn where the model file leaves them open."""
-    stated = model.simulate.get("axes") or {}
-    if not isinstance(stated, Mapping):
-        raise UserError(f"{model.path}: simulate.axes: must be a mapping of axes")
-    for name in stated:
-        model.group_of(str(name))
     truth: dict[str, dict[str, Any]] = {}
     for number, name in enumerate(model.axes):
         where = f"axes.{name}"
-        fields = stated.get(name) or {}
-        allowed = ("hypothesis", "bias", *PLACES)
-        if not isinstance(fields, Mapping):
-            raise UserError(f"{model.path}: simulate.{where}: must be a mapping of {', '.join(allowed)}")
-        for key in fields:
-            if key not in allowed:
-                known = f"(known: {', '.join(allowed)})"
-                raise UserError(f"{model.path}: simulate.{where}: unknown entry {shown(key)} {known}")
+        fields = model.simulate["axes"].get(name, {})
         # All are drawn, in one order, so that stating one leaves the others as they were.
         random = _reference.Random(seed, _DRAWS + number)
         priors = model.group_of(name).priors
@@ -210,13 +179,7 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         more = [parameter for parameter in priors if parameter not in ("bias", *PARAMETERS)]
         drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in (*PARAMETERS, *more)}
         law = fields.get("hypothesis", law)
-        if not isinstance(law, str) or law not in LAWS:
-            known = f"(known: {', '.join(LAWS)})"
-            raise UserError(f"{model.path}: simulate.{where}.hypothesis: unknown {shown(law)} {known}")
-        for key in PLACES.keys() | {"bias"}:
-            if key not in fields:
-                continue
-            drawn[key] = _positive(model, fields[key], f"{where}.{key}", signed=key == "bias")
+        drawn |= {key: value for key, value in fields.items() if key != "hypothesis"}
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
         for parameter in LAWS[law]:
             if parameter not in drawn:
