@@ -48,7 +48,8 @@ def diagnose(
     check_writable(json, report, write_model)
     loaded = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
-    names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)
+    axes = [axes] if isinstance(axes, str) else axes
+    names = chosen_axes(recording, loaded, axes)
     record = of_recording(recording, loaded, decimate)
     judged = [name for name in names if name in record.axes]
     errors = {name: "every reading is the same" for name in names if name not in judged}
@@ -70,10 +71,32 @@ def diagnose(
     if report is not None:
         from selfcal.diagnosis.page import write_page
 
-        write_page(report, document, record, found)
+        write_page(report, document, record, found, _given(axes, model, decimate, rate, columns, units, scale))
     if json is not None:
         write_json(document, json)
     return document
+
+
+def _given(
+    axes: Sequence[str],
+    model: Path | str | None,
+    decimate: float | None,
+    rate: float | None,
+    columns: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    scale: Mapping[str, Scale] | None,
+) -> list[tuple[str, str]]:
+    """The command line's options that decide what is found, as they were given."""
+    given = [("--axis", name) for name in axes]
+    given += [] if model is None else [("--model", str(model))]
+    for option, value in (("--decimate", decimate), ("--rate", rate)):
+        given += [] if value is None else [(option, f"{value:.15g}")]
+    for option, pairs in (("--column", columns), ("--unit", units)):
+        given += [(option, f"{name}={value}") for name, value in (pairs or {}).items()]
+    for name, (size, unit) in (scale or {}).items():
+        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
+        given.append(("--scale", f"{name}={text}" if name else text))
+    return given
 
 
 def failing(document: Mapping[str, Any], wanted: str) -> bool:
