@@ -22,7 +22,6 @@ from selfcal.output import write_text
 from selfcal.recording import Scale, load
 from selfcal.verbs.identify import chosen_axes
 
-
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
 INTERRUPTED = "interrupted before it was done"
@@ -137,6 +136,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         f"{recording['duration_s']:g} s\n",
         highlight=False,
         markup=False,
+        soft_wrap=True,
     )
     for name, axis in document["axes"].items():
         if "error" in axis:
