@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from selfcal.document import check_writable, write_json
+from selfcal.ending import Held
 from selfcal.errors import UserError, printable
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -46,6 +47,7 @@ def compare(
     for log in logs:
         identified = identify(log, axes=axes, model=model)["axes"]
         diagnosed = diagnose(log, axes=axes, model=model, decimate=decimate)["axes"]
+        Held().check()
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
     changes: dict[str, list[dict[str, Any]]] = {}
     for (first, before), (second, after) in pairwise(zip(logs, seen, strict=True)):
