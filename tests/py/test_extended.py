@@ -225,6 +225,12 @@ def test_every_tool_takes_the_model_and_simulate_makes_the_effect_again(cause: s
     assert found[0]["cause"] == cause
     identify(log, axes=["gx"], model=tmp_path / "extended.yaml")
     codegen(tmp_path / "extended.yaml", tmp_path / "tables")
+    if cause in ("temperature", "supply", "cross_axis", "ramp", "step", "periodic"):  # stated now: no finding any more
+        stated = diagnose(log, axes=axes, model=tmp_path / "extended.yaml", write_model=tmp_path / "twice.yaml")
+        assert stated["axes"]["gx"]["verdict"] == "adequate"
+        first, twice = (yaml.safe_load((tmp_path / name).read_text()) for name in ("extended.yaml", "twice.yaml"))
+        assert twice["regressors"] == first["regressors"]
+        assert [text.partition(":")[0] for text in twice["simulate"]["effects"]] == [cause]
     simulate(tmp_path / "extended.yaml", tmp_path / "again.npz", seed=8)
     again = diagnose(tmp_path / "again.npz", axes=axes, model=model)["axes"]["gx"]["findings"]
     assert [finding["cause"] for finding in again][:1] == [cause]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,19 +50,22 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
         "axes": {name: _truth(one) for name, one in found.items()},
-        "effects": [text for name, one in found.items() for text in _effects(name, one, record)],
+        "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
 
 
 def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> list[dict[str, Any]]:
-    """Entries for the columns that the axes have, the strongest first, as many as a model may have."""
+    """Entries for the columns that were found, the strongest first, as many as a model may have."""
+    stated = {column for one in model.regressors for column in one.columns}
     entries: dict[str, dict[str, Any]] = {}
     strength: dict[str, float] = {}
     for name, one in found.items():
         group = model.group_of(name).name
         for k, regressor in enumerate(one.state.regressors):
-            key = regressor.name.removesuffix(".sin").removesuffix(".cos")
+            if regressor.name in stated:
+                continue
+            key = _key(regressor.name)
             entry = entries.setdefault(key, {"name": key, **regressor.entry, "sd": {}, "probability": 0.5})
             if regressor.cause == "cross_axis":
                 entry["reference"] = _digits(record.axes[str(regressor.entry["column"])].level)
@@ -70,7 +73,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))
             strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
     kept: list[dict[str, Any]] = []
-    used = 0
+    used = len(stated)
     for key in sorted(entries, key=lambda key: -strength[key]):
         entry = entries[key]
         columns = 2 if entry["kind"] == "periodic" else 1
@@ -180,33 +183,67 @@ def _digits(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _effects(name: str, one: Diagnosed, record: Record) -> list[str]:
-    """`--effect` texts that put each finding back into a simulated record. The simulator has one effect of a kind on an
+def _key(column: str) -> str:
+    """Name of the regressor that a column belongs to."""
+    return column.removesuffix(".sin").removesuffix(".cos")
+
+
+def _effects(name: str, one: Diagnosed) -> list[str]:
+    """`--effect` texts that put what an axis has into a simulated record. The simulator has one effect of a kind on an
     axis: the strongest."""
-    texts: list[str] = []
-    told: set[str] = set()
-    for finding in sorted(one.findings, key=lambda finding: -finding.look.gain):
-        if finding.look.cause in told:
-            continue
-        told.add(finding.look.cause)
-        estimate = finding.look.estimate
-        pairs = {key: value["median"] for key, value in estimate.items() if isinstance(value, Mapping)}
-        pairs.pop("width_hz", None)
-        if finding.look.cause == "outliers":
-            pairs.pop("time_s", None)
-        if finding.look.cause == "variance_change":
-            pairs["ratio"] **= 2  # the simulator's is of variances
-        if finding.look.cause in ("unexplained", "quantization", "saturation"):
-            continue  # the lattice and the range are in the groups
-        if finding.look.cause in ("missing_samples", "motion"):
-            pairs = {key: int(max(1, round(value))) for key, value in pairs.items()}
-        where = "" if finding.look.cause == "missing_samples" else f",axis={name}"
-        if finding.look.cause == "cross_axis":
-            where += f",other={estimate['other']}"
-        text = f"{finding.look.cause}:" + ",".join(f"{key}={value:.8g}" for key, value in pairs.items()) + where
-        if finding.look.cause != "missing_samples" or not any(old.startswith("missing") for old in texts):
-            texts.append(text)
+    found = [*_of_columns(one), *_of_findings(one)]
+    strongest: dict[str, tuple[float, dict[str, Any]]] = {}
+    for cause, strength, pairs in found:
+        if cause not in strongest or strongest[cause][0] < strength:
+            strongest[cause] = (strength, pairs)
+    texts = []
+    for cause, (_, pairs) in strongest.items():
+        where = {} if cause == "missing_samples" else {"axis": name}
+        values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in pairs.items()}
+        texts.append(f"{cause}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
     return texts
+
+
+def _of_columns(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
+    """Cause, strength in nats, and the effect's keys, of the columns in an axis' model."""
+    fit = one.state.best
+    sizes: dict[str, list[int]] = {}
+    for k, column in enumerate(one.state.regressors):
+        sizes.setdefault(_key(column.name), []).append(k)
+    for places in sizes.values():
+        column = one.state.regressors[places[0]]
+        c = [float(fit.c[1 + k]) for k in places]
+        strength = sum(
+            0.5 * (value / max(float(fit.sd[1 + k]), 1e-300)) ** 2 for value, k in zip(c, places, strict=True)
+        )
+        entry = column.entry
+        if column.cause in ("temperature", "supply"):
+            yield column.cause, strength, {"coefficient": c[0]}
+        elif column.cause == "cross_axis":
+            yield column.cause, strength, {"coefficient": c[0], "other": str(entry["column"])}
+        elif column.cause == "ramp":
+            yield column.cause, strength, {"slope": c[0]}
+        elif column.cause == "step":
+            yield column.cause, strength, {"time_s": float(entry["time_s"]), "amplitude": c[0]}
+        elif column.cause == "periodic":
+            yield column.cause, strength, {"frequency_hz": float(entry["frequency_hz"]), "amplitude": math.hypot(*c)}
+
+
+def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
+    """The same of what is no column. The lattice and the range are in the groups."""
+    for finding in one.findings:
+        look = finding.look
+        median = {key: value["median"] for key, value in look.estimate.items() if isinstance(value, Mapping)}
+        if look.cause in ("flicker", "colored_noise"):
+            yield look.cause, look.gain, median
+        elif look.cause == "periodic" and "width_hz" in median:
+            yield look.cause, look.gain, {key: median[key] for key in ("frequency_hz", "amplitude")}
+        elif look.cause == "outliers":
+            yield look.cause, look.gain, {"fraction": median["fraction"]}
+        elif look.cause == "variance_change":  # the simulator's ratio is of variances
+            yield look.cause, look.gain, {"time_s": median["time_s"], "ratio": median["ratio"] ** 2}
+        elif look.cause in ("missing_samples", "motion"):
+            yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 
 
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:
