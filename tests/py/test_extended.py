@@ -25,6 +25,7 @@ from selfcal.diagnosis.state import State
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import load
 from selfcal.verbs.codegen import codegen
+from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
@@ -234,6 +235,19 @@ def test_every_tool_takes_the_model_and_simulate_makes_the_effect_again(cause: s
     simulate(tmp_path / "extended.yaml", tmp_path / "again.npz", seed=8)
     again = diagnose(tmp_path / "again.npz", axes=axes, model=model)["axes"]["gx"]["findings"]
     assert [finding["cause"] for finding in again][:1] == [cause]
+
+
+def test_compare_sees_a_stated_coefficient_change(tmp_path: Path) -> None:
+    """The model states that gx follows the temperature; in the last record it does so by 0.2 instead of 0.1."""
+    base, extended_file = written(base_model(1.0), tmp_path / "base.yaml"), tmp_path / "extended.yaml"
+    logs = [tmp_path / f"{k}.npz" for k in range(3)]
+    for seed, (log, size) in enumerate(zip(logs, (0.1, 0.1, 0.2), strict=True)):
+        simulate(base, log, seed=seed, effects=[f"temperature:axis=gx,coefficient={size}"])
+    diagnose(logs[0], axes=["gx"], model=base, write_model=extended_file)
+    same, changed = (compare(pair, axes=["gx"], model=extended_file)["axes"]["gx"] for pair in (logs[:2], logs[1:]))
+    assert "temperature.coefficient" not in {row["quantity"] for row in same}
+    (row,) = [row for row in changed if row["quantity"] == "temperature.coefficient"]
+    assert row["after"] / row["before"] == pytest.approx(2.0, rel=0.1)  # each is known to 3 %
 
 
 @pytest.mark.parametrize("lag1", [0.5, -0.4])

@@ -61,7 +61,8 @@ def compare(
 
 
 def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What can change: parameters of the likeliest law, the bias, the size of each cause found."""
+    """What can change: parameters of the likeliest law, the bias, the coefficients of the model file's regressors, and
+    the size of each cause found."""
     found: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
         law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
@@ -76,6 +77,10 @@ def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> 
             "q95": bias["mean"] + half,
             "unit": bias["unit"],
         }
+        for regressor in identified.get("regressors", {}).values():
+            for column, estimate in regressor["coefficients"].items():
+                if math.isfinite(estimate["median"]):
+                    found[f"{column}.coefficient"] = estimate
     counted: dict[str, int] = {}
     for finding in diagnosed.get("findings", []):
         cause = str(finding["cause"])
