@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter
 from scipy.special import ndtr
-from scipy.stats import chi2, poisson, truncnorm
+from scipy.stats import poisson, truncnorm
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
@@ -20,14 +20,17 @@ MISSING_LEAST = 1e-3
 CLOCK_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
-#: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
-MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-#: A burst counts from this worth on, net of the search; several that each could be chance are none together.
-BURST_LEAST = 2.5
-#: All bursts together, nats net: more than for another cause, since lattices and drifts of several axes join in.
-MOTION_LEAST = 11.0
-#: What the axes beside the strongest must show, nats: an event of one axis meets chance on the others.
-REST_PRICE = 4.0
+#: Lengths of motion looked for, s, and variances over the resting one's.
+MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+MOTION_RATIOS = (1.3, 1.6, 2.0, 3.0, 5.0, 10.0)
+#: Shares of a record's windows in which the sensor moves, from half a window on.
+MOTION_SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+#: ln of the evidence for motion that is told.
+MOTION_LEAST = 7.6
+#: What the axes beside the strongest of each window must show, nats: an event of one axis is none of the sensor.
+REST_LEAST = 3.0
+#: Probability of motion from which on a window is one that moves.
+MOVES = 0.5
 
 
 def missing(record: Record) -> tuple[Look, Mask] | None:
@@ -136,13 +139,23 @@ def saturation(state: State) -> tuple[Look, State] | None:
             continue
         half = 0.5 * state.lsb
         predicted = sign * (y - state.whitened * np.sqrt(state.variance))
-        beyond = ndtr((predicted - edge - half) / np.sqrt(state.variance))
+        deviation = np.sqrt(state.variance)
+        beyond = ndtr((predicted - edge - half) / deviation)
         expected = float(np.nansum(beyond))
         # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
-        if expected < NET_LEAST + math.log(2.0) or at_edge.sum() < 0.5 * expected:
+        worth = expected - math.log(2.0)
+        if half > 0.0:
+            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
+            cell = ndtr((predicted - edge + half) / deviation) - beyond
+            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
+            worth = max(worth, pile - math.log(20.0))
+        else:
+            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
+            worth = max(worth, (int(at_edge.sum()) - 1) * math.log(100.0))
+        if worth < NET_LEAST or at_edge.sum() < 0.5 * expected:
             continue
         sides.append((sign * edge, int(at_edge.sum())))
-        gain += expected
+        gain += worth + math.log(2.0)
         found = _unclipped(found, at_edge, edge, sign)
     if not sides:
         return None
@@ -186,41 +199,13 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
     for name in names:
         w2 = np.where(np.isfinite(record.axes[name].whitened), record.axes[name].whitened ** 2, np.nan)
         filled = np.where(np.isfinite(w2), w2, 1.0)
-        around = max(3, min(n // 3, round(120.0 * rate)))
+        around = max(3, min(n // 3, round(600.0 * rate)))
         block = max(1, round(rate))
         level = _robust_level(filled, block, around)
         squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
-    count = len(names)
-    worth, half = np.zeros(n), np.zeros(n, np.int64)
-    for length in MOTION_S:
-        window = round(length * rate)
-        if window < 1 or window > n // 4:
-            continue
-        mean = uniform_filter1d(power, window, axis=1, mode="reflect") if window > 1 else power
-        gain = 0.5 * window * _excess(mean)
-        # One axis alone is an outlier or a change of its own noise: the others together must show the burst too.
-        strongest = gain.argmax(axis=0)
-        rest = gain.sum(axis=0) - gain.max(axis=0)
-        others = (mean.sum(axis=0) - np.take_along_axis(mean, strongest[None], axis=0)[0]) / (count - 1)
-        # Windows a quarter of a length apart, of every length.
-        ln_looks = math.log(4.0 * n / window) + math.log(len(MOTION_S))
-        each = -chi2.logsf(2.0 * gain.sum(axis=0), count)  # a size of its own on every axis
-        common = -chi2.logsf(window * count * _excess(mean.mean(axis=0)), 1)  # one size on all
-        beside = np.maximum(-chi2.logsf(2.0 * rest, count - 1), -chi2.logsf(window * (count - 1) * _excess(others), 1))
-        told = np.minimum(np.maximum(each, common) - math.log(2.0) - ln_looks, beside - REST_PRICE)
-        better = told > worth
-        worth[better], half[better] = told[better], (window + 1) // 2
-    bursts: list[tuple[int, int]] = []
-    total, left = 0.0, worth.copy()
-    while left.max() > BURST_LEAST and len(bursts) < 1000:
-        at = int(np.argmax(left))
-        a, b = max(0, at - int(half[at])), min(n, at + int(half[at]) + 1)
-        bursts.append((a, b))
-        total += float(left[at])
-        margin = max(1, round(2.0 * rate))
-        left[max(0, a - margin) : b + margin] = 0.0
-    if total < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
+    whole, beside, bursts = _moving(power, rate)
+    if not bursts or whole < MOTION_LEAST or beside < REST_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
     pad = max(1, round(0.5 * rate))
@@ -236,13 +221,64 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         look = Look(
             "motion",
             worth_here,
-            total,
+            whole,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
             when=(shown[0][0] / rate, shown[-1][1] / rate),
         )
         found[name] = (look, mask)
     return found if len(found) >= 2 else {}
+
+
+def _moving(power: Array, rate: float) -> tuple[float, float, list[tuple[int, int]]]:
+    """ln of the evidence that in some windows all axes are louder, by one ratio or each by its own; the same without
+    the strongest axis of each window; and the windows. `power` [axes, n]: squared innovations over the axis' level.
+
+    A window moves with the probability of a share, and then by a ratio: the evidence is the mean of the likelihood
+    ratios over lengths, places, shares and ratios, so that noise exceeds e^x of it with a probability below e^-x.
+    """
+    n = power.shape[1]
+    found: list[tuple[float, float]] = []
+    best: tuple[float, list[tuple[int, int]]] = (-math.inf, [])
+    for length in MOTION_S:
+        window = round(length * rate)
+        if window < 1 or window > n // 8:
+            continue
+        for begin in sorted({k * window // 4 for k in range(4)}):
+            count = (n - begin) // window
+            energy = power[:, begin : begin + count * window].reshape(len(power), count, window).sum(axis=2)
+            total, each_axis = energy.sum(axis=0), _louder(energy, window)
+            ln_whole = _either(_louder(total, window * len(power)), each_axis.sum(axis=0))
+            ln_beside = _either(
+                _louder(total - energy.max(axis=0), window * (len(power) - 1)),
+                each_axis.sum(axis=0) - each_axis.max(axis=0),
+            )
+            for share in [max(share, 0.5 / count) for share in MOTION_SHARES]:
+                each = np.logaddexp(math.log1p(-share), math.log(share) + ln_whole)
+                others = np.logaddexp(math.log1p(-share), math.log(share) + ln_beside)
+                found.append((float(each.sum()), float(others.sum())))
+                if found[-1][0] > best[0]:
+                    moving = np.flatnonzero(math.log(share) + ln_whole - each > math.log(MOVES))
+                    places = [(begin + int(k) * window, begin + int(k + 1) * window) for k in moving]
+                    best = (found[-1][0], places)
+    if not found:
+        return 0.0, 0.0, []
+    ln_whole_mean, ln_beside_mean = np.logaddexp.reduce(np.array(found), axis=0) - math.log(len(found))
+    return float(ln_whole_mean), float(ln_beside_mean), best[1]
+
+
+def _either(a: Array, b: Array) -> Array:
+    """ln of the mean of two likelihood ratios."""
+    found: Array = np.logaddexp(a, b) - math.log(2.0)
+    return found
+
+
+def _louder(energy: Array, freedom: int) -> Array:
+    """ln likelihood ratio of windows with the sums of squares `energy`: louder by one of the ratios over at rest."""
+    ratio = np.array(MOTION_RATIOS).reshape(-1, *(1,) * energy.ndim)
+    each = 0.5 * energy * (1.0 - 1.0 / ratio) - 0.5 * freedom * np.log(ratio)
+    found: Array = np.logaddexp.reduce(each, axis=0) - math.log(len(MOTION_RATIOS))
+    return found
 
 
 def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:
