@@ -149,7 +149,7 @@ def saturation(state: State) -> tuple[Look, State] | None:
             cell = ndtr((predicted - edge + half) / deviation) - beyond
             pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
             worth = max(worth, pile - math.log(20.0))
-        else:
+        elif not state.redrawn:
             # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
             worth = max(worth, (int(at_edge.sum()) - 1) * math.log(100.0))
         if worth < NET_LEAST or at_edge.sum() < 0.5 * expected:

@@ -58,7 +58,8 @@ def flicker(state: State, record: Record) -> list[Look]:
     extras = replace(state.extras, flicker=True)
     series = state.series
     fits = [fit(series, extras, moved(state.best, extras))]
-    fits += [fit(series, replace(extras, walk=True), moved(state.best, replace(extras, walk=True)))]
+    for drift in (replace(extras, walk=True), replace(extras, markov=True)):
+        fits.append(fit(series, drift, moved(state.best, drift)))
     chosen = best(fits)
     gain = chosen.ln_likelihood - state.best.ln_likelihood
     worth = net(gain, 1)
