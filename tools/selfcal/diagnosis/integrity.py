@@ -20,17 +20,16 @@ MISSING_LEAST = 1e-3
 CLOCK_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
-#: Lengths of motion looked for, s, and variances over the resting one's.
-MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-MOTION_RATIOS = (1.3, 1.6, 2.0, 3.0, 5.0, 10.0)
-#: Shares of a record's windows in which the sensor moves, from half a window on.
-MOTION_SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
-#: ln of the evidence for motion that is told.
-MOTION_LEAST = 7.6
-#: What the axes beside the strongest of each window must show, nats: an event of one axis is none of the sensor.
+#: Motion: the piece of time that rests or moves, s; variances over the resting one's; mean lengths, s, and the shares
+#: of pieces in which a motion begins.
+PIECE_S = 0.5
+MOTION_RATIOS = (1.25, 1.6, 2.2, 3.5, 6.0, 12.0)
+MOTION_S = (1.0, 4.0, 16.0)
+MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
+#: ln of the evidence for motion that is told. Noise exceeds it with a probability below e^-6, and it is one look.
+MOTION_LEAST = 6.0
+#: What the axes beside the strongest must show, nats: an event of one axis is none of the sensor.
 REST_LEAST = 3.0
-#: Probability of motion from which on a window is one that moves.
-MOVES = 0.5
 
 
 def missing(record: Record) -> tuple[Look, Mask] | None:
@@ -204,23 +203,27 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         level = _robust_level(filled, block, around)
         squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
-    whole, beside, bursts = _moving(power, rate)
-    if not bursts or whole < MOTION_LEAST or beside < REST_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
+    whole, bursts = _moving(power, max(1, round(PIECE_S * rate)))
+    if not bursts or whole < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
+    each = np.array([[_burst(power[k, a:b]) for a, b in joined] for k in range(len(names))])
+    # Beside the strongest axis of each burst; every axis gains half a nat by chance.
+    beside = each.sum(axis=0) - each.max(axis=0) - 0.5 * (len(names) - 1)
+    if beside.sum() < REST_LEAST:
+        return {}
     pad = max(1, round(0.5 * rate))
     mask = np.zeros(n, bool)
     for a, b in joined:
         mask[max(0, a - pad) : b + pad] = True
     found: dict[str, tuple[Look, Mask]] = {}
     for k, name in enumerate(names):
-        worth_here = sum(_burst(power[k, a:b]) for a, b in joined)
         shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 2.0]
         if not shown:
             continue
         look = Look(
             "motion",
-            worth_here,
+            float(each[k].sum()),
             whole,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
@@ -230,55 +233,49 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
     return found if len(found) >= 2 else {}
 
 
-def _moving(power: Array, rate: float) -> tuple[float, float, list[tuple[int, int]]]:
-    """ln of the evidence that in some windows all axes are louder, by one ratio or each by its own; the same without
-    the strongest axis of each window; and the windows. `power` [axes, n]: squared innovations over the axis' level.
+def _moving(power: Array, piece: int) -> tuple[float, list[tuple[int, int]]]:
+    """ln of the evidence that the sensor moves now and then, and when (samples). `power` [axes, n]: squared innovations
+    over the level of their axis.
 
-    A window moves with the probability of a share, and then by a ratio: the evidence is the mean of the likelihood
-    ratios over lengths, places, shares and ratios, so that noise exceeds e^x of it with a probability below e^-x.
+    Every piece of `piece` samples rests or moves; a motion makes all axes louder by one of the ratios for as long as it
+    lasts (a hidden Markov model, forward and backward). The evidence is the mean over lengths and shares of the
+    likelihood over that of rest: noise alone exceeds e^x with a probability below e^-x.
     """
-    n = power.shape[1]
-    found: list[tuple[float, float]] = []
-    best: tuple[float, list[tuple[int, int]]] = (-math.inf, [])
-    for length in MOTION_S:
-        window = round(length * rate)
-        if window < 1 or window > n // 8:
-            continue
-        for begin in sorted({k * window // 4 for k in range(4)}):
-            count = (n - begin) // window
-            energy = power[:, begin : begin + count * window].reshape(len(power), count, window).sum(axis=2)
-            total, each_axis = energy.sum(axis=0), _louder(energy, window)
-            ln_whole = _either(_louder(total, window * len(power)), each_axis.sum(axis=0))
-            ln_beside = _either(
-                _louder(total - energy.max(axis=0), window * (len(power) - 1)),
-                each_axis.sum(axis=0) - each_axis.max(axis=0),
-            )
-            for share in [max(share, 0.5 / count) for share in MOTION_SHARES]:
-                each = np.logaddexp(math.log1p(-share), math.log(share) + ln_whole)
-                others = np.logaddexp(math.log1p(-share), math.log(share) + ln_beside)
-                found.append((float(each.sum()), float(others.sum())))
-                if found[-1][0] > best[0]:
-                    moving = np.flatnonzero(math.log(share) + ln_whole - each > math.log(MOVES))
-                    places = [(begin + int(k) * window, begin + int(k + 1) * window) for k in moving]
-                    best = (found[-1][0], places)
-    if not found:
-        return 0.0, 0.0, []
-    ln_whole_mean, ln_beside_mean = np.logaddexp.reduce(np.array(found), axis=0) - math.log(len(found))
-    return float(ln_whole_mean), float(ln_beside_mean), best[1]
-
-
-def _either(a: Array, b: Array) -> Array:
-    """ln of the mean of two likelihood ratios."""
-    found: Array = np.logaddexp(a, b) - math.log(2.0)
-    return found
-
-
-def _louder(energy: Array, freedom: int) -> Array:
-    """ln likelihood ratio of windows with the sums of squares `energy`: louder by one of the ratios over at rest."""
-    ratio = np.array(MOTION_RATIOS).reshape(-1, *(1,) * energy.ndim)
-    each = 0.5 * energy * (1.0 - 1.0 / ratio) - 0.5 * freedom * np.log(ratio)
-    found: Array = np.logaddexp.reduce(each, axis=0) - math.log(len(MOTION_RATIOS))
-    return found
+    count = power.shape[1] // piece
+    energy = power[:, : count * piece].reshape(len(power), count, piece).sum(axis=(0, 2))
+    ratio = np.array(MOTION_RATIOS)
+    louder = 0.5 * energy[:, None] * (1.0 - 1.0 / ratio) - 0.5 * len(power) * piece * np.log(ratio)
+    like = np.hstack([np.ones((count, 1)), np.exp(np.minimum(louder, 600.0))])
+    begins, lasts = (grid.ravel() for grid in np.meshgrid(MOTION_BEGINS, MOTION_S))
+    ends = np.minimum(1.0, PIECE_S / lasts)
+    states = 1 + ratio.size
+    move = np.zeros((begins.size, states, states))
+    move[:, 0, 0] = 1.0 - begins
+    move[:, 0, 1:] = begins[:, None] / ratio.size
+    move[:, 1:, 0] = ends[:, None]
+    move[:, range(1, states), range(1, states)] = 1.0 - ends[:, None]
+    ahead = np.empty((count, begins.size, states))
+    ln_evidence = np.zeros(begins.size)
+    now = np.zeros((begins.size, states))
+    now[:, 0] = 1.0
+    for k in range(count):
+        now = np.einsum("cs,cst->ct", now, move) * like[k]
+        total = now.sum(axis=1, keepdims=True)
+        now /= total
+        ln_evidence += np.log(total[:, 0])
+        ahead[k] = now
+    weight = np.exp(ln_evidence - ln_evidence.max())
+    weight /= weight.sum()
+    behind = np.ones((begins.size, states))
+    moving = np.empty(count)
+    for k in range(count - 1, -1, -1):
+        both = ahead[k] * behind
+        moving[k] = 1.0 - float(weight @ (both[:, 0] / both.sum(axis=1)))
+        behind = np.einsum("cst,ct->cs", move, behind * like[k])
+        behind /= behind.max(axis=1, keepdims=True)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (moving > 0.5).astype(int), [0]])))
+    bursts = [(int(a) * piece, int(b) * piece) for a, b in edges.reshape(-1, 2)]
+    return float(np.logaddexp.reduce(ln_evidence)) - math.log(begins.size), bursts
 
 
 def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:
