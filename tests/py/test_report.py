@@ -1,4 +1,4 @@
-"""The report on the default grid (16 nodes of rho, 12 of alpha, 96 cells) against a dense one, over the whole prior.
+"""The report on the default grid (16 nodes of rho, 12 of alpha, 48 cells) against a dense one, over the whole prior.
 
 The judge is the same code in double on 48 and 40 x 40 nodes with 192 cells, where neither counts any more: 64 and
 56 x 56 nodes give the same to 1e-4. That its sums are right is test_bank.py's business, that its posterior is,
