@@ -447,12 +447,8 @@ static void step_truth(selfcal_work_t *work) {
 /* The best node of the hypothesis settles n_eff, by the share of the bias there, and with it how sigma_v is spread. */
 static void step_sigma(selfcal_work_t *work, uint16_t nodes) {
     const selfcal_real_t *profile = &work->field[0][work->first_node];
-    const uint16_t columns = grid_nodes(hypothesis_of(work)->alpha);
     uint16_t best = 0;
-    for (uint16_t k = 0; k < nodes; k++) {
-        uint8_t *row = &work->column_best[k % columns];
-        const uint8_t mine = (uint8_t)(k / columns);
-        *row = mine == 0U || profile[k] > profile[(uint16_t)(*row * columns + k % columns)] ? mine : *row;
+    for (uint16_t k = 1; k < nodes; k++) {
         best = profile[k] > profile[best] ? k : best;
     }
     selfcal_field_t field;
@@ -936,30 +932,6 @@ static bool find_row(selfcal_work_t *work) {
     return true;
 }
 
-/* A row of the first pass is looked for about the best node of the nearest column. */
-static void start_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    const selfcal_t *bank = work->bank;
-    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    selfcal_range_t *range = &work->range[0];
-    unsigned column = 0;
-    if (hypothesis->alpha != NULL) {
-        const selfcal_real_t z = (ln_alpha - bank->alpha_lo[work->hypothesis]) / bank->alpha_step[work->hypothesis] + R(0.5);
-        column = z > R(0.0) ? (unsigned)r_fmin(z, (selfcal_real_t)(hypothesis->alpha->nodes - 1U)) : 0U;
-    }
-    range->lo = work->limit_lo[0];
-    range->hi = work->limit_hi[0];
-    if (hypothesis->rho != NULL) {
-        const unsigned row = work->column_best[column];
-        const selfcal_real_t step = bank->rho_step[work->hypothesis], middle = r_fma((selfcal_real_t)row, step, bank->rho_lo[work->hypothesis]);
-        range->lo = row > 0U ? r_fmax(middle - R(1.5) * step, range->lo) : range->lo;
-        range->hi = row + 1U < hypothesis->rho->nodes ? r_fmin(middle + R(1.5) * step, range->hi) : range->hi;
-        if (!(range->lo < range->hi)) { /* beyond the limits */
-            range->lo = work->limit_lo[0];
-            range->hi = work->limit_hi[0];
-        }
-    }
-}
-
 /* A row near the one in hand is looked for where that one is, and half as far beyond. */
 static void widen_row(selfcal_work_t *work) {
     selfcal_range_t *range = &work->range[0];
@@ -1007,7 +979,8 @@ static bool step_search(selfcal_work_t *work) {
     if (work->at == 0U) {
         const selfcal_real_t ln_alpha = rows ? sample_at(range, work->row) : R(0.0);
         if (work->pass == 0U) {
-            start_row(work, ln_alpha);
+            work->range[0].lo = work->limit_lo[0]; /* nothing is known yet: a row may have two peaks */
+            work->range[0].hi = work->limit_hi[0];
         } else {
             widen_row(work);
         }

@@ -823,7 +823,6 @@ typedef struct {
     selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
     selfcal_truth_t truth;
     /* of the hypothesis in hand */
-    uint8_t column_best[SELFCAL_ALPHA_MAX]; /* the best row of nodes at each alpha */
     selfcal_real_t peak;     /* of the nodes' profile ln-likelihood */
     selfcal_real_t n_eff;    /* bank samples less those that bias and coefficients took */
     /* what the priors permit of (ln rho, ln alpha); of these the row in hand, and the rows; what the last pass found */
