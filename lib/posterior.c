@@ -583,7 +583,7 @@ static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t
     const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->ln_noise == R(0.0);
     const selfcal_real_t far = (even ? FAR_EVEN : FAR) * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
-    if (even && weight < R(0.05)) {
+    if (even && UNSETTLED > R(20.0) * e->p_sq * n * n) {
         return;
     }
     selfcal_real_t row[SELFCAL_FITTED + 1];
