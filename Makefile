@@ -1,6 +1,9 @@
 # selfcal. On a fresh machine each of these does its own set-up first:
+#   make help                   this list
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
+#   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
 #   make emulate                20 minutes of six axes through the emulated firmware
@@ -10,6 +13,9 @@
 #   make firmware [TARGET=...] [CFLAGS=...] [ACCEPT=1]   build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above its budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
+#   make setup                  the set-up alone
+#   make lock [UPGRADE=1 | UPGRADE=name]   versions and hashes of the Python packages, from the names in tools/pyproject.toml
+#   make clean                  removes what was made, but for .venv
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
 PYTHON ?= python3
@@ -17,13 +23,22 @@ BUILD := build
 VENV := .venv
 BIN := $(VENV)/bin
 RECORDING ?= tests/data/simulated_adis16405.npz
+# A file's name is data: make expands nothing in it, here or in a make below, and the shell takes it from the environment.
+ifeq ($(origin RECORDING),command line)
+MAKEOVERRIDES :=
+endif
+override RECORDING := $(value RECORDING)
+export RECORDING
 
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all setup system python run posix test soak tolerances emulate c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden soak tolerances emulate c-tests check clean
 
 all: setup
+
+help:
+	@sed -n 's/^#   //p; /^# Settings/s/^# //p' Makefile
 
 # ------------------------------------------------------------------------------------------------------------- set-up
 
@@ -32,29 +47,47 @@ UNITY := $(UNITY_ROOT)/unity.c
 PACKAGE := $(VENV)/package.stamp
 MODEL := $(BUILD)/model
 
-setup: system python $(UNITY)
+# One at a time: whoever has waited for the lock finds all done.
+setup:
+	@mkdir -p $(BUILD)
+	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 system $(PACKAGE) $(UNITY)
 
 system:
 	@PYTHON="$(PYTHON)" tools/setup/system.sh
 
 python: $(PACKAGE)
 
+ifdef SETTING_UP
+# Of stated hashes, and nothing that would have to be built by what has none. The venv's own pip is replaced as well.
 $(VENV)/requirements.stamp: tools/requirements.txt | system
-	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --requirement tools/requirements.txt
+	@echo "Python packages into $(VENV) (a minute or two)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements.txt
 	@touch $@
 
 # Installed in place: Python sources need no new set-up, C and C++ ones do.
 $(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt $(wildcard tools/bindings/*) \
             $(wildcard host_sim/*) $(wildcard lib/*.[ch])
-	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps --editable tools
+	@echo "selfcal into $(VENV): its C and C++ is compiled (a minute)"
+	$(BIN)/python -m pip install --no-build-isolation --no-deps --editable tools
 	@touch $@
 
 ifeq ($(UNITY_ROOT),$(BUILD)/unity)
 $(UNITY): tools/setup/unity.py | system
+	@echo "Unity into $(UNITY_ROOT) (half a minute)"
 	$(PYTHON) tools/setup/unity.py $(UNITY_ROOT)
 	@touch $@
 endif
+else
+$(PACKAGE) $(UNITY): setup ;
+endif
+
+# Versions and hashes anew, from the names in tools/pyproject.toml. What has a version keeps it: UPGRADE=1 takes the newest of all, UPGRADE=numpy of one.
+lock:
+	@mkdir -p $(BUILD) && $(PYTHON) -m venv --clear $(BUILD)/lock
+	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: --requirement tools/setup/lock.txt
+	cd tools && ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group dev --custom-compile-command "make lock" \
+	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements.txt pyproject.toml
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
@@ -63,7 +96,7 @@ $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal
 
 run: setup
 	@mkdir -p $(BUILD)/run
-	$(BIN)/selfcal replay $(RECORDING) --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png
+	$(BIN)/selfcal replay --json $(BUILD)/run/report.json --plot $(BUILD)/run/report.png -- "$$RECORDING"
 
 # The firmware for this machine, of the default model; `selfcal replay` builds its own for each recording's rate.
 posix: $(MODEL)/selfcal_model.c
@@ -83,27 +116,46 @@ TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/
 test: setup
 	@$(BIN)/python tests/run.py
 
+quick: setup
+	@$(BIN)/python tests/run.py --quick
+
+# The matrices are small: a BLAS with threads burns a core and is no faster.
+soak tolerances emulate campaigns: export OPENBLAS_NUM_THREADS := 1
+
+# What `make test` leaves out. When each last ran, and on which commit, stands in tests/long_runs.txt.
+LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
+PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=.
+
+# Seeds from the date unless SEED is given.
+hidden: setup
+	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) $(SEED:%=--seed %) \
+	    $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
+
 soak: setup
-	SELFCAL_SOAK=1e8 $(BIN)/python -m pytest -q -s tests/py/test_long.py
+	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
 
 # SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup
-	@$(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
+	@$(LONG) $(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup
-	SELFCAL_EMULATE=1 $(BIN)/python -m pytest -q -s --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_qemu.py -k twenty
+	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt
-	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=. tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py
+	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
+	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py tests/py/test_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
 
+# Without the instruction each fmaf is a call; either rounds once.
+FMA := $(if $(filter fma,$(shell grep -m1 '^flags' /proc/cpuinfo 2>/dev/null)),-mfma)
+
 # One archive a variant, so that a test links only what it uses. C is the compiler's flags of the variant.
 # The sanitizers' own code draws warnings, so those are left to the plain variant.
-$(BUILD)/c/plain/%: C := -O2 $(WARNINGS)
-SANITIZED := -O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
+$(BUILD)/c/plain/%: C := -O2 $(FMA) $(WARNINGS)
+SANITIZED := -O1 $(FMA) -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
 $(BUILD)/c/sanitized/%: C := $(SANITIZED)
 $(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
 $(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
@@ -179,7 +231,7 @@ flash: setup
 BENCH := $(BUILD)/bench
 BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
-ARM_FAST += $(CURDIR)/tests/bench/%
+ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part has: the measuring and its records take some of it.
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
@@ -200,8 +252,7 @@ $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
-	cd $$(@D)/objects && $$(call arm_objects,$(ARM_$(1)) -I$(CURDIR)/lib -I$(CURDIR)/port -I$(CURDIR)/port/app -I$(CURDIR)/$$(@D), \
-	    $(patsubst %,$(CURDIR)/%,$(filter-out lib/%,$(BENCH_C))) $(CURDIR)/$$(@D)/selfcal_model.c)
+	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),$(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
@@ -225,8 +276,8 @@ bench-images: $(BENCH)/$(1)/$(2).elf
 $(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS='$(MORE_$(2))'
-	cd $$(@D)/$(2) && $$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -I$(CURDIR)/lib -I$$(CURDIR)/$$(@D), \
-	    $(addprefix $(CURDIR)/,$(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c))
+	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),$(addprefix tests/bench/,count.c image.c more.c record.c) \
+	    $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
 	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))
@@ -297,7 +348,8 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/bench/bench.py tests/bench/image_sizes.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py tests/bench/bench.py tests/bench/image_sizes.py
+	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py ../tests/hidden/rivals.py
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

@@ -67,7 +67,7 @@ Drift drift_of(const Node &node, double dt_s) {
     return drift;
 }
 
-// Model (1), (2) at one node, and the Kalman filter over it. `size` is that of the state [drift; x0; c].
+// Model (1), (2) at one node, and the Kalman filter over it. The state [drift; x0; c] has `size` elements.
 template <int size> class Filter {
     static constexpr int most = size == Eigen::Dynamic ? static_cast<int>(order_max + 1 + regressors_max) : size;
     using Vector = Eigen::Matrix<double, size, 1, 0, most, 1>;
@@ -149,11 +149,13 @@ template <int size> class Filter {
     Row h_, now_; // of the last sample: what is read, and the part of it that is not noise
 };
 
-// Calls use(filter), with the state's size known to the compiler where nothing is added to the paper's.
-template <typename Use> void with_filter(const Record &record, const Node &node, const Use &use) {
-    if (record.regressors == 0 && order(node.law) == 1) {
-        Filter<2> filter(record, node);
+// Calls use(filter). The compiler knows the size of a small state and writes its products out; larger states are few.
+template <int size = 2, typename Use> void with_filter(const Record &record, const Node &node, const Use &use) {
+    if (order(node.law) + 1 + record.regressors == size) {
+        Filter<size> filter(record, node);
         use(filter);
+    } else if constexpr (size < 5) {
+        with_filter<size + 1>(record, node, use);
     } else {
         Filter<Eigen::Dynamic> filter(record, node);
         use(filter);

@@ -11,6 +11,8 @@
 //   - the covariance update has Joseph's form: algebraically the same, and P0 >> sigma_v^2 does not cancel in it.
 #pragma once
 
+// The matrices have 2 to 10 rows. Vector instructions slow them down: what one stores whole is read in parts.
+#define EIGEN_DONT_VECTORIZE
 #include <Eigen/Core>
 
 #include <array>

@@ -25,6 +25,15 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
 #define Q_MAX R(1e12)
 
+/* No drift forgets more, see ALPHA_DT_MAX: 1 - e^-6.9. */
+#define BETA_MAX R(0.999)
+
+/* No drift's variance is greater: after the longest gap, 2^32 intervals, it is 4.3e21. */
+#define P_MAX R(1e22)
+
+/* Beneath it a float is a denormal, whose rounding is not relative. */
+#define LEAST R(1.2e-38)
+
 /* No prior of drift and white noise, and no interval, puts a node lower. */
 #define LN_RHO_MIN R(-120.0)
 
@@ -143,6 +152,7 @@ static bool averager_is_sound(const selfcal_t *self) {
 #ifdef SELFCAL_FIXED
 
 #define ROOM ((int64_t)1 << 62)
+#define X_MAX (SELFCAL_FIXED_LIMIT + (1L << 24))
 
 static bool scales_are_sound(const selfcal_t *self) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
@@ -155,13 +165,8 @@ static bool scales_are_sound(const selfcal_t *self) {
                 return false;
             }
         }
-        for (uint32_t i = 0; i <= SELFCAL_BATCH; i++) {
-            if (self->step[axis][i] > 3 * SELFCAL_FIXED_LIMIT || self->step[axis][i] < -3 * SELFCAL_FIXED_LIMIT) {
-                return false;
-            }
-        }
     }
-    return true;
+    return selfcal_kernel_steps_sound(self);
 }
 
 /* A level node's numbers follow from its gains. */
@@ -179,7 +184,7 @@ static bool kernel_is_sound(const selfcal_t *self, size_t j) {
     const size_t axes = self->model->axes;
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
         if (self->b[k] > ROOM || self->b[k] < -ROOM || self->c[k] < 0 || self->c[k] > ROOM ||
-            self->x[k] > 2 * SELFCAL_FIXED_LIMIT || self->x[k] < -2 * SELFCAL_FIXED_LIMIT) {
+            self->x[k] > X_MAX || self->x[k] < -X_MAX) {
             return false;
         }
     }
@@ -235,9 +240,10 @@ static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     /* Some may have run over the batch that waits. */
     const uint32_t seen = self->n + (self->ran > 0U ? self->batch[1U - self->gathering].count : 0U);
     /* P' = phi^2 r P/(r + P) + q: q <= P at any time, and with r = 1 P' < 1 + q */
-    if (!within(node->beta, R(0.0), R(1.0)) || !within(node->q, R(0.0), Q_MAX) ||
+    if (!within(node->beta, R(0.0), BETA_MAX) || !within(node->q, R(0.0), Q_MAX) ||
         !within(node->p_inf, node->q * (R(1.0) - SLACK), (R(1.0) + node->q) * (R(1.0) + SLACK)) ||
-        !within(now.c, R(0.0), R(1.0)) || !isfinite(now.d) || node->p_inf + now.d < node->q - SLACK * node->p_inf ||
+        !within(now.c, R(0.0), R(1.0)) || !within(now.d, -P_MAX, P_MAX) ||
+        node->p_inf + now.d < node->q - SLACK * node->p_inf - LEAST ||
         !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + now.e, -SLACK, R(1.0) + SLACK) ||
         (node->level ? now.d != R(0.0) || now.e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||

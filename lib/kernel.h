@@ -60,6 +60,9 @@ void selfcal_kernel_settle(selfcal_t *self, size_t j);
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
 
 #ifdef SELFCAL_FIXED
+/* Whether the steps of the span that they were made for are those of its readings, which are within their limits. */
+bool selfcal_kernel_steps_sound(const selfcal_t *self);
+
 /* g, u/s and 1/s of a level node as the integer kernels take them, in place of how they moved. */
 void selfcal_kernel_mantissas(selfcal_node_t *node);
 #endif

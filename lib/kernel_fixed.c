@@ -375,6 +375,28 @@ static void make_steps(selfcal_t *self, span_t span, float beta, bool floored) {
     }
 }
 
+bool selfcal_kernel_steps_sound(const selfcal_t *self) {
+    if (self->step_from > self->step_to || self->step_to > SELFCAL_BATCH || !(self->step_beta >= 0.0F) || !(self->step_beta < 1.0F)) {
+        return false;
+    }
+    const uint32_t shift = gain_shift(self->step_beta), count = self->step_to - self->step_from;
+    const int32_t mantissa = to_fixed(self->step_beta, (int)shift + 14);
+    for (size_t axis = 0; axis < self->model->axes && count > 0U; axis++) {
+        const int32_t *y = &self->y_fixed[axis][self->step_from], *d = self->step[axis];
+        int32_t held = 0;
+        for (uint32_t i = 0; i < count; i++) {
+            if (d[i] != y[i] - held - (self->step_floored ? (int32_t)(i & 1U) : 0)) {
+                return false;
+            }
+            held = y[i] - part_of(mantissa, shift, y[i]);
+        }
+        if (d[count] != held) {
+            return false;
+        }
+    }
+    return true;
+}
+
 /* w (mantissa 2^-shift) times c, c < 2^44: in two parts where it does not fit 32 bits, each product below 2^62. */
 static int64_t weigh(uint64_t c, uint32_t mantissa, uint32_t shift) {
     if (c >> 32 == 0U) {

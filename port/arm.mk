@@ -16,9 +16,10 @@ ARM_COMPILE := -std=c99 -ffp-contract=off -fno-math-errno -ffunction-sections -f
 ARM_SMALL := -fno-move-loop-invariants -fno-tree-loop-im -fno-tree-tail-merge -fno-reorder-blocks -fno-schedule-insns2 -fno-tree-fre
 ARM_FAST := %/averager.c %/averager_fixed.c %/kernel_fixed.c %/kernel_float.c
 arm_fast = $(filter $(if $(findstring KERNEL_M4F,$(1)),$(filter-out %/kernel_float.c,$(ARM_FAST)),$(ARM_FAST)),$(2))
-# arm_objects FLAGS,SOURCES: objects of the sources (absolute paths) in the working directory.
-arm_objects = $(if $(call arm_fast,$(1),$(2)),arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1) -c $(call arm_fast,$(1),$(2)) &&) \
-	arm-none-eabi-gcc -Os $(ARM_SMALL) $(ARM_COMPILE) $(1) -c $(filter-out $(call arm_fast,$(1),$(2)),$(2))
+# arm_objects FLAGS,SOURCES,DIR: objects of the sources in DIR. Paths are as given: none of a checkout, which may hold spaces, enters.
+arm_each = for source in $(2); do $(1) -c $$source -o $(3)/$$(basename $$source .c).o || exit 1; done
+arm_objects = $(call arm_each,arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1),$(call arm_fast,$(1),$(2)),$(3)); \
+	$(call arm_each,arm-none-eabi-gcc -Os $(ARM_SMALL) $(ARM_COMPILE) $(1),$(filter-out $(call arm_fast,$(1),$(2)),$(2)),$(3))
 
 # What a replayed recording needs of the application: the board's sensor, with rates of its own, is left out.
 APP_WITHOUT_SENSOR := $(filter-out port/app/module.c port/app/sensor.c,$(wildcard port/app/*.c))

@@ -8,24 +8,25 @@ $(if $(OUT),,$(error OUT=DIR is wanted))
 PROGRAM_FLAGS := $(IMAGE_CFLAGS) $(CFLAGS)
 IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c)
 IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/$(TARGET)/*.h)
-IMAGE_MODEL := $(abspath $(MODEL_DIR))
 
 .PHONY: $(TARGET)
 $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
 
-$(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(IMAGE_MODEL)/selfcal_model.c $(IMAGE_MODEL)/selfcal_model.h \
+$(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h \
                     port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/library.mk port/arm.mk $(OUT)/flags
 	@rm -rf $(OUT)/objects
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(PROGRAM_FLAGS))'
-	cd $(OUT)/objects && $(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(PROGRAM_FLAGS) -I$(CURDIR)/lib -I$(CURDIR)/port \
-	    -I$(CURDIR)/port/app -I$(IMAGE_MODEL),$(abspath $(IMAGE_SOURCES)) $(IMAGE_MODEL)/selfcal_model.c)
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app \
+	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
 	    $(OUT)/objects/*.o -lm -o $@
 
-# Other flags, another image: touched when they change.
+# Other flags, another image: touched when they change. The compiler reads them there, so that no log shows a command key. Who can read an
+# image has its key: the folder of one that has any is its owner's alone.
 .PHONY: flags
 $(OUT)/flags: flags
-	@mkdir -p $(OUT) && printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' > $@
+	@mkdir -p $(OUT) && $(if $(findstring APP_COMMAND_KEY,$(PROGRAM_FLAGS)),chmod go= $(OUT) &&) umask 077 && touch -a $@ && chmod 600 $@ && \
+	    { printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' > $@; }
 
 $(OUT)/selfcal.bin: $(OUT)/selfcal.elf
 	arm-none-eabi-objcopy -O binary $< $@

@@ -4,7 +4,9 @@
 include port/arm.mk
 
 LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c,$(PROGRAM_FLAGS)))
-LIBRARY := build/library/$(CORE)-$(firstword $(shell printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))' | cksum))
+LIBRARY_SOURCES := $(wildcard lib/*.c lib/*.h) port/arm.mk
+# Named by the content of all that it is made of: no time stamp takes old objects for new ones.
+LIBRARY := build/library/$(CORE)-$(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES); } | sha256sum | cut -c1-16)
 
 # The lock: programs may be made at the same time.
 .PHONY: objects
@@ -13,7 +15,7 @@ objects:
 	@flock $(LIBRARY).lock $(MAKE) --no-print-directory -f port/library.mk $(LIBRARY)/stamp
 	@cp $(LIBRARY)/*.o $(LIBRARY)/*.su $(OUT)
 
-$(LIBRARY)/stamp: $(wildcard lib/*.c lib/*.h) port/arm.mk
+$(LIBRARY)/stamp:
 	@rm -rf $(@D) && mkdir -p $(@D)
-	cd $(@D) && $(call arm_objects,$(LIBRARY_FLAGS) -I$(CURDIR)/lib,$(abspath $(wildcard lib/*.c)))
+	$(call arm_objects,$(LIBRARY_FLAGS) -Ilib,$(wildcard lib/*.c),$(@D))
 	@touch $@

@@ -1,10 +1,13 @@
 """Run every suite and close with one line that sums them: `N passed, N failed[, N skipped]`. Called by `make test`.
 
 Each target of `make check` counts as one test; a program that dies without a summary counts as one failure.
+`--quick` (`make quick`) runs the checks, the C tests and a thin way through everything.
 """
 
 from __future__ import annotations
 
+import argparse
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +16,8 @@ import xml.etree.ElementTree as ElementTree
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+import long_run
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build"
@@ -24,6 +29,25 @@ FUZZ_SECONDS = {"float": 12, "fixed16": 6, "fixed32": 6}
 BUILT = ("c-tests", "bench-images", "firmware-images", *(f"build/fuzz/{kernel}/fuzz_api" for kernel in FUZZ_SECONDS))
 #: At once; the machine that this is to be quick on has two cores.
 WORKERS = 2
+#: Left out of `make quick`: the slowest of the checks.
+SLOW_CHECKS = ("check-tidy",)
+#: Variants of the C tests; the first one is plain, and alone in `make quick`.
+VARIANTS = ("plain", "sanitized", "fixed16", "fixed32")
+#: The thin way of `make quick`: numbers against the textbook, the command, the wire, a recording through the firmware,
+#: both images on their boards. A test that is gone is an error.
+QUICK = (
+    "test_bank.py::test_parity_with_the_textbook_bank[gauss_markov-1000-gaps]",
+    "test_reference.py::test_bank_over_time_follows_equations_11_to_14",
+    "test_report.py::test_report_over_the_whole_prior[100]",
+    "test_cli.py::test_version_is_the_headers",
+    "test_cli.py::test_identify_loads_no_scipy",
+    "test_units.py",
+    "test_export.py",
+    "test_firmware_faults.py::test_saturation",
+    "test_firmware_m0.py::test_samples_and_telemetry",
+    "test_firmware_commands.py::test_an_answer_outlives_the_next_question",
+)
+C_TESTS = sorted((ROOT / "tests" / "c").glob("test_*.c"))
 MAKE = ("make", "--silent", "--keep-going", "--output-sync=target", f"--jobs={WORKERS}")
 
 
@@ -63,13 +87,14 @@ def run(command: list[str], timeout: int) -> tuple[int | None, str]:
     return done.returncode, done.stdout.decode(errors="replace")
 
 
-def checks() -> Count:
+def checks(quick: bool) -> Count:
     """Every target of `make check`. With them, so that no core idles, what the later suites run is made; they tell
     what of that failed."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     match = re.search(r"^CHECKS := (.*)$", makefile, re.MULTILINE)
-    names = match[1].split() if match else []
-    code, output = run([*MAKE, *names, *BUILT], TIMEOUT["check"])
+    names = [name for name in (match[1].split() if match else []) if not (quick and name in SLOW_CHECKS)]
+    built = [program(VARIANTS[0], source) for source in C_TESTS] if quick else BUILT
+    code, output = run([*MAKE, *names, *map(str, built)], TIMEOUT["check"])
     made = r"\*\*\* \[[^\]]*: (check-\S+)\]|Target '(check-\S+)' not remade"
     failed = {a or b for a, b in re.findall(made, output)} if code in (0, 2) else set(names)
     for name in names:
@@ -79,38 +104,43 @@ def checks() -> Count:
     return Count(len(names) - len(failed), len(failed))
 
 
-def c_tests() -> Count:
+def program(variant: str, source: Path) -> Path:
+    """The C test's program, from the root folder."""
+    return Path("build", "c", variant, source.stem)
+
+
+def c_tests(quick: bool) -> Count:
     """Unity programs, built plainly, with sanitizers, and these over the integer kernels."""
-    code, output = run([*MAKE, "c-tests"], TIMEOUT["c"])
+    targets = [str(program(VARIANTS[0], source)) for source in C_TESTS] if quick else ["c-tests"]
+    code, output = run([*MAKE, *targets], TIMEOUT["c"])
     total = Count()
     if code != 0:
         print(f"FAILED c-tests do not build\n{output}")
         total.failed += 1
-    sources = sorted((ROOT / "tests" / "c").glob("**/test_*.c"))
-    variants = ("plain", "sanitized", "fixed16", "fixed32")
-    programs = [BUILD / "c" / variant / source.stem for variant in variants for source in sources]
+    sources = C_TESTS if quick else sorted((ROOT / "tests" / "c").glob("**/test_*.c"))
+    made = [ROOT / program(variant, source) for variant in VARIANTS[: 1 if quick else None] for source in sources]
     with ThreadPoolExecutor(WORKERS) as pool:
-        for count in pool.map(c_test, (program for program in programs if program.is_file())):
+        for count in pool.map(c_test, (path for path in made if path.is_file())):
             total += count
     return total
 
 
-def c_test(program: Path) -> Count:
+def c_test(path: Path) -> Count:
     """Runs one of them."""
-    code, output = run([str(program)], TIMEOUT["c"])
+    code, output = run([str(path)], TIMEOUT["c"])
     summary = re.search(r"^(\d+) Tests (\d+) Failures (\d+) Ignored", output, re.MULTILINE)
     if summary is None or code is None or code < 0 or (code != 0 and summary[2] == "0"):
         count = Count(failed=1)
     else:
         tests, failed, ignored = (int(number) for number in summary.groups())
         count = Count(tests - failed - ignored, failed, ignored)
-    print(f"{'FAILED' if count.failed else 'ok    '} {program.relative_to(BUILD)}: {count}")
+    print(f"{'FAILED' if count.failed else 'ok    '} {path.relative_to(BUILD)}: {count}")
     if count.failed:
         print(output)
     return count
 
 
-def bench() -> Count:
+def bench(quick: bool) -> Count:
     """Instruction counts and sizes against the committed ones: exact, so one test."""
     code, output = run([*MAKE, "bench-counts"], TIMEOUT["bench"])
     skipped = code == 0 and "NOT COMPARED" in output
@@ -121,7 +151,7 @@ def bench() -> Count:
     return count
 
 
-def fuzz() -> Count:
+def fuzz(quick: bool) -> Count:
     """Random calls of the library for a while, after those that failed it once: one test a kernel."""
     total = Count()
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -142,14 +172,15 @@ def fuzz_kernel(kernel: str) -> Count:
     return Count(passed=1) if passed else Count(failed=1)
 
 
-def pytest() -> Count:
-    """The Python tests; their output is shown as it comes."""
+def pytest(quick: bool) -> Count:
+    """The Python tests; their output is shown as it comes. A worker that is done takes tests from the other."""
     report = BUILD / "pytest.xml"
     report.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "pytest", "-q", f"-n{WORKERS}"]
+    command = [sys.executable, "-m", "pytest", "-q", f"-n{WORKERS}", "--dist=worksteal"]
+    chosen = [f"tests/py/{test}" for test in QUICK] if quick else ["tests/py"]
     try:
         code = subprocess.run(
-            [*command, "--config-file=tools/pyproject.toml", "--rootdir=.", f"--junitxml={report}", "tests/py"],
+            [*command, "--config-file=tools/pyproject.toml", "--rootdir=.", f"--junitxml={report}", *chosen],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             timeout=TIMEOUT["pytest"],
@@ -171,14 +202,20 @@ def pytest() -> Count:
 
 
 def main() -> None:
-    """All suites, each timed; exit code 1 if anything failed."""
+    """The suites, each timed; exit code 1 if anything failed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="checks, C tests and a thin way through everything")
+    quick = parser.parse_args().quick
     BUILD.mkdir(exist_ok=True)
+    # The matrices of the tests are small: a BLAS with threads burns a core and is no faster.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     total = Count()
-    for suite in (checks, c_tests, fuzz, bench, pytest):
+    for suite in (checks, c_tests, pytest) if quick else (checks, c_tests, fuzz, bench, pytest):
         start = time.monotonic()
-        count = suite()
+        count = suite(quick)
         print(f"{suite.__name__}: {count} ({time.monotonic() - start:.0f} s)", flush=True)
         total += count
+    print(f"not part of `make quick`: {', '.join(SLOW_CHECKS)}, the rest of `make test`" if quick else long_run.say())
     (BUILD / "summary").write_text(f"{total}\n")
     print(total, flush=True)
     sys.exit(total.failed > 0)

@@ -214,6 +214,10 @@ class Machine:
         """The processor stands still, as on a flash operation."""
         self._spent += us
 
+    def wait(self, until_us: float) -> None:
+        """Turns of a loop that asks a part until then, or until the next event, are left out."""
+        self._spent = max(self._spent, min(until_us, self._next_us()) - self.now_us)
+
     def pend(self, exception: int) -> None:
         """Interrupt n is exception 16 + n."""
         self._pending.add(exception)

@@ -51,9 +51,13 @@ class Spi(Part):
         return self._noisy(self.device(self._noisy(word), self.cr1 & 3, self.sck_hz, end_us))
 
     def read(self, offset: int) -> int:
-        """CR1, CR2, SR, DR."""
+        """CR1, CR2, SR, DR. While SR is busy, time goes on to the frame's end or the next event: the program would ask
+        again and again.
+        """
         if offset == 0x08:
             done = self.machine.time_us >= self.done_at
+            if not done:
+                self.machine.wait(self.done_at)
             return (self.rxne and done) << 0 | 1 << 1 | (not done) << 7
         if offset == 0x0C:
             self.rxne = False

@@ -1,10 +1,15 @@
-/* The application on a POSIX host: a recording takes the sensor's place, a pseudo-terminal with SLCAN the bus's.
+/* The application on a POSIX host: a recording takes the sensor's place; telemetry leaves by a pseudo-terminal with
+ * SLCAN, or by a CAN bus of the host.
  *
- *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate]
+ *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate] [--stay | --can BUS]
  *
  * Prints `SELFCAL_PTY path`, waits for the host to open the channel, plays the recording (time stands still while the
- * channel is closed), and ends when the host closes the channel after the last frame. Exit code: 0; 1 if the host went
- * away or never came; 2 for bad arguments or a bad recording. With --gate motion is kept out, by the model's gate.
+ * channel is closed), and ends when the host closes the channel after the last frame. With --stay a host that goes away
+ * has closed the channel, and another may open it.
+ * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last
+ * frame (port/posix/can.h).
+ * With --gate motion is kept out, by the model's gate.
+ * Exit code: 0; 1 if the host went away or never came, or the bus failed; 2 for bad arguments or a bad recording.
  *
  * RECORDING: see port/replay/replay.h.
  */
@@ -12,12 +17,14 @@
 
 #include <errno.h>
 #include <math.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
 
 #include "app.h"
+#include "can.h"
 #include "pty.h"
 #include "replay.h"
 
@@ -30,8 +37,10 @@ typedef struct {
     struct timespec start; /* when the channel was opened, and what had passed then */
     uint64_t passed_at_start;
     uint32_t unpolled;
-    const char *error;
+    const char *error; /* of the recording */
     pty_t pty;
+    bool on_can; /* the bus in place of the pseudo-terminal */
+    can_t can;
 } host_t;
 
 static bool host_read(void *context, void *bytes, size_t count)
@@ -55,7 +64,11 @@ static port_sample_t host_sample(void *context, float reading[], uint32_t *missi
 static bool host_send(void *context, const selfcal_frame_t *frame)
 {
     host_t *host = context;
-    pty_send(&host->pty, frame);
+    if (host->on_can) {
+        can_send(&host->can, frame);
+    } else {
+        pty_send(&host->pty, frame);
+    }
     return true;
 }
 
@@ -69,22 +82,38 @@ static int wall_wait_ms(const host_t *host)
     return wait > 0.0 ? (int)ceil(fmin(wait, 1.0) * 1000.0) : 0;
 }
 
+/* Why the wire is of no more use; NULL while it works. */
+static const char *wire_error(const host_t *host)
+{
+    return host->on_can ? host->can.error : host->pty.error;
+}
+
+/* Waits, on a pseudo-terminal for commands. */
+static void wait_on_wire(host_t *host, int wait_ms)
+{
+    if (host->on_can) {
+        (void)poll(NULL, 0, wait_ms);
+    } else {
+        (void)pty_receive(&host->pty, wait_ms);
+    }
+}
+
 /* The application has nothing to do: time goes on by one row. */
 static void host_idle(void *context)
 {
     host_t *host = context;
-    if (host->pty.pending > 0 || ++host->unpolled >= ROWS_BETWEEN_POLLS) {
+    if (!host->on_can && (host->pty.pending > 0 || ++host->unpolled >= ROWS_BETWEEN_POLLS)) {
         host->unpolled = 0;
         pty_flush(&host->pty);
         (void)pty_receive(&host->pty, 0);
     }
-    if (!host->pty.slcan.open || host->replay.rows == 0) {
+    if ((!host->on_can && !host->pty.slcan.open) || host->replay.rows == 0) {
         return;
     }
     host->error = replay_next(&host->replay);
     if (host->speed > 0.0) {
-        for (int wait = wall_wait_ms(host); wait > 0 && host->pty.error == NULL; wait = wall_wait_ms(host)) {
-            (void)pty_receive(&host->pty, wait);
+        for (int wait = wall_wait_ms(host); wait > 0 && wire_error(host) == NULL; wait = wall_wait_ms(host)) {
+            wait_on_wire(host, wait);
         }
     }
 }
@@ -100,6 +129,12 @@ static const char *open_recording(host_t *host, const char *path)
     return replay_open(&host->replay);
 }
 
+static void start_clock(host_t *host)
+{
+    (void)clock_gettime(CLOCK_MONOTONIC, &host->start);
+    host->passed_at_start = host->replay.passed;
+}
+
 /* Waits until the channel is open, or closed; false if the host went away or let the timeout pass. */
 static bool await_channel(host_t *host, bool open)
 {
@@ -107,8 +142,7 @@ static bool await_channel(host_t *host, bool open)
         if (!pty_receive(&host->pty, host->pty.timeout_ms)) {
             host->pty.error = open ? "the host did not open the channel" : "the host did not close the channel";
         } else if (host->pty.slcan.open) {
-            (void)clock_gettime(CLOCK_MONOTONIC, &host->start);
-            host->passed_at_start = host->replay.passed;
+            start_clock(host);
         }
     }
     return host->pty.error == NULL;
@@ -132,9 +166,9 @@ int main(int argc, char **argv)
     static host_t host;
     static app_t app;
     const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};
-    const char *path = NULL;
+    const char *path = NULL, *bus = NULL;
     double report_every_s = 10.0, timeout_s = 30.0;
-    bool gate = false;
+    bool gate = false, stay = false;
 
     for (int i = 1; i < argc; i++) {
         double *option = strcmp(argv[i], "--report-every") == 0 ? &report_every_s
@@ -148,6 +182,10 @@ int main(int argc, char **argv)
             i++;
         } else if (strcmp(argv[i], "--gate") == 0) {
             gate = true;
+        } else if (strcmp(argv[i], "--stay") == 0) {
+            stay = true;
+        } else if (strcmp(argv[i], "--can") == 0 && i + 1 < argc) {
+            bus = argv[++i];
         } else if (path == NULL && argv[i][0] != '-') {
             path = argv[i];
         } else {
@@ -169,14 +207,31 @@ int main(int argc, char **argv)
     }
 
     const int timeout_ms = (int)(timeout_s * 1000.0);
-    const char *device = pty_open(&host.pty, timeout_ms);
+    bool more = true;
+    if (bus != NULL) {
+        host.on_can = true;
+        error = can_open(&host.can, bus, timeout_ms);
+        if (error != NULL) {
+            return fail(1, bus, error);
+        }
+        (void)printf("SELFCAL_CAN %s\n", bus);
+        (void)fflush(stdout);
+        start_clock(&host);
+        while (more && host.error == NULL && host.can.error == NULL) {
+            more = app_step(&app);
+        }
+        if (host.error != NULL) {
+            return fail(2, path, host.error);
+        }
+        return host.can.error != NULL ? fail(1, bus, host.can.error) : 0;
+    }
+    const char *device = pty_open(&host.pty, timeout_ms, stay);
     if (device == NULL) {
         return fail(1, "pseudo-terminal", strerror(errno));
     }
     (void)printf("SELFCAL_PTY %s\n", device);
     (void)fflush(stdout);
 
-    bool more = true;
     while (more && host.error == NULL && await_channel(&host, true)) {
         more = app_step(&app);
     }

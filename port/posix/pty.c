@@ -11,33 +11,44 @@
 #include <termios.h>
 #include <unistd.h>
 
-const char *pty_open(pty_t *pty, int timeout_ms)
+/* Opens the slave, raw, for the program itself; false with errno set. */
+static bool hold(pty_t *pty)
+{
+    struct termios mode;
+    pty->slave = open(pty->path, O_RDWR | O_NOCTTY);
+    if (pty->slave < 0 || tcgetattr(pty->slave, &mode) != 0) {
+        return false;
+    }
+    cfmakeraw(&mode);
+    return tcsetattr(pty->slave, TCSANOW, &mode) == 0;
+}
+
+const char *pty_open(pty_t *pty, int timeout_ms, bool stay)
 {
     memset(pty, 0, sizeof *pty);
     pty->timeout_ms = timeout_ms;
+    pty->stay = stay;
     slcan_init(&pty->slcan);
     pty->master = posix_openpt(O_RDWR | O_NOCTTY);
     if (pty->master < 0 || grantpt(pty->master) != 0 || unlockpt(pty->master) != 0) {
         return NULL;
     }
     const char *path = ptsname(pty->master);
-    if (path == NULL) {
+    if (path == NULL || strlen(path) >= sizeof pty->path) {
         return NULL;
     }
-    pty->slave = open(path, O_RDWR | O_NOCTTY);
-    struct termios mode;
-    if (pty->slave < 0 || tcgetattr(pty->slave, &mode) != 0) {
-        return NULL;
-    }
-    cfmakeraw(&mode);
-    if (tcsetattr(pty->slave, TCSANOW, &mode) != 0 || fcntl(pty->master, F_SETFL, O_NONBLOCK) != 0) {
-        return NULL;
-    }
-    return path;
+    memcpy(pty->path, path, strlen(path) + 1U);
+    return hold(pty) && fcntl(pty->master, F_SETFL, O_NONBLOCK) == 0 ? pty->path : NULL;
 }
 
 static void hang_up(pty_t *pty)
 {
+    if (pty->stay) {
+        slcan_init(&pty->slcan);
+        pty->pending = 0;
+        pty->error = hold(pty) ? NULL : strerror(errno);
+        return;
+    }
     pty->hung_up = true;
     pty->error = "the host hung up";
 }

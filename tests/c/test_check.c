@@ -92,6 +92,32 @@ static void a_silent_sensor_is_sound(void) {
     }
 }
 
+/* As much white noise and as little walk as a model may have: variances of drift over white noise are denormals, or 0. */
+static void a_model_at_its_limits_is_sound(void) {
+    selfcal_axis_t axes[AXES];
+    memcpy(axes, selfcal_model.axis, sizeof axes);
+    for (unsigned axis = 0; axis < AXES; axis++) {
+        axes[axis].prior[SELFCAL_N] = (selfcal_prior_t){41.0F, 46.0F, false};
+        axes[axis].range = 0.0F;
+    }
+    model.axis = axes;
+    model.dt_s = 1e-6F;
+    for (float ln_k = -46.0F; ln_k <= -26.0F; ln_k += 0.5F) {
+        for (unsigned axis = 0; axis < AXES; axis++) {
+            axes[axis].prior[SELFCAL_K] = (selfcal_prior_t){ln_k, ln_k + 5.0F, false};
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&bank, &model, memory.bytes, BYTES));
+        for (int i = 0; i < 60 * BLOCK; i++) {
+            float sample[AXES];
+            for (unsigned axis = 0; axis < AXES; axis++) {
+                sample[axis] = 1.5e11F * noise();
+            }
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
+        }
+    }
+}
+
 static void mend(void) {
     bank = sound;
     memory = sound_memory;
@@ -192,6 +218,7 @@ static void each_broken_invariant_is_seen(void) {
     /* nodes, the last and others */
     BROKEN(node[model.nodes - 1U].beta = 1.1F);
     BROKEN(node[1].beta = -1e-3F);
+    BROKEN(node[1].beta = 1.0F); /* gains over 1 - beta */
     BROKEN(node[1].q = -1e-9F);
     BROKEN(node[1].q = INFINITY);
     BROKEN(node[1].p_inf = NAN);
@@ -199,6 +226,7 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(node[1].gains.moving.c = 1.5F);
     BROKEN(node[1].gains.moving.d = -1.1F * node[1].p_inf);
     BROKEN(node[1].gains.moving.d = NAN);
+    BROKEN(node[1].gains.moving.d = 1e23F); /* no gap is so long */
     BROKEN(node[1].u_inf = 1.5F);
     BROKEN(node[1].gains.moving.e = 1.5F);
     BROKEN(node[level].gains.moving.d = 1e-9F);
@@ -215,10 +243,15 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.c[0] = INT64_MAX);
     BROKEN(bank.x[last] = INT32_MAX);
     BROKEN(bank.x[0] = INT32_MIN);
+    BROKEN(bank.x[0] = 2 * SELFCAL_FIXED_LIMIT); /* among the readings, but for rounding */
     BROKEN(bank.scale[AXES - 1U].exponent = 201);
     BROKEN(bank.scale[0].most_y = -1);
     BROKEN(bank.y_fixed[0][SELFCAL_BATCH - 1U] = INT32_MAX);
     BROKEN(bank.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
+    BROKEN(bank.step[0][1]++); /* not that of its readings */
+    BROKEN(bank.step_from = bank.step_to + 1U);
+    BROKEN(bank.step_to = SELFCAL_BATCH + 1U);
+    BROKEN(bank.step_beta = NAN);
     BROKEN(node[level].g_shift++);
     BROKEN(node[level].u_shift = 64);
     BROKEN(node[level].gains.settled.w++);
@@ -243,6 +276,7 @@ int main(void) {
     RUN_TEST(the_size_is_what_init_demands);
     RUN_TEST(a_bank_at_work_is_sound);
     RUN_TEST(a_silent_sensor_is_sound);
+    RUN_TEST(a_model_at_its_limits_is_sound);
     RUN_TEST(each_broken_invariant_is_seen);
     return UNITY_END();
 }

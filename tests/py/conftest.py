@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,20 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 ROOT = Path(__file__).resolve().parents[2]
 #: The recordings' licence keeps them out of this repository.
 SHARED_DATA = Path(os.environ.get("SELFCAL_DATA", ROOT.parent / "shared" / "data"))
+
+
+def _multicast() -> bool:
+    """Whether this machine's network takes a multicast group: a machine without any route does not."""
+    group = socket.inet_aton("239.74.163.2") + struct.pack("@I", socket.INADDR_ANY)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attempt:
+        try:
+            attempt.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+        except OSError:
+            return False
+    return True
+
+
+needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip route add 239.74.163.2 dev lo")
 
 
 def shared_recording(name: str) -> Recording:

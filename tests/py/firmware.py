@@ -37,6 +37,13 @@ AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 #: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
 #: their rows go to build/campaigns.txt as well.
 MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
+
+
+def often(trials: int) -> int:
+    """`make test` runs half of a campaign's trials; `make campaigns` MANY times all of them."""
+    return MANY * trials if MANY > 1 else (trials + 1) // 2
+
+
 #: A model whose bank takes no sample within a test, so that no report is made and time goes by fast. The slowest rate
 #: at which the sensor takes the clock of the default model; at SLOW_RATE_HZ it wants a slower one.
 QUIET_RATE_HZ = 163.84

@@ -1,5 +1,6 @@
 """The command: every fault of the user is one line on stderr and exit code 2, whatever raised it."""
 
+import json
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ import selfcal
 
 from conftest import ROOT
 
+DEFAULT = ROOT / "tools" / "selfcal" / "models" / "default.yaml"
 COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
 
 
@@ -48,10 +50,32 @@ def test_help() -> None:
         assert run(verb, "--help").returncode == 0
 
 
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_can_be_installed(shell: str, tmp_path: Path) -> None:
+    """Into the user's own files, from within that shell; and the shell is then told the verbs."""
+    home = os.environ | {"HOME": str(tmp_path), "SHELL": f"/bin/{shell}"}
+    install = [*COMMAND, "--install-completion", shell]
+    done = subprocess.run(install, capture_output=True, text=True, env=home, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [path for path in tmp_path.rglob("*") if path.is_file() and "SELFCAL_COMPLETE" in path.read_text()]
+    if shell == "bash":
+        asked = home | {"_SELFCAL_COMPLETE": "complete_bash", "COMP_WORDS": "selfcal id", "COMP_CWORD": "1"}
+        done = subprocess.run(COMMAND, capture_output=True, text=True, env=asked, check=False)
+        assert done.stdout.split() == ["identify"]
+
+
 def test_help_loads_nothing_heavy() -> None:
     code = "import sys, selfcal.cli; print(sorted({'numpy', 'scipy', 'can', 'matplotlib', 'yaml'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_identify_loads_no_scipy() -> None:
+    """Without regressors, whose mixtures need it: its import takes longer than all else at the start."""
+    log = ROOT / "tests" / "data" / "simulated_adis16405.npz"
+    code = f"import sys, selfcal; selfcal.identify({str(log)!r}, axes=['gx']); print('scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
 
 
 def test_verbs_are_functions() -> None:
@@ -64,8 +88,17 @@ def test_verbs_are_functions() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["nonsense"], "No such command 'nonsense'."),
-        (["identify"], "Missing argument 'LOG'."),
+        (["nonsense"], "No such command 'nonsense'; see `selfcal --help`"),
+        (["identify"], "Missing argument 'LOG' (Recording: .csv, .csv.gz or .npz); see `selfcal identify --help`"),
+        (["identify", "."], ".: is a folder: name a recording in it (.csv, .csv.gz or .npz)"),
+        (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),
+        (["identify", "log.csv", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
+        (["identify", "log.csv", "--json", "."], ".: cannot write: it is a folder"),
+        (["identify", "log.csv", "--plot", "out.xls"], "out.xls: a plot is one of .png, .pdf, .svg, .jpg"),
+        (["identify", "log.csv", "--overbound", "0.9"], "--overbound is for --export FORMAT FILE"),
+        (["identify", "log.csv", "--units", "metric"], "Invalid value for '--units': 'metric' is not "),
+        (["montecarlo", "--json", "no/out.json"], "no/out.json: cannot write: there is no such folder"),
+        (["simulate", "m.yaml", "-o", "log.csv", "--seed", "abc"], "Invalid value for '--seed': must be a whole"),
         (["identify", "log.csv", "--rate", "fast"], "Invalid value for '--rate'"),
         (["identify", "log.csv", "--engine", "steam"], "Invalid value for '--engine'"),
         (["identify", "log.csv", "--unit", "rad/s"], "--unit takes NAME=VALUE, not 'rad/s'"),
@@ -76,7 +109,7 @@ def test_verbs_are_functions() -> None:
         (["identify", "log.csv", "--model", "absent.yaml"], "absent.yaml: "),
         (["simulate", "absent.yaml", "-o", "log.csv"], "absent.yaml: "),
         (["codegen", "absent.yaml", "-o", "."], "absent.yaml: "),
-        (["monitor"], "Missing option '--channel'."),
+        (["monitor"], "which module? --channel names its port (th"),
         (["monitor", "--channel", "/dev/absent"], ""),
     ],
 )
@@ -85,14 +118,49 @@ def test_faults_are_one_line(tmp_path: Path, arguments: list[str], expected: str
     assert one_error(*arguments, cwd=tmp_path).startswith(expected)
 
 
+@pytest.mark.parametrize(
+    ("rate", "said"),
+    [
+        ("100", "100 samples at 100 Hz make a bank sample of 1 s"),
+        ("819.2", "819 samples at 819.2 Hz make a bank sample of 0.9997559 s"),
+        ("0.5", "1 sample at 0.5 Hz makes a bank sample of 2 s"),
+    ],
+)
+def test_codegen_says_what_its_tables_assume(rate: str, said: str, tmp_path: Path) -> None:
+    """And its header has the rate for the preprocessor to check. (819 samples are 819/819.2 s.)"""
+    done = run("codegen", str(DEFAULT), "-o", "made", "--rate", rate, cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout == f"made: {said}\n"
+    header = (tmp_path / "made" / "selfcal_model.h").read_text()
+    assert f"#define SELFCAL_MODEL_RATE_MILLIHZ {float(rate) * 1000:.0f}UL" in header
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "nan", "1e9"])
+def test_codegen_of_no_rate(rate: str, tmp_path: Path) -> None:
+    said = one_error("codegen", str(DEFAULT), "-o", "made", "--rate", rate, cwd=tmp_path)
+    assert f"the sampling rate, {float(rate):g} Hz, is outside 1e-06 to 1e+06 Hz" in said
+    assert not (tmp_path / "made").exists()
+
+
+def test_json_on_stdout_is_nothing_else(tmp_path: Path) -> None:
+    """A program reads stdout; the tables go to stderr."""
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + "".join(f"{k},{0.1 * (k * 7 % 5)}\n" for k in range(60)))
+    for verb in (["identify", "log.csv"], ["montecarlo", "--records", "2", "--duration", "20"]):
+        done = run(*verb, "--json", "-", cwd=tmp_path)
+        assert done.returncode == 0, done
+        assert json.loads(done.stdout)["schema"] == f"selfcal.{verb[0]}/1"
+        assert "─" in done.stderr
+        assert run(*verb, cwd=tmp_path).stdout.count("─") > 20
+
+
 def test_a_gate_that_codegen_leaves_out_is_named(tmp_path: Path) -> None:
     """It works on windows of two samples or more within a bank interval."""
-    text = (ROOT / "tools" / "selfcal" / "models" / "default.yaml").read_text()
+    text = DEFAULT.read_text()
     complaint = "model.yaml: `gate` is left out: a bank interval is one sample"
     for bank_hz, said, gate in ((819.2, complaint, 0), (409.6, "", 1)):
         (tmp_path / "model.yaml").write_text(text.replace("bank_rate_hz: 1.0", f"bank_rate_hz: {bank_hz}"))
         done = run("codegen", "model.yaml", "-o", "made", cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (0, "")
+        assert done.returncode == 0
         assert done.stderr.startswith(said)
         assert done.stderr.count("\n") == 1 - gate
         assert f"#define SELFCAL_MODEL_GATE {gate}\n" in (tmp_path / "made" / "selfcal_model.h").read_text()
@@ -120,7 +188,7 @@ BAD = {
     "infinity": ("t[s],gx[deg/s]\n0,1\n1,inf\n", "bad.csv: line 3: column 'gx': infinite"),
     "time backwards": ("t[s],gx[deg/s]\n0,1\n-1,2\n", "bad.csv: line 3: column 't': time runs backwards"),
     "missing unit": ("t[s],gx\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has no unit"),
-    "unknown unit": ("t[s],gx[dps]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has the unknown unit 'dps'"),
+    "unknown unit": ("t[s],gx[rpm]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has the unknown unit 'rpm'"),
     "ragged row": ("t[s],gx[deg/s]\n0,1\n1\n", "bad.csv: line 3: 1 cells where the header has 2"),
     "binary junk": ("\0\x01\x02", "bad.csv: line 1: not text (byte 0x00)"),
     "one row": ("t[s],gx[deg/s]\n0,1\n", "bad.csv: line 2: one row only"),

@@ -26,7 +26,8 @@ def test_the_guide_has_the_cost_table_of_the_bench() -> None:
 
 
 def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
-    """As a function's body, with warnings as errors, against the header that `codegen` makes."""
+    """As a function's body, with warnings as errors, against the header of its rate; against that of another it does
+    not."""
     guide = (ROOT / "GUIDE.md").read_text(encoding="utf-8")
     programs = re.findall(r"^```c\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
     program = next(text for text in programs if "selfcal_model.h" in text)
@@ -36,9 +37,14 @@ def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
     declared = ["void fault(void);", "void read_sensor(float sample[]);", "int run(uint8_t axis);"]
     source = tmp_path / "program.c"
     source.write_text("\n".join([*includes, *declared, "int run(uint8_t axis) {", *body, "return 0;", "}"]))
-    codegen(None, tmp_path)
     flags = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-fsyntax-only"]
-    subprocess.run(["cc", *flags, f"-I{ROOT / 'lib'}", f"-I{tmp_path}", str(source)], check=True)
+    command = ["cc", *flags, f"-I{ROOT / 'lib'}", f"-I{tmp_path}", str(source)]
+    codegen(None, tmp_path, rate=100.0)
+    subprocess.run(command, check=True)
+    codegen(None, tmp_path)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "the tables are for another sampling rate" in done.stderr
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:

@@ -12,6 +12,7 @@ import yaml
 
 from selfcal.errors import UserError
 from selfcal.export import FORMS
+from selfcal.overbound import overbound, upper_limit
 from selfcal.recording import save
 from selfcal.verbs.identify import identify
 
@@ -70,6 +71,90 @@ def test_every_number_carries_its_unit(form: str, log: Path, tmp_path: Path) -> 
     assert "rad/s" in text
     assert "m/s^2" in text
     assert "nan" not in text
+
+
+def test_the_file_says_what_it_covers(log: Path, tmp_path: Path) -> None:
+    """Axes, rate, adequacy, and beside every number the other estimate."""
+    for form in FORMS:
+        out = tmp_path / form
+        identify(log, export=(form, out))
+        text = out.read_text()
+        assert "from log.csv: 4 Hz, 1000 s" in text
+        assert "Written: medians" in text
+        assert "gyro: axes gx, gy;" in text
+        assert "accelerometer: axes ax;" in text
+        assert text.count(": adequate") == 2
+        assert text.count("overbound 0.95: ") == 4
+        assert "from 2 to 1" in text
+
+
+def test_an_axis_that_no_law_explains_is_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(6000.0)
+    sine = 0.02 * np.sin(t * 0.0628) + 0.04 * rng.standard_normal(t.size)
+    log = tmp_path / "log.csv"
+    save(log, {"gx": ("deg/s", sine), "ax": ("mg", rng.standard_normal(t.size))}, 1.0, {})
+    identify(log, export=("kalibr", tmp_path / "k.yaml"))
+    text = (tmp_path / "k.yaml").read_text()
+    assert "# gyro: NOT ADEQUATE: no law explains gx\n" in text
+    assert "# accelerometer: adequate\n" in text
+
+
+def test_an_overbound_takes_the_medians_place(log: Path, tmp_path: Path) -> None:
+    """Its white noise and walk lie above every gyro's measured curve, and the files agree among each other."""
+    kalibr, rotors, px4 = (tmp_path / name for name in ("k", "r", "p"))
+    for form, out in (("kalibr", kalibr), ("rotors", rotors), ("px4", px4)):
+        document = identify(log, export=(form, out), overbound=0.95)
+    text = kalibr.read_text()
+    written = yaml.safe_load(text)
+    assert "Written: overbound 0.95" in text
+    median = document["axes"]["gy"]["parameters"]["random_walk"]["N"]["median"] * DEG
+    assert f"rad/s/sqrt(Hz); median {median:.6e}" in text
+    n, k = written["gyroscope_noise_density"], written["gyroscope_random_walk"]
+    for name in ("gx", "gy"):
+        allan = document["axes"][name]["allan"]
+        tau = np.array(allan["tau_s"])
+        assert (n**2 / tau + k**2 * tau / 3.0 > (DEG * np.array(allan["recording"])) ** 2).all()
+    xml = rotors.read_text()
+    assert f"<gyroscopeRandomWalk>{k:.6e}<" in xml
+    assert "<gyroscopeBiasCorrelationTime>1.000000e+09<" in xml  # a walk, not a Gauss-Markov drift
+    parameters = dict(re.findall(r"param set (\S+) (\S+)", px4.read_text()))
+    assert float(parameters["EKF2_GYR_NOISE"]) == pytest.approx(n * math.sqrt(RATE), rel=1e-5)
+    for level in (0.4, 1.0, math.nan):
+        with pytest.raises(UserError, match=r"--overbound must be 0\.5 to 0\.99999"):
+            identify(log, export=("kalibr", kalibr), overbound=level)
+
+
+def test_an_overbound_is_above_everywhere_and_has_the_least_area() -> None:
+    """Against a search over 400 x 400 pairs of N and K, on curves of two axes, one with a hump: no pair that lies above
+    has less area, and the best of the lattice is as near as its step of 2 %."""
+    tau = np.geomspace(2.0, 2000.0, 41)
+    hump = 0.02 * np.exp(-0.5 * np.log(tau / 60.0) ** 2)
+    curves = [np.sqrt(0.04**2 / tau + hump**2 + 1e-7 * tau), np.sqrt(0.06**2 / tau + 1e-7 * tau)]
+    n, k = overbound([tau, tau], curves)
+
+    def variance(n: np.ndarray, k: np.ndarray) -> np.ndarray:
+        return np.asarray(n[..., None] ** 2 / tau + k[..., None] ** 2 * tau / 3.0)
+
+    def area(n: np.ndarray, k: np.ndarray) -> np.ndarray:
+        return np.asarray(np.trapezoid(np.log(variance(n, k)), np.log(tau), axis=-1))
+
+    def above(n: np.ndarray, k: np.ndarray) -> np.ndarray:
+        return np.asarray((variance(n, k) >= np.maximum(*curves) ** 2 * (1.0 - 1e-9)).all(axis=-1))
+
+    assert above(np.array(n), np.array(k))
+    grid_n, grid_k = np.meshgrid(np.geomspace(0.005, 15.0, 400), np.geomspace(1e-5, 0.03, 400))
+    best = float(area(grid_n, grid_k)[above(grid_n, grid_k)].min())
+    assert float(area(np.array(n), np.array(k))) <= best + 1e-9
+    assert best - float(area(np.array(n), np.array(k))) < 2.0 * 0.02 * math.log(1000.0)
+
+
+def test_upper_limits_hold_as_often_as_they_say() -> None:
+    """A variance of 6 degrees of freedom, 4000 times: 95 % of the limits are above the truth, to 4 sd."""
+    freedom = np.full(4000, 6.0)
+    measured = np.sqrt(np.random.default_rng(1).chisquare(6.0, 4000) / 6.0)
+    share = float((upper_limit(measured, freedom, 0.95) > 1.0).mean())
+    assert share == pytest.approx(0.95, abs=4.0 * math.sqrt(0.95 * 0.05 / 4000))
 
 
 def test_wrong_exports_are_one_clear_line(log: Path, tmp_path: Path) -> None:

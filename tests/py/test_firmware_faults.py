@@ -3,7 +3,7 @@ trials, and how many were survived. Each prints a line with both.
 
 A trial is survived when the image does not reset, hang or fault, breaks no rule of a part, gives the library no sample
 that the sensor did not make (wrong = 0) and puts every sample where it belongs in time (misplaced = 0).
-SELFCAL_CAMPAIGN=N runs N times as many trials (`make campaigns`)."""
+`make test` runs half of the trials; SELFCAL_CAMPAIGN=N (`make campaigns`) N times all of them."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from firmware import (
     Tap,
     image,
     messages,
+    often,
     parts,
     readings,
     reports,
@@ -72,7 +73,7 @@ def quiet(target: str, seed: int) -> parts.Board | parts.NrfBoard:
 @pytest.mark.parametrize("target", TARGETS if MANY > 1 else ["stm32f405"])
 def test_sensor_unplugged_and_back(target: str) -> None:
     """The time away is counted by the module's clock: within a sample a gap."""
-    trials, survived = (4 if target == "stm32f405" else 1) * MANY, 0
+    trials, survived = often(4 if target == "stm32f405" else 1), 0
     for trial in range(trials):
         rng = random.Random(trial)
         board = quiet(target, seed=trial)
@@ -287,7 +288,7 @@ def test_sensor_bad_from_the_start(name: str, code: int) -> None:
 def test_spi_bit_flips(target: str, chance: float) -> None:
     """Bits turned over on either wire: no wrong sample is taken. Two bursts carry 192 bits of the six channels, so that
     at 1e-3 every sixth sample is lost."""
-    seconds = (8.0 if target == "stm32f405" else 3.0) * MANY
+    seconds = often(8 if target == "stm32f405" else 3)
     board = quiet(target, seed=int(1 / chance))
     tap = Tap(board)
     board.run(1.0)
@@ -625,7 +626,7 @@ def test_another_rate_than_the_one_set(target: str, factor: float) -> None:
 
 def test_bus_off_and_back() -> None:
     """A bus with errors on every frame: bus-off, recovery by itself, frames again, samples never touched."""
-    trials, survived = 3 * MANY, 0
+    trials, survived = often(3), 0
     for trial in range(trials):
         board = Board(image(*QUIET), seed=trial)
         tap = Tap(board)
@@ -691,7 +692,7 @@ def test_corrected_samples_starve_nothing() -> None:
 def test_random_serial_lines() -> None:
     """Random, truncated and overlong SLCAN lines: each is answered or ignored, the channel still opens, frames are
     whole."""
-    lines = 100_000 if MANY > 1 else 1000
+    lines = 100_000 if MANY > 1 else 500
     rng = random.Random(12)
     board = Board(image(*SERIAL), seed=12)
     board.usart.host_baud = 1e6
@@ -851,7 +852,7 @@ def test_power_cut_at_every_flash_operation_of_a_save(target: str) -> None:
     assert truth[0][2] < truth[1][2]
     rng = random.Random(7)
     erases = sum(len(new) > 4 for _, _, new in history)
-    between = rng.sample(range(erases, total), 20 if target == "stm32f405" else 6)
+    between = rng.sample(range(erases, total), 10 if target == "stm32f405" else 3)
     some = {0, 1, erases - 1, erases, erases + 1, *range(total - 12, total), *between}
     chosen = range(total) if MANY > 1 else sorted(some)
     content = bytearray(after)
@@ -876,7 +877,7 @@ def test_power_cut_at_every_flash_operation_of_a_save(target: str) -> None:
 def test_power_cut_while_running(target: str) -> None:
     """The same on the running machine: the cut ends the run, the next start goes on from the older state and saves
     again."""
-    for k in (0, 30, 500) if target == "stm32f405" or MANY > 1 else (30,):
+    for k in (0, 30, 500) if MANY > 1 else (0, 500) if target == "stm32f405" else (30,):
         board, _, _, _, _ = two_saves(target)
         board.flash.cut_at = board.flash.operations + k
         board.run(4.0)
@@ -936,7 +937,7 @@ def test_a_power_cut_after_another_model_s_save() -> None:
 def test_flash_that_refuses_is_told_and_loses_nothing(target: str) -> None:
     """An operation that the flash refuses voids the save: counted, the sensor goes on, and what was saved before
     stands. Of the first five operations of the header one that is not written spoils it."""
-    for k in (100, 5) if target == "stm32f405" or MANY > 1 else (5,):
+    for k in (100, 5) if MANY > 1 else (100,) if target == "stm32f405" else (5,):
         board, _, _, _, start = two_saves(target)
         board.flash.fail_at = board.flash.operations + (k if k == 100 else board.flash.operations - start - k)
         board.run(5.0)

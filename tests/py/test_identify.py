@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +12,17 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.blocks import REPORT_MIN, block_means
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import NODES, PLAIN, Model, Prior
 from selfcal.recording import save
+from selfcal.table import show
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import REPORT_MIN, block_means, identify, show
+from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.verbs.simulate import simulate
 
 from conftest import shared_recording, worst_difference
 
@@ -202,6 +206,50 @@ def test_what_is_kept_out_is_counted_and_long_gaps_cost_nothing(tmp_path: Path) 
     assert axis["parameters"]["constant"]["N"]["mean"] == pytest.approx(0.04, rel=4 / math.sqrt(2 * 1979))
     with pytest.raises(UserError, match="too many for the reference"):
         identify(log, engine="reference")
+
+
+def test_an_axis_without_a_result_leaves_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """gx is stuck, gy is noise: the answer has gy, and in gx's place the reason."""
+    rng = np.random.default_rng(3)
+    log = tmp_path / "log.csv"
+    stuck, noise = np.full(500, 0.3), 0.04 * rng.standard_normal(500)
+    save(log, {"gx": ("deg/s", stuck), "gy": ("deg/s", noise), "ax": ("g", 0.001 * noise)}, 1.0, {})
+    document = identify(log, json=tmp_path / "out.json", export=("kalibr", tmp_path / "k.yaml"))
+    assert set(document["axes"]["gx"]) == {"error"}
+    assert document["axes"]["gx"]["error"].startswith("all 500 averages are equal (0.3 deg/s)")
+    alone = identify(log, axes=["gy"])["axes"]["gy"]
+    assert document["axes"]["gy"]["hypotheses"] == alone["hypotheses"]
+    assert json.loads((tmp_path / "out.json").read_text())["axes"]["gx"] == document["axes"]["gx"]
+    assert "gyro: axes gy;" in (tmp_path / "k.yaml").read_text()
+    show(document)
+    said = capsys.readouterr().out
+    assert re.search(r"^no result: gx: all 500 averages are equal .*; choose axes with --axis$", said, re.MULTILINE)
+
+
+def test_a_reason_of_all_axes_is_said_once(tmp_path: Path) -> None:
+    """And so is the file's name: each axis fails of the column that the model's regressor lacks."""
+    log, model = tmp_path / "log.csv", tmp_path / "model.yaml"
+    rng = np.random.default_rng(3)
+    save(log, {name: ("deg/s", rng.standard_normal(100)) for name in ("gx", "gy")}, 1.0, {})
+    model.write_text(
+        MODEL.path.read_text()
+        + "regressors:\n- {name: temp, kind: column, column: temp, unit: degC, reference: 25, sd: {gyro: 0.1}}\n"
+    )
+    with pytest.raises(UserError) as caught:
+        identify(log, model=model)
+    assert str(caught.value).count(str(log)) == 1
+    assert str(caught.value).startswith(f"{log}: columns gx, gy: there is no column 'temp'")
+
+
+@pytest.mark.parametrize("seed", [1, 10])
+def test_the_readmes_model_is_identified_whatever_is_drawn(seed: int, tmp_path: Path) -> None:
+    """Seeds whose noise stays below the lattice of an accelerometer, and of a gyro."""
+    log = tmp_path / "my.csv"
+    simulate(MODEL.path, log, seed=seed)
+    axes = identify(log, model=MODEL.path)["axes"]
+    stuck = [name for name, axis in axes.items() if "error" in axis]
+    assert stuck == {1: ["ay"], 10: ["gx"]}[seed]
+    assert len(axes) == 6
 
 
 def test_equal_readings_are_said(tmp_path: Path) -> None:

@@ -156,9 +156,9 @@ def test_replay_is_the_library_over_the_wire(
     titles: list[str] = []
     drawn = replay_module.plot_run
 
-    def watched(history: Any, path: Any, title: str, truth: Any) -> None:
+    def watched(history: Any, path: Any, title: str, truth: Any, units: Any) -> None:
         titles.append(title)
-        drawn(history, path, title, truth)
+        drawn(history, path, title, truth, units)
 
     monkeypatch.setattr(replay_module, "plot_run", watched)
     document = replay(log, report_every=100.0, json=tmp_path / "report.json", plot=tmp_path / "report.png")
@@ -174,7 +174,7 @@ def test_replay_is_the_library_over_the_wire(
         assert axis["samples_kept_out"]["missing"] == 70
         assert axis["adequate"] is alone["axes"][name]["adequate"]
         checks = {check: outcome["value"] for check, outcome in alone["axes"][name]["checks"].items()}
-        assert len(checks) == 4
+        assert len(checks) == 4 + 6  # of the innovations, and of averaging times from 2 to 64 s
         assert {check: outcome["value"] for check, outcome in axis["checks"].items()} == pytest.approx(checks, abs=0.02)
     said = capfd.readouterr().err
     # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 44 frames, and the last status
@@ -224,7 +224,9 @@ def assert_one_line(done: subprocess.CompletedProcess[str], complaint: str) -> N
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--transport", "can"], "--transport can: this build has the transport slcan only"),
+        (["--transport", "can", "--target", "cortex-m0"], "--transport can: an emulated board has a serial line alone"),
+        (["--channel", "vcan0"], "--channel vcan0: goes with --transport can"),
+        (["--transport", "can", "--channel", "no-such-can"], "socketcan no-such-can: th"),
         (["--report-every", "0"], "--report-every must be 0.001 to 4e+06 s, not 0"),
         (["--report-every", "1e9"], "--report-every must be 0.001 to 4e+06 s, not 1e+09"),
         (["--report-every", "nan"], "--report-every must be 0.001 to 4e+06 s, not nan"),

@@ -15,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import PLACES
 from selfcal.recording import load
-from selfcal.tables import AxisTable, Tables, make_tables
+from selfcal.tables import AxisTable, Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
@@ -46,6 +47,16 @@ SMALL = "cortex-m0-small"
 DRAWS = int(os.environ.get("SELFCAL_DRAWS", "4"))
 LENGTHS = [int(float(n)) for n in os.environ.get("SELFCAL_LENGTHS", "10,100,1000,10000,100000").split(",")]
 MISSING = float(os.environ.get("SELFCAL_MISSING", "0.05"))
+
+
+@pytest.mark.parametrize("nodes", range(6, 65))
+def test_the_spline_is_scipys(nodes: int) -> None:
+    """`fit` gives the coefficients with which scipy's spline passes through the values: to the rounding of the values,
+    some 1e-16, times the 64 terms of a sum and coefficients up to 10."""
+    values = np.random.default_rng(nodes).uniform(-1.0, 1.0, nodes)
+    knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
+    through = BSpline(knots, make_grid(nodes).fit @ values, 5)(np.arange(nodes, dtype=float))
+    np.testing.assert_allclose(through, values, atol=1e-13)
 
 
 @pytest.mark.parametrize("n", LENGTHS)

@@ -16,7 +16,7 @@ from scipy import stats
 from selfcal import _reference, recording
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
-from selfcal.verbs.simulate import simulate
+from selfcal.verbs.simulate import show, simulate
 
 DATA = Path(__file__).parents[1] / "data"
 SIGMAS = 4.5
@@ -390,7 +390,7 @@ def test_bad_effects_are_one_clear_line(effect: str, words: str, tmp_path: Path)
         ("simulate: {rate_hz: 0}\n", "simulate.rate_hz"),
         ("simulate: {rate_hz: 5000}\n", "819.2 Hz at most"),
         ("simulate: {rate_hz: 1, duration_s: 1}\n", "fewer than two samples"),
-        ("simulate: {rate_hz: 1, duration_s: 1e15}\n", "more than 5e+08 samples"),
+        ("simulate: {rate_hz: 1, duration_s: 1e15}\n", "more than 100,000,000 readings: take 1.67e+07 s or"),
         ("simulate: {axes: [gx]}\n", "simulate.axes"),
         ("simulate: {axes: {qx: {bias: 1}}}\n", "no axis 'qx'"),
         ("simulate: {axes: {gx: {bais: 1}}}\n", "unknown entry 'bais'"),
@@ -409,3 +409,15 @@ def test_bad_seed_and_bad_suffix_are_errors(tmp_path: Path) -> None:
         simulate(DATA / "simulated_adis16405.yaml", tmp_path / "log.npz", seed=-1)
     with pytest.raises(UserError, match="ends in"):
         simulate(DATA / "simulated_adis16405.yaml", tmp_path / "log.txt")
+
+
+def test_what_was_written_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The recording and the file that the truth is in."""
+    places = (("log.csv", f"{tmp_path}/log.csv.meta.json: the truth:"), ("log.npz", "the truth, in its member"))
+    entry = "simulate: {rate_hz: 2, duration_s: 30, axes: {gx: {hypothesis: constant, N: 0.1}}}\n"
+    for name, place in places:
+        path = write_model(tmp_path, entry)
+        show(simulate(path, tmp_path / name, seed=7), tmp_path / name)
+        said = capsys.readouterr().out
+        assert said.startswith(f"{tmp_path / name}: 60 samples at 2 Hz, seed 7\n{place}")
+        assert "N 0.1 deg/s/sqrt(Hz)\n  gy: " in said

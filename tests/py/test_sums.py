@@ -21,9 +21,9 @@ from selfcal.engines.library import Bank
 from selfcal.engines.reference import identify_axis
 from selfcal.errors import UserError
 from selfcal.model import PLACES, SUMS, Model
+from selfcal.result import in_unit
 from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.identify import in_unit
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.replay import replay
 

@@ -11,11 +11,11 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from selfcal.errors import UserError
+from selfcal.ending import install, last_signal
+from selfcal.errors import UserError, printable
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -40,6 +40,8 @@ def _options(
 
 #: Exit code of everything the user can put right.
 USER_ERROR = 2
+#: ... after Ctrl-C.
+INTERRUPTED = 130
 
 
 class Engine(StrEnum):
@@ -48,6 +50,13 @@ class Engine(StrEnum):
     library = "library"
     reference = "reference"
     fixed = "fixed"
+
+
+class Units(StrEnum):
+    """What a table is in."""
+
+    recording = "recording"
+    datasheet = "datasheet"
 
 
 class Target(StrEnum):
@@ -99,9 +108,22 @@ def identify(
         float | None, typer.Option(metavar="HZ", help="Rate of the block means instead of the model file's")
     ] = None,
     json: Json = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Save the Allan deviations beside the model's (.png .pdf .svg)")
+    ] = None,
+    table_units: Annotated[
+        Units,
+        typer.Option("--units", help="Of table and plot: the recording's, or deg/sqrt(h), deg/h, ug as data sheets"),
+    ] = Units.recording,
     export: Annotated[
         tuple[str, Path] | None,
         typer.Option(metavar="FORMAT FILE", help="Write noise parameters for kalibr, rotors, px4, orbslam3 or vins"),
+    ] = None,
+    overbound: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="Export white noise and walk above the recording's Allan deviation, at P (0.95)"
+        ),
     ] = None,
     rate: Rate = None,
     column: Column = None,
@@ -110,6 +132,7 @@ def identify(
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import identify as verb
 
     result = verb.identify(
@@ -119,13 +142,62 @@ def identify(
         engine=engine.value,
         decimate=decimate,
         json=json,
+        plot=plot,
+        datasheet=table_units is Units.datasheet,
         export=export,
+        overbound=overbound,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+    )
+    show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
+
+
+@app.command()
+def diagnose(
+    log: Log,
+    axis: Axis = None,
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Look at block means at this rate; default: every sample")
+    ] = None,
+    json: Json = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")
+    ] = None,
+    write_model: Annotated[
+        Path | None, typer.Option(metavar="MODEL.yaml", help="Write the model file with what was found in it")
+    ] = None,
+    fail_on: Annotated[
+        str | None, typer.Option(metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it")
+    ] = None,
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+) -> None:
+    """What the model gets wrong in a recording at rest, why, and what mending it gains."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import diagnose as verb
+
+    result = verb.diagnose(
+        log,
+        axes=axis or (),
+        model=model,
+        decimate=decimate,
+        json=json,
+        report=report,
+        write_model=write_model,
+        fail_on=fail_on,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
     verb.show(result)
+    if fail_on is not None and verb.failing(result, fail_on):
+        sys.exit(1)
 
 
 @app.command()
@@ -143,7 +215,7 @@ def simulate(
     """Write a simulated recording, read out as the sensor would, with its truth in its metadata."""
     from selfcal.verbs import simulate as verb
 
-    verb.simulate(model, output, seed=seed, effects=effect or ())
+    verb.show(verb.simulate(model, output, seed=seed, effects=effect or ()), output)
 
 
 @app.command()
@@ -153,6 +225,9 @@ def replay(
     model: ModelFile = None,
     target: Annotated[Target, typer.Option(help="Where the firmware runs: here, or in QEMU")] = Target.host,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    channel: Annotated[
+        str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP on this machine")
+    ] = "",
     report_every: Annotated[
         float | None, typer.Option(metavar="S", help="Seconds between reports; default: 100 in all, fewer in QEMU")
     ] = None,
@@ -166,8 +241,8 @@ def replay(
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.table import show
     from selfcal.verbs import replay as verb
-    from selfcal.verbs.identify import show
 
     result = verb.replay(
         log,
@@ -175,6 +250,7 @@ def replay(
         model=model,
         target=target.value,
         transport=transport.value,
+        channel=channel,
         report_every=report_every,
         gate=gate,
         json=json,
@@ -184,21 +260,57 @@ def replay(
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
-    show(result)
+    show(result, to_stderr=str(json) == "-")
 
 
 @app.command()
 def monitor(
-    channel: Annotated[str, typer.Option(metavar="NAME", help="Channel: a serial port for slcan", show_default=False)],
+    channel: Annotated[str | None, typer.Option(metavar="NAME", help="Channel: a serial port for slcan")] = None,
     interface: Annotated[str, typer.Option(metavar="NAME", help="python-can interface")] = "slcan",
-    log: Annotated[Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .trc)")] = None,
+    read: Annotated[Path | None, typer.Option(metavar="FILE", help="Read a log of frames instead of a channel")] = None,
+    speed: Annotated[float | None, typer.Option(metavar="X", help="Of --read, 1 as it came; default: at once")] = None,
+    axis: Axis = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc)")
+    ] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this long; default: Ctrl-C")] = None,
     bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
+    once: Annotated[bool, typer.Option("--once", help="End when the port vanishes instead of waiting for it")] = False,
+    json: Json = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
 ) -> None:
-    """Live view of a module's telemetry."""
+    """Live view of a module's telemetry; exit code 1 if the module was out of reach when the time was up."""
     from selfcal.verbs import monitor as verb
 
-    verb.monitor(interface=interface, channel=channel, log=log, duration=duration, bitrate=bitrate)
+    outcome = verb.monitor(
+        interface=interface,
+        channel=channel,
+        read=read,
+        speed=speed,
+        axes=axis or (),
+        log=log,
+        duration=duration,
+        bitrate=bitrate,
+        once=once,
+        json=json,
+        plot=plot,
+    )
+    sys.exit(1 if outcome.contact_lost else 0)
+
+
+@app.command()
+def demo(
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="Recording; default: the shipped one", show_default=False)
+    ] = None,
+    speed: Annotated[float, typer.Option(metavar="X", help="Times real time")] = 10.0,
+    transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    channel: Annotated[str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP")] = "",
+) -> None:
+    """A module without hardware: the firmware over a recording, for `selfcal monitor` to watch."""
+    from selfcal.verbs import demo as verb
+
+    verb.demo(log, speed=speed, transport=transport.value, channel=channel)
 
 
 @app.command()
@@ -228,7 +340,7 @@ def command(
         print(verb.build_flag(verb.read_key(key)))
     else:
         answer = verb.command(order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate)
-        print(f"{order}: {answer}")
+        print(f"{order}: {answer} ({verb.UNVERIFIED})")
         sys.exit(0 if answer == "done" else USER_ERROR)
 
 
@@ -244,7 +356,8 @@ def montecarlo(
     """Simulate records with parameters drawn from the prior and compare stated with actual errors."""
     from selfcal.verbs import montecarlo as verb
 
-    verb.show(verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json))
+    result = verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json)
+    verb.show(result, to_stderr=str(json) == "-")
 
 
 @app.command()
@@ -252,30 +365,59 @@ def codegen(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],
     target: Annotated[str, typer.Option(help="Whose node counts of the model file")] = "host",
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the samples that are fed; default: the sensor's")
+    ] = None,
 ) -> None:
     """Write the C model tables for the firmware."""
     from selfcal.verbs import codegen as verb
 
-    verb.codegen(model, output, target=target)
+    print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate))}")
+
+
+#: What typer says of a wrong value, and what a person reads.
+_PLAINER = {
+    "Value error, ": "",
+    "Input should be a valid integer, unable to parse string as an integer": "must be a whole number",
+    "Input should be a valid number, unable to parse string as a number": "must be a number",
+    "Input should be": "must be",
+}
+
+
+def _usage(error: TyperException) -> str:
+    """One line of a wrong use: what is wrong, what is wanted there, and where to read on."""
+    said = error.format_message().rstrip(".")
+    for theirs, ours in _PLAINER.items():
+        said = said.replace(theirs, ours)
+    wanted = getattr(getattr(error, "param", None), "help", None) if said.startswith("Missing") else None
+    context = getattr(error, "ctx", None)
+    verb = f" {context.info_name}" if context is not None and context.parent is not None else ""
+    return f"{said}{f' ({wanted})' if wanted else ''}; see `selfcal{verb} --help`"
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"selfcal: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"selfcal: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     sys.exit(USER_ERROR)
 
 
 def main() -> NoReturn:
-    """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 130 after Ctrl-C; a traceback is our bug."""
+    """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
+    traceback is our bug."""
+    install()
     try:
-        sys.exit(app(args=sys.argv[1:] or ["--help"], standalone_mode=False))
+        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        sys.exit((last_signal() or code) if code == INTERRUPTED else code)  # typer's code for every signal
     except UserError as error:
         _fail(str(error))
     except TyperException as error:
-        _fail(error.format_message())
+        _fail(_usage(error))
     except (typer.Abort, KeyboardInterrupt):
-        sys.exit(130)
-    except BrokenPipeError:  # the reader of our output has gone, as in `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(last_signal() or INTERRUPTED)
+    except (BrokenPipeError, SystemExit) as error:  # the reader of our output has gone, as in `| head`
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise  # typer turns the others into one
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         sys.exit(0)
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename is not None else str(error))

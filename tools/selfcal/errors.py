@@ -1,5 +1,45 @@
-"""The one error type users see."""
+"""The one error type users see, and how text of unknown origin is shown."""
+
+from __future__ import annotations
+
+import reprlib
+import sys
+
+_SHOWN = reprlib.Repr()
+_SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother = 2, 40, 40
+_SHOWN.maxlist = _SHOWN.maxtuple = _SHOWN.maxset = _SHOWN.maxdict = 3
 
 
 class UserError(Exception):
     """Something the user can put right. Its text is one line; the command prints it and ends with exit code 2."""
+
+
+def printable(text: str) -> str:
+    """`text` with every character that a terminal would obey, or cannot show, as its escape: `\\x1b`, `\\ud800`."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii") for letter in text
+    )
+
+
+def short(text: str) -> str:
+    """At most 60 printable characters of something found in a file."""
+    clean = "".join(letter if letter.isprintable() else "?" for letter in text[:61])
+    return clean if len(clean) <= 60 else clean[:57] + "..."
+
+
+def shown(value: object) -> str:
+    """A short form of any value that a file holds: never long, never an exception."""
+    try:
+        return printable(_SHOWN.repr(value))
+    except ValueError:  # an integer of thousands of digits
+        return f"a {type(value).__name__}"
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an exception's text, its kind where it has none."""
+    return short(str(error).split("\n")[0]) or type(error).__name__
+
+
+def note(text: str) -> None:
+    """Tell the user, on stderr, something that is no error."""
+    print(f"selfcal: {printable(text)}", file=sys.stderr)

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ import numpy as np
 import yaml
 
 from selfcal import units
-from selfcal.errors import UserError
+from selfcal.errors import UserError, short, shown
+from selfcal.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 
 SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
@@ -40,6 +42,10 @@ RATIOS = ("spectral_ratio", "markov_ratio")
 RATIO_LIMITS = (1e-3, 1e3)
 #: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/posterior.c).
 WIDEST_BIAS = 1e8
+#: Characters of a name or another text.
+LONGEST_TEXT = 200
+#: Axes of a model, and taps of the sensor's filter: more than any part has.
+MOST_AXES, MOST_TAPS = 64, 1024
 #: The largest number of any kind: its square is still a float.
 LARGEST = 1e18
 #: The smallest but 0: below what any prior may reach.
@@ -169,15 +175,53 @@ class Model:
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loading that refuses a key given twice, of which YAML would silently take the last."""
+    """Safe loading of plain values: a date is text, a key given twice or an unknown tag is refused.
+
+    An alias counts as what it stands for, so that a few of them do not grow into millions of values.
+    """
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own attribute)
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        alias = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        if node is None or id(node) in self._values:
+            return node
+        if alias:  # of a node that is not complete yet
+            raise yaml.constructor.ConstructorError(None, None, "an alias stands for itself", node.start_mark)
+        below = [node.value] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = [part for entry in below for part in (entry if isinstance(entry, tuple) else (entry,))]
+        size = 1 + sum(1 if isinstance(part, str) else self._values[id(part)] for part in parts)
+        if size > MOST_MODEL_VALUES:
+            what = f"more than {MOST_MODEL_VALUES} values, aliases counted as often as they stand"
+            raise yaml.constructor.ConstructorError(None, None, what, node.start_mark)
+        self._values[id(node)] = size
+        return node
+
+    @cached_property
+    def _values(self) -> dict[int, int]:
+        """Values in each node, by its identity: the tree keeps all nodes alive."""
+        return {}
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, TypeError, KeyError) as error:  # of a number or a tag
+            raise yaml.constructor.ConstructorError(None, None, "not valid YAML", node.start_mark) from error
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
+        seen: set[str] = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, str) and key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key}' appears twice", key_node.start_mark)
-            seen.add(str(key))
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a name must be text", key_node.start_mark)
+            key = key_node.value
+            if key in seen:
+                what = f"'{short(key)}' appears twice"
+                raise yaml.constructor.ConstructorError(None, None, what, key_node.start_mark)
+            seen.add(key)
         return super().construct_mapping(node, deep)
 
 
@@ -192,21 +236,21 @@ class _Reader:
 
     def tree(self) -> dict[str, Any]:
         try:
-            text = self.path.read_text(encoding="utf-8")
+            text = read_text(self.path, MOST_MODEL_BYTES, "not a text file")
         except OSError as error:
             raise UserError(f"{self.path}: cannot read the model file: {error.strerror}") from error
-        except UnicodeDecodeError as error:
-            raise UserError(f"{self.path}: not a text file") from error
-        try:
-            tree = yaml.load(text, Loader=_Loader)  # a safe loader
-        except RecursionError:
-            raise UserError(f"{self.path}: not a model file: nested too deep") from None
-        except yaml.YAMLError as error:
-            mark = getattr(error, "problem_mark", None)
-            line = f"line {mark.line + 1}: " if mark is not None else ""
-            twice = str(getattr(error, "problem", ""))
-            what = twice if twice.endswith("appears twice") else "not valid YAML"
-            raise UserError(f"{self.path}: {line}{what}") from error
+        with reading(self.path, "not a model file"):
+            try:
+                tree = yaml.load(text, Loader=_Loader)  # a safe loader
+            except yaml.YAMLError as error:
+                mark, what = None, "not valid YAML"
+                if isinstance(error, yaml.MarkedYAMLError):
+                    mark = error.problem_mark
+                    if isinstance(error, yaml.constructor.ConstructorError) and error.context is None:
+                        what = str(error.problem)  # of _Loader, or an unknown tag
+                line = f"line {mark.line + 1}: " if mark is not None else ""
+                tab = "; indent by spaces: YAML takes no tabs" if "'\\t'" in str(error) else ""
+                raise UserError(f"{self.path}: {line}{what}{tab}") from error
         if not isinstance(tree, dict):
             raise UserError(f"{self.path}: not a model file (a YAML mapping with schema: {SCHEMA})")
         return tree
@@ -221,44 +265,49 @@ class _Reader:
             raise self.fail(where, "must be a mapping")
         for key in tree:
             if key not in allowed:
-                raise self.fail(where, f"unknown entry '{key}' (known: {', '.join(allowed)})")
+                raise self.fail(where, f"unknown entry '{short(str(key))}' (known: {', '.join(allowed)})")
         return tree
 
     def number(self, value: Any, where: str, *, low: float = 0.0, strict: bool = True) -> float:
         try:
             number = float(value)  # YAML reads 1e-3 without a dot as text
         except (TypeError, ValueError, OverflowError):
-            raise self.fail(where, f"must be a number, not {value!r:.40}") from None
+            raise self.fail(where, f"must be a number, not {shown(value)}") from None
         if LARGEST < abs(number) < math.inf:
             raise self.fail(where, f"must be within +-{LARGEST:g}: the firmware computes in float")
         if 0.0 < abs(number) < SMALLEST:
             raise self.fail(where, f"must be 0, or {SMALLEST:g} and more: the firmware computes in float")
         if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
             bound = "" if low == -math.inf else f" above {low:g}" if strict else f" of at least {low:g}"
-            raise self.fail(where, f"must be a finite number{bound}, not {value!r}")
+            raise self.fail(where, f"must be a finite number{bound}, not {shown(value)}")
         return number
+
+    def rate(self, value: Any, where: str) -> float:
+        rate = self.number(value, where)
+        if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
+            raise self.fail(where, f"must be {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz, not {rate:g}")
+        return rate
 
     def count(self, value: Any, where: str, low: int, high: int = 2**31 - 1) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.fail(where, f"must be a whole number from {low} to {high}, not {value!r}")
+            raise self.fail(where, f"must be a whole number from {low} to {high}, not {shown(value)}")
         return value
 
     def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
         value = self.entry(tree, key, where)
         text = str(value)  # `unit: 1` is a number to YAML
         known = isinstance(value, str | int | float) and not isinstance(value, bool)
-        if not known or not text.isprintable() or "*/" in text:
-            what = "one line of text, without '*/': it goes into a comment of the tables"
-            raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {value!r:.40}")
+        if not known or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
+            what = f"one line of text, {LONGEST_TEXT} characters at most, without '*/': the tables have it as a comment"
+            raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {shown(value)}")
         return text
 
     def unit(self, tree: Mapping[str, Any], where: str) -> str:
         unit = self.text(tree, "unit", where)
         try:
-            units.parse(unit)
+            return units.parse(units.plain(unit)).name
         except UserError as error:
             raise self.fail(f"{where}.unit", str(error)) from None
-        return unit
 
     def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
         fields = self.only(tree, ("law", "min", "max", "sd"), where)
@@ -268,7 +317,7 @@ class _Reader:
                 raise self.fail(where, "the bias prior must have law: normal")
             return Prior("normal", sd=self.number(self.entry(fields, "sd", where), f"{where}.sd"))
         if law not in ("log_uniform", "uniform"):
-            raise self.fail(where, f"unknown law '{law}' (log_uniform or uniform)")
+            raise self.fail(where, f"unknown law {shown(law)} (log_uniform or uniform)")
         low = self.number(self.entry(fields, "min", where), f"{where}.min")
         high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
         least, most = RATIO_LIMITS
@@ -285,7 +334,9 @@ class _Reader:
         axes = self.entry(fields, "axes", where)
         if not isinstance(axes, list) or not axes or not all(isinstance(axis, str) for axis in axes):
             raise self.fail(f"{where}.axes", "must be a list of axis names")
-        if not all(re.fullmatch(r"\w[\w.-]*", axis) for axis in axes):
+        if len(axes) > MOST_AXES:
+            raise self.fail(f"{where}.axes", f"has {len(axes)} axes, {MOST_AXES} are the most")
+        if not all(re.fullmatch(r"\w[\w.-]*", axis) and len(axis) <= LONGEST_TEXT for axis in axes):
             raise self.fail(f"{where}.axes", "a name is of letters, digits, '_', '.' and '-': the tables have it")
         names = ("bias", *PARAMETERS, *(name for law in laws for name in LAWS[law] if name not in PARAMETERS))
         known = ("bias", *PLACES)
@@ -312,8 +363,8 @@ class _Reader:
         if not isinstance(tree, dict):
             raise self.fail(where, "must be a mapping")
         kind = self.entry(tree, "kind", where)
-        if kind not in REGRESSORS:
-            raise self.fail(where, f"unknown kind '{kind}' ({', '.join(REGRESSORS)})")
+        if not isinstance(kind, str) or kind not in REGRESSORS:
+            raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
         unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or self.unit(fields, where)
         priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
@@ -341,6 +392,8 @@ class _Reader:
     def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
         if not isinstance(tree, list):
             raise self.fail("regressors", "must be a list")
+        if len(tree) > MOST_COLUMNS:
+            raise self.fail("regressors", f"{len(tree)} are more than {MOST_COLUMNS}")
         found = tuple(self.regressor(one, f"regressors[{i}]", groups) for i, one in enumerate(tree))
         names = [regressor.name for regressor in found]
         for name in names:
@@ -391,7 +444,7 @@ class _Reader:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
-            raise self.fail("schema", f"must be {SCHEMA}, not {raw.get('schema')!r}")
+            raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
         name = self.text(tree, "name", "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
@@ -406,10 +459,12 @@ class _Reader:
         if not isinstance(groups_tree, dict) or not groups_tree:
             raise self.fail("groups", "must be a mapping of at least one group")
         for key in groups_tree:
-            if not isinstance(key, str):
-                raise self.fail("groups", f"a group's name must be text, not {key!r}")
+            if not isinstance(key, str) or not key.isprintable() or len(key) > LONGEST_TEXT:
+                raise self.fail("groups", f"a group's name must be text, not {shown(key)}")
         groups = tuple(self.group(name, fields, weights, time) for name, fields in groups_tree.items())
         axes = [axis for group in groups for axis in group.axes]
+        if len(axes) > MOST_AXES:
+            raise self.fail("groups", f"have {len(axes)} axes, {MOST_AXES} are the most")
         for axis in axes:
             if axes.count(axis) > 1:
                 raise self.fail("groups", f"axis '{axis}' appears twice")
@@ -420,10 +475,10 @@ class _Reader:
         return Model(
             name=name,
             path=self.path,
-            bank_rate_hz=self.number(self.entry(tree, "bank_rate_hz", ""), "bank_rate_hz"),
+            bank_rate_hz=self.rate(self.entry(tree, "bank_rate_hz", ""), "bank_rate_hz"),
             sensor_name=self.text({"name": "", **sensor}, "name", "sensor"),
-            sensor_rate_hz=self.number(self.entry(sensor, "rate_hz", "sensor"), "sensor.rate_hz"),
-            filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1),
+            sensor_rate_hz=self.rate(self.entry(sensor, "rate_hz", "sensor"), "sensor.rate_hz"),
+            filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1, MOST_TAPS),
             groups=groups,
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
             nodes={name: self.nodes(fields, f"nodes.{name}", weights) for name, fields in targets.items()},

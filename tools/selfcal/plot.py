@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.model import LAWS
-from selfcal.wire import AxisReport, signal_unit
+from selfcal.output import whole
+from selfcal.units import factor, known, parameter_unit, same_kind, typeset
+from selfcal.wire import AxisReport, axis_unit
 
 COLORS = {
     "constant": "tab:green",
@@ -22,72 +26,153 @@ COLORS = {
 }
 #: Columns after the probabilities: parameter, and the laws whose estimates of it are drawn.
 PANELS = {
-    "N": ("random_walk", "gauss_markov"),
+    "N": ("constant", "random_walk", "gauss_markov"),
     "K": ("random_walk",),
     "sigma_m": ("gauss_markov",),
     "alpha": ("gauss_markov",),
 }
+#: A law whose last probability is below this is drawn faint, and its values are not written.
+FAINT = 0.01
+#: A true value beyond this is none: an integer may have any number of digits.
+LARGEST = 1e30
+#: Share of the reports, from the first on, whose intervals do not count for the scales: they are the prior's.
+SETTLING = 0.2
+#: What a picture's name may end in.
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def check_picture(path: Path | str) -> None:
+    """Raise UserError for a file name that is no picture's."""
+    if Path(path).suffix not in PICTURES:
+        raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
 def plot_run(
-    history: Mapping[str, Sequence[AxisReport]], path: Path | str, title: str, truth: Mapping[str, Any] | None = None
+    history: Mapping[str, Sequence[AxisReport]],
+    path: Path | str,
+    title: str,
+    truth: Mapping[str, Any] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> None:
     """Save the picture of complete reports by axis; the suffix of `path` chooses the format.
 
-    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales in the units of the telemetry.
-    `truth`, of a simulated recording: per axis its `hypothesis` and parameters, drawn dashed. Raises UserError if it
-    cannot be written.
+    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
+    as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
+    `units` of the axes' readings; default: telemetry's. `truth`, of a simulated recording: per axis its `hypothesis`
+    and parameters, drawn dashed. Raises UserError if it cannot be written.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.lines import Line2D
 
     axes = list(history)
+    unit = {axis: (units or {}).get(axis, axis_unit(axis)) for axis in axes}
+    rows = {name: [axis for axis in axes if unit[axis] == name] for name in unit.values()}
+    spans: dict[tuple[str, str], list[float]] = {}  # what a panel's scale has to hold
     figure, grid = pyplot.subplots(
         len(axes),
         1 + len(PANELS),
-        figsize=(19, 2.3 * len(axes) + 1.0),
+        figsize=(19, 2.3 * len(axes) + 1.4),
         squeeze=False,
         sharex=True,
         layout="constrained",
     )
-    figure.suptitle(title)
+    figure.suptitle(printable(title), parse_math=False)
     for row, axis in zip(grid, axes, strict=True):
         reports = history[axis]
         time = np.array([report.time_s for report in reports])
-        known = (truth or {}).get(axis, {})
+        late = int(SETTLING * len(time))
+        told = (truth or {}).get(axis)
         laws = [law for law in LAWS if f"{law}_probability" in reports[-1].values]
+        last = {law: reports[-1].value(f"{law}_probability") for law in laws}
+        shown = {law: 1.0 if probability >= FAINT else 0.2 for law, probability in last.items()}
         for law in laws:
-            row[0].plot(time, [r.value(f"{law}_probability") for r in reports], color=COLORS[law], label=law)
+            row[0].plot(time, _values(reports, f"{law}_probability"), color=COLORS[law], alpha=shown[law])
         row[0].set_ylim(-0.03, 1.03)
         row[0].set_ylabel(axis, rotation=0, fontweight="bold", labelpad=15)
-        if "hypothesis" in known:
-            row[0].text(0.98, 0.5, f"truth: {known['hypothesis']}", ha="right", va="center", transform=row[0].transAxes)
+        _write(row[0], *_verdict(last, told))
         for panel, (parameter, candidates) in zip(row[1:], PANELS.items(), strict=True):
+            scale = 1.0 if parameter == "alpha" else factor(axis_unit(axis), unit[axis])
+            spans[axis, parameter] = []
+            best = ""
             for law in (law for law in candidates if law in laws):
-                name = f"{law}_{parameter}"
                 low, middle, high = (
-                    np.array([r.value(f"{name}_{key}") for r in reports]) for key in ("q05", "median", "q95")
+                    _values(reports, f"{law}_{parameter}_{key}") * scale for key in ("q05", "median", "q95")
                 )
-                panel.fill_between(time, low, high, color=COLORS[law], alpha=0.25, linewidth=0)
-                panel.plot(time, middle, color=COLORS[law], label=law)
-                panel.set_ylabel(signal_unit(axis, f"{name}_median"), fontsize="small")
-            value = known.get("N_with_lattice", known.get("N")) if parameter == "N" else known.get(parameter)
+                if parameter == "alpha":
+                    low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
+                panel.fill_between(time, low, high, color=COLORS[law], alpha=0.25 * shown[law], linewidth=0)
+                panel.plot(time, middle, color=COLORS[law], alpha=shown[law])
+                if last[law] >= FAINT and math.isfinite(middle[-1]):
+                    spans[axis, parameter] += [*low[late:], *high[late:]]
+                    if last[law] > last.get(best, 0.0):
+                        best = law
+                        _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[law])
+                elif len(candidates) == 1:  # nothing else in this panel
+                    spans[axis, parameter] += middle[late:].tolist()
+            value = _true(told, parameter, unit[axis])
             if value is not None:
-                panel.axhline(value, color="black", linestyle="--", linewidth=1.0, label="truth")
+                spans[axis, parameter].append(value)
+                panel.axhline(value, color="black", linestyle="--", linewidth=1.0)
             panel.set_yscale("log")
+            panel.set_ylabel(typeset("s" if parameter == "alpha" else parameter_unit(parameter, unit[axis])))
             panel.grid(True, alpha=0.3)
         row[0].grid(True, alpha=0.3)
-    for panel, heading in zip(grid[0], ("P(hypothesis)", *PANELS), strict=True):
-        panel.set_title(heading)
-    grid[0][0].legend(fontsize="x-small", loc="best")
-    grid[0][1].legend(fontsize="x-small", loc="best")
+    for column, parameter in enumerate(PANELS, start=1):
+        for group in rows.values():
+            span = [value for axis in group for value in spans[axis, parameter] if math.isfinite(value) and value > 0.0]
+            for axis in group if span else ():
+                grid[axes.index(axis)][column].set_ylim(min(span) / 1.2, max(span) * 1.2)
+    headings = ("P", *("1/alpha" if parameter == "alpha" else parameter for parameter in PANELS))
+    for panel, heading in zip(grid[0], headings, strict=True):
+        panel.set_title(heading, loc="left", fontweight="bold")
+    drawn = [law for law in LAWS if any(f"{law}_probability" in reports[-1].values for reports in history.values())]
+    handles = [Line2D([], [], color=COLORS[law], label=law.replace("_", " ")) for law in drawn]
+    handles += [Line2D([], [], color="black", linestyle="--", label="truth")] if truth else []
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     for panel in grid[-1]:
         panel.set_xlabel("time, s")
     try:
-        figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=100)
+    except ValueError as error:
         raise UserError(f"{path}: cannot save the plot: {error}") from error
     finally:
         pyplot.close(figure)
+
+
+def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
+    return np.array([report.value(signal) for report in reports])
+
+
+def _verdict(last: Mapping[str, float], told: Any) -> tuple[str, str]:
+    """The most probable law with its probability and the true law, if there is one; and its colour."""
+    finite = {law: probability for law, probability in last.items() if math.isfinite(probability)}
+    if not finite:
+        return "outside the priors", "black"
+    best = max(finite, key=lambda law: finite[law])
+    said = f"{best.replace('_', ' ')} {finite[best]:.3f}"
+    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(LAWS):
+        said += f" (truth: {told['hypothesis'].replace('_', ' ')})"
+    return said, COLORS[best]
+
+
+def _true(told: Any, parameter: str, unit: str) -> float | None:
+    """A parameter's true value in the picture's unit, if the recording states one that can be drawn."""
+    if not isinstance(told, Mapping):
+        return None
+    value = told.get("N_with_lattice", told.get("N")) if parameter == "N" else told.get(parameter)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < LARGEST:
+        return None
+    if parameter == "alpha":
+        return 1.0 / value
+    stated = told.get("unit", unit)
+    if not isinstance(stated, str) or not known(stated) or not same_kind(stated, unit):
+        return None
+    return float(value) * factor(stated, unit)
+
+
+def _write(panel: Any, text: str, color: str) -> None:
+    panel.set_title(text, loc="right", color=color, fontsize="small")

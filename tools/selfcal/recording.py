@@ -1,18 +1,17 @@
-"""Recordings of a resting sensor: read (CSV, gzipped CSV, npz), check, and write.
+"""Recordings of a resting sensor: read, check, and write. `text_table.py` and `array_files.py` read the files.
 
-CSV has one header row of `name[unit]`. An npz has one 1-D array a column, named like the CSV header, or named plainly
-with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A CSV
+Text has one header row of `name[unit]`. An npz has one 1-D array a column, named like the header, or named plainly
+with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A text
 file may have such a text beside it, LOG.meta.json. Every fault raises UserError with file, line and column in one line.
 """
 
 from __future__ import annotations
 
-import gzip
 import json
+import math
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -22,8 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import units
-from selfcal.errors import UserError
+from selfcal.array_files import Members, mat, npz, parse_meta, r_data
+from selfcal.errors import UserError, short, shown
+from selfcal.limits import (
+    LEAST_RATE_HZ,
+    LONGEST,
+    LONGEST_HEADING,
+    MOST_META_BYTES,
+    MOST_NUMBERS,
+    MOST_RATE_HZ,
+    read_text,
+    reading,
+)
+from selfcal.output import whole
 from selfcal.sampling import Ambiguous, sampling
+from selfcal.text_table import TextTable
 
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -31,6 +43,12 @@ SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
+
+#: Suffixes of text, each with .gz too, and what reads the others.
+_TEXT = (".csv", ".tsv", ".txt")
+_ARRAYS: Mapping[str, Callable[[Path], Members]] = {
+    ".npz": npz, ".mat": mat, ".rda": r_data, ".rdata": r_data, ".rds": r_data,
+}  # fmt: skip
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
@@ -115,25 +133,28 @@ def load(
     `units`: name here -> unit, for headers that state none or one that is not known.
     `scale`: size of one LSB, for all LSB columns or by name, with its unit (default deg/s for g*, m/s^2 for a*).
     `sensors`: columns of which at least one must be there.
-    Raises UserError for any file that is not a sound recording. O(n); about 2 s for 10^6 CSV rows of 7 columns.
+    Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
+    for 10^6 CSV rows of 7 columns.
     """
     path = Path(path)
     by_name: Mapping[str, Scale] = {"": (float(scale), None)} if isinstance(scale, int | float) else scale or {}
-    if rate is not None and not (np.isfinite(rate) and rate > 0.0):
-        raise UserError(f"the rate must be above 0 Hz, not {rate:g}")
+    if rate is not None and not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
+        raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
     header = _Header(path, columns, units, by_name, sensors)
-    name = path.name.lower()
-    try:
-        with path.open("rb") as stream:
-            if not stream.read(1):
-                raise UserError(f"{path}: the file is empty")
-        if name.endswith(".npz"):
-            return _load_npz(path, rate, header)
-        if name.endswith((".csv", ".csv.gz")):
-            return _load_csv(path, rate, header)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from error
-    raise UserError(f"{path}: not a recording (.csv, .csv.gz or .npz)")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder: name a recording in it ({', '.join((*_TEXT, *_ARRAYS))})")
+    suffix = path.suffix.lower()
+    with reading(path, "not a sound recording"):
+        if suffix in _ARRAYS:
+            with path.open("rb") as stream:
+                if not stream.read(1):
+                    raise UserError(f"{path}: the file is empty")
+            return _load_arrays(path, rate, header, _ARRAYS[suffix](path))
+        if path.name.lower().removesuffix(".gz").endswith(_TEXT):
+            return _load_text(path, rate, header)
+        path.open("rb").close()
+    known = ", ".join((*_TEXT, *_ARRAYS))
+    raise UserError(f"{path}: not a recording: its name ends in none of {known}, .csv.gz")
 
 
 def save(
@@ -151,35 +172,45 @@ def save(
     stores such a column as whole numbers of it. CSV values carry 9 digits. Raises UserError for an unwritable file.
     """
     path = Path(path)
-    lsb = lsb or {}
     described: dict[str, Any] = {**(meta or {}), "rate_hz": float(rate_hz)}
-    try:
-        if path.suffix.lower() == ".npz":
-            arrays: dict[str, NDArray[Any]] = {} if t is None else {"t[s]": np.asarray(t, np.float64)}
-            described["columns"] = {}
-            for name, (unit, values) in columns.items():
-                if name in lsb:
-                    counts = np.rint(np.asarray(values, np.float64) / lsb[name])
-                    arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
-                    described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
-                else:
-                    arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
-            with path.open("wb") as stream:
-                np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
-            return
-        if not path.name.lower().endswith((".csv", ".csv.gz")):
-            raise UserError(f"{path}: a recording's name ends in .csv, .csv.gz or .npz")
-        n = len(next(iter(columns.values()))[1])
-        stamps = np.arange(n) / rate_hz if t is None else t
-        table = np.column_stack([stamps, *(values for _, values in columns.values())])
-        names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
-        np.savetxt(path, table, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
-        if meta is None:
-            _sidecar(path).unlink(missing_ok=True)
+    if path.suffix.lower() == ".npz":
+        _save_npz(path, columns, described, t, lsb or {})
+        return
+    if not path.name.lower().endswith((".csv", ".csv.gz")):
+        raise UserError(f"{path}: a recording's name ends in .csv, .csv.gz or .npz")
+    n = len(next(iter(columns.values()))[1])
+    stamps = np.arange(n) / rate_hz if t is None else t
+    values = np.column_stack([stamps, *(values for _, values in columns.values())])
+    names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
+    with ExitStack() as files:
+        beside = None if meta is None else files.enter_context(whole(meta_place(path)))
+        table = files.enter_context(whole(path))
+        np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
+        if beside is not None:
+            beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
+        # Both are written. From here to the renaming, first of the table, no meta stands beside another's table.
+        meta_place(path).unlink(missing_ok=True)
+
+
+def _save_npz(
+    path: Path,
+    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    described: dict[str, Any],
+    t: NDArray[np.float64] | None,
+    lsb: Mapping[str, float],
+) -> None:
+    """Write the columns, whole numbers of an LSB where `lsb` has its size, and `described` as the member `meta`."""
+    arrays: dict[str, NDArray[Any]] = {} if t is None else {"t[s]": np.asarray(t, np.float64)}
+    described["columns"] = {}
+    for name, (unit, values) in columns.items():
+        if name in lsb:
+            counts = np.rint(np.asarray(values, np.float64) / lsb[name])
+            arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
+            described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
-            _sidecar(path).write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+            arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
+    with whole(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
 
 
 def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
@@ -209,12 +240,14 @@ def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
 
 
 def _split(text: str) -> tuple[str, str | None]:
-    """`name[unit]` in its parts; unit None without brackets."""
-    match = re.fullmatch(r"(.*?)\s*\[(.*)\]", text.strip())
-    return (match[1].strip(), match[2].strip()) if match else (text.strip(), None)
+    """`name[unit]` or `name(unit)` in its parts; unit None without brackets."""
+    text = text.strip()
+    match = re.fullmatch(r"([^[]*)\[(.*)\]", text) or re.fullmatch(r"(.*?)\(((?:[^()]|\([^()]*\))*)\)", text)
+    return (match[1].strip(), match[2].strip()) if match else (text, None)
 
 
-def _sidecar(path: Path) -> Path:
+def meta_place(path: Path) -> Path:
+    """Where the metadata of a text recording stand: beside it. An npz holds its own."""
     return path.with_name(path.name + ".meta.json")
 
 
@@ -236,6 +269,10 @@ class _Header:
         what a meta text says of columns that are named plainly."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
             raise UserError(f"{self.path}: meta: 'columns' must be a mapping of column names to unit and lsb")
+        for key in keys:
+            if len(key) > LONGEST_HEADING or not key.isprintable():
+                what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
+                raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
         fields: list[_Field] = []
         for key in keys:
@@ -253,7 +290,7 @@ class _Header:
                     raise UserError(f"{self.path}: {where}there is no column '{name}' for {option}")
         if not any(name in self.sensors for name in names):
             raise UserError(
-                f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{_short(','.join(keys))}';"
+                f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}';"
                 " name yours with --column gx=NAME --unit gx=deg/s"
             )
         return fields
@@ -276,28 +313,33 @@ class _Header:
         if not name:
             raise UserError(f"{self.path}: {where}a column has no name")
         stated = self.stated.get(name)
+        if isinstance(unit, str):
+            unit = units.plain(unit)
         if stated is not None:
+            stated = units.plain(stated)
             if unit is not None and unit != stated and units.known(str(unit)):
                 raise UserError(f"{column} is in {unit} by its header, --unit says {stated}")
             unit = stated
+        left_out = self.columns and not mapped and name != "t" and name not in self.sensors
+        if ("[" in name or "]" in name) and not (unit is None and left_out):
+            raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
         if unit is None:
-            if self.columns and not mapped and name != "t" and name not in self.sensors:
+            if left_out:
                 return []
-            if "[" in name or "]" in name:
-                raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
             known = {"t": "s", "temp": "degC", "supply": "V", **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
             example = known.get(name, _LSB_UNITS.get(name[0]) if name in self.sensors else None)
             hint = f"write {name}[{example or 'UNIT'}] in the header or give --unit {name}={example or 'UNIT'}"
             leave = "" if example else ", or leave it out by naming what to read with --column NAME=HEADER"
             raise UserError(f"{column} has no unit: {hint}{leave}")
         if not isinstance(unit, str) or not units.known(unit):
-            raise UserError(f"{column} has the unknown unit '{unit}' (known: {', '.join(units.RECORDING_UNITS)})")
+            known_units = f"(known: {', '.join(units.RECORDING_UNITS)})"
+            raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}")
         size = 1.0
         if unit == units.LSB:
             given = self.scale.get(name, self.scale.get(""))
             if given is None:
                 raise UserError(f"{column} is in LSB: give the size of one with --scale {name}=SIZE[unit]")
-            size, unit = given[0], given[1] or _LSB_UNITS.get(name[0])
+            size, unit = given[0], units.plain(given[1]) if given[1] else _LSB_UNITS.get(name[0])
             if unit is None or not units.known(unit) or unit == units.LSB:
                 raise UserError(f"{column} is in LSB: --scale needs a unit, --scale {name}={size:g}[unit]")
         elif name in self.scale:
@@ -313,180 +355,74 @@ class _Header:
 
 def _number(value: Any) -> float:
     """A JSON value as a number; NaN if it is none."""
-    return float(value) if isinstance(value, int | float) else np.nan
+    try:
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        return math.inf
 
 
-def _short(text: str) -> str:
-    """At most 60 printable characters of something found in a file."""
-    clean = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return clean if len(clean) <= 60 else clean[:57] + "..."
+# ----------------------------------------------------------------------------------------------------------- loaders
 
 
-# --------------------------------------------------------------------------------------------------------------- CSV
-
-
-def _load_csv(path: Path, rate: float | None, header: _Header) -> Recording:
-    text = _csv_text(path)
-    lines = text.split("\n")
-    while lines and not lines[-1].strip():
-        lines.pop()
-    if not lines:
-        raise UserError(f"{path}: line 1: the file holds empty lines only")
-    if "," not in lines[0] and re.search(r"[;\t]", lines[0]):
-        raise UserError(f"{path}: line 1: columns must be separated by commas")
-    keys = []
-    for number, key in enumerate(lines[0].split(",")):
-        inner = _unquoted(key)
-        if inner is None:
-            raise UserError(f"{path}: line 1: column {number + 1}: an unclosed quote: '{_short(key.strip())}'")
-        keys.append(inner.strip())
-    meta = _csv_meta(path)
-    fields = header.fields(keys, "line 1: ", {})
-    index = [keys.index(field.key) for field in fields]
-    if len(lines) == 1:
-        raise UserError(f"{path}: line 1: there is a header but no rows")
-    if len(lines) == 2:
-        raise UserError(f"{path}: line 2: one row only, a recording needs two or more")
+def _load_text(path: Path, rate: float | None, header: _Header) -> Recording:
+    with ExitStack() as files:
+        table = TextTable(path, files)
+        meta = _meta_beside(path)
+        fields = header.fields(table.keys, table.where, {})
+        columns = table.columns([(field.key, field.name) for field in fields])
+    if meta.get("rows", columns[0].size) != columns[0].size:
+        what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
+        raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
 
     def fail(row: int, field: int | None, what: str) -> NoReturn:
-        column = "" if field is None else f"column '{fields[field].name}': "
-        raise UserError(f"{path}: line {row + 2}: {column}{what}")
+        table.fail(row, None if field is None else fields[field].name, what)
 
-    rows = lines[1:]
-    table: NDArray[np.float64] | None = None
-    if all(row.count(",") == len(keys) - 1 for row in rows):
-        try:
-            table = np.loadtxt(rows, delimiter=",", comments=None, usecols=index, ndmin=2)
-        except ValueError:
-            table = None
-    if table is None or len(table) != len(rows):
-        table = _scan(rows, len(keys), index, fail)
-    return _checked(path, rate, meta, fields, list(table.T), fail)
+    return _checked(path, rate, meta, fields, columns, fail)
 
 
-def _unquoted(cell: str) -> str | None:
-    """A cell without the spaces and the pair of quotes around it; None if one quote has no partner."""
-    text = cell.strip()
-    inner = text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text
-    return None if '"' in inner else inner
-
-
-def _csv_text(path: Path) -> str:
+def _meta_beside(path: Path) -> Mapping[str, Any]:
+    beside = meta_place(path)
     try:
-        if path.suffix.lower() == ".gz":
-            with gzip.open(path) as stream:
-                data = stream.read()
-        else:
-            data = path.read_bytes()
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise UserError(f"{path}: not a whole gzip file: {error}") from error
-    start = 3 if data.startswith(b"\xef\xbb\xbf") else 0
-    bad = data.find(b"\0")
-    try:
-        text = data[start:].decode("utf-8")
-    except UnicodeDecodeError as error:
-        bad = min(bad, error.start + start) if bad >= 0 else error.start + start
-    if bad >= 0:
-        raise UserError(f"{path}: line {data.count(10, 0, bad) + 1}: not text (byte 0x{data[bad]:02x})")
-    return text.replace("\r\n", "\n")
-
-
-def _csv_meta(path: Path) -> Mapping[str, Any]:
-    beside = _sidecar(path)
-    try:
-        meta = json.loads(beside.read_text(encoding="utf-8"))
+        return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text"))
     except FileNotFoundError:
         return {}
-    except ValueError as error:
-        raise UserError(f"{beside}: not a JSON text: {error}") from error
-    if not isinstance(meta, dict):
-        raise UserError(f"{beside}: not a JSON mapping")
-    return meta
 
 
-_NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*\Z", re.ASCII)
-_NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)\Z", re.ASCII | re.IGNORECASE)
-
-
-def _scan(lines: Sequence[str], width: int, index: Sequence[int], fail: _Fail) -> NDArray[np.float64]:
-    """The slow exact way: float64[rows, fields], or the first fault. Columns that are not read may hold anything."""
-    table = np.empty((len(lines), len(index)))
-    for row, line in enumerate(lines):
-        cells = line.split(",")
-        if len(cells) != width:
-            fail(row, None, f"{len(cells)} cells where the header has {width}" if line.strip() else "an empty line")
-        for field, column in enumerate(index):
-            cell = _unquoted(cells[column])
-            if cell is None:
-                fail(row, field, f"an unclosed quote: '{_short(cells[column].strip())}'")
-            if not _NUMBER.match(cell) and not _NOT_FINITE.match(cell):
-                fail(row, field, f"'{_short(cell)}' is not a number" if cell else "an empty cell")
-            table[row, field] = float(cell)
-    return table
-
-
-# --------------------------------------------------------------------------------------------------------------- npz
-
-
-def _load_npz(path: Path, rate: float | None, header: _Header) -> Recording:
-    damaged = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, SyntaxError)
-    with path.open("rb") as stream:
-        if stream.read(4) not in (b"PK\x03\x04", b"PK\x05\x06"):  # of a zip, with members and without
-            raise UserError(f"{path}: not an npz file")
-    arrays: dict[str, NDArray[Any]] = {}
-    try:
-        archive = np.load(path, allow_pickle=False)
-    except damaged as error:
-        raise UserError(f"{path}: not a whole npz file: {_first_line(error)}") from error
-    with archive:
-        for key in archive.files:
-            try:
-                arrays[key] = np.asarray(archive[key])  # numpy hands out what is no array as bytes
-            except damaged as error:
-                raise UserError(f"{path}: column '{_short(key)}': cannot be read: {_first_line(error)}") from error
-    meta = _npz_meta(path, arrays.pop("meta", None))
+def _load_arrays(path: Path, rate: float | None, header: _Header, members: Members) -> Recording:
+    arrays, meta = members
     if not arrays:
         raise UserError(f"{path}: there are no columns")
     fields = header.fields(list(arrays), "", meta.get("columns", {}))
+    rows = math.prod(arrays[fields[0].key].shape)
     for field in fields:
-        values, column = arrays[field.key], f"{path}: column '{field.name}'"
-        if values.ndim != 1:
-            raise UserError(f"{column} has {values.ndim} dimensions, not one")
-        if values.dtype.kind not in "iuf":
-            raise UserError(f"{column} holds no numbers (its type is {values.dtype})")
-        if values.size != arrays[fields[0].key].size:
-            raise UserError(f"{column} has {values.size} rows, '{fields[0].name}' has {arrays[fields[0].key].size}")
-    rows = arrays[fields[0].key].size
+        member, column = arrays[field.key], f"{path}: column '{field.name}'"
+        if len(member.shape) != 1:
+            raise UserError(f"{column} has {len(member.shape)} dimensions, not one")
+        if member.dtype.kind not in "iuf":
+            raise UserError(f"{column} holds no numbers (its type is {short(str(member.dtype))})")
+        if member.shape[0] != rows:
+            raise UserError(f"{column} has {member.shape[0]} rows, '{fields[0].name}' has {rows}")
     if rows < 2:
         raise UserError(f"{path}: {'one row only' if rows else 'no rows'}, a recording needs two or more")
+    if rows * len(fields) > MOST_NUMBERS:
+        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns")
 
     def fail(row: int, field: int | None, what: str) -> NoReturn:
         column = "" if field is None else f"column '{fields[field].name}': "
         raise UserError(f"{path}: row {row + 1}: {column}{what}")
 
-    def as_read(field: _Field) -> NDArray[np.float64]:
-        array = arrays[field.key]
-        if field.name == "t" and array.dtype.kind in "iu":
-            array = array.astype(np.int64) - int(array[0])  # time since an epoch in ns does not fit a float64
+    def as_read(number: int) -> NDArray[np.float64]:
+        array = arrays[fields[number].key].read()
+        if fields[number].name == "t" and array.dtype.kind in "iu":
+            # Time since an epoch in ns does not fit a float64; a difference of two int64 fits a uint64.
+            back = array[1:] < array[:-1]
+            if back.any():
+                fail(int(np.argmax(back)) + 1, number, "time runs backwards")
+            bits = array.astype(np.uint64 if array.dtype.kind == "u" else np.int64).view(np.uint64)
+            array = bits - bits[0]
         return array.astype(np.float64)
 
-    return _checked(path, rate, meta, fields, [as_read(field) for field in fields], fail)
-
-
-def _npz_meta(path: Path, text: NDArray[Any] | None) -> Mapping[str, Any]:
-    if text is None:
-        return {}
-    try:
-        meta = json.loads(str(text.item()))
-    except ValueError as error:
-        raise UserError(f"{path}: meta: not a JSON text") from error
-    if not isinstance(meta, dict):
-        raise UserError(f"{path}: meta: not a JSON mapping")
-    return meta
-
-
-def _first_line(error: BaseException) -> str:
-    return _short(str(error).split("\n")[0]) or type(error).__name__
+    return _checked(path, rate, meta, fields, [as_read(number) for number in range(len(fields))], fail)
 
 
 # ------------------------------------------------------------------------------------------------------ common checks
@@ -507,20 +443,30 @@ def _checked(
         if not finite.all():
             row = int(np.argmin(finite))
             fail(row, number, "not a number (NaN)" if np.isnan(raw[row]) else "infinite")
-        columns[field.name] = Column(field.name, field.unit, raw * field.lsb if field.lsb != 1.0 else raw.copy())
+        values = raw * field.lsb if field.lsb != 1.0 else raw
+        if not np.isfinite(values).all():
+            fail(int(np.argmin(np.isfinite(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
+        columns[field.name] = Column(field.name, field.unit, values)
+    _check_truth(path, meta)
+    rows = table[0].size
     stamps = columns.pop("t", None)
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(path, meta)
         if rate is None:
             raise UserError(f"{path}: there is no time column: add t[s] or give --rate HZ")
-        missing = np.zeros(table[0].size, np.int64)
+        missing = np.zeros(rows, np.int64)
     else:
         time = units.convert(stamps.values - stamps.values[0], stamps.unit, "s")
+        if not np.isfinite(time[-1]):
+            raise UserError(f"{path}: column 't' spans more than a number can hold")
         number = [field.name for field in fields].index("t")
         found, missing = _sampling(path, time, stamps, rate, lambda row, what: fail(row, number, what))
         if rate is not None and (not 0.9 < found / rate < 1.1 or 2 * np.count_nonzero(missing) > missing.size):
             raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}")
         rate = found if rate is None else rate
+        if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
+            what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
+            raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
     return Recording(path, rate, columns, missing, meta)
 
 
@@ -542,6 +488,8 @@ def _sampling(
         raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
     if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+    if not 0.0 < dt < math.inf or not time[-1] / dt < LONGEST:
+        raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
     return float(f"{1.0 / dt:.10g}"), missing
 
 
@@ -552,3 +500,16 @@ def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:
     if not (np.isfinite(rate) and rate > 0.0):
         raise UserError(f"{path}: meta: 'rate_hz' must be a number above 0")
     return rate
+
+
+def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
+    """What a simulated recording says of itself: by axis, texts and finite numbers."""
+    truth = meta.get("truth", {})
+    if not isinstance(truth, dict) or not all(isinstance(entry, dict) for entry in truth.values()):
+        raise UserError(f"{path}: meta: 'truth' must be a mapping of axes")
+    for axis, entry in truth.items():
+        for key, value in entry.items():
+            if key == "units" or (isinstance(value, str) and len(value) <= 60 and value.isprintable()):
+                continue
+            if not math.isfinite(_number(value)):
+                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")

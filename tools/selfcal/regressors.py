@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import logsumexp, ndtr
 
 from selfcal.errors import UserError
 from selfcal.model import Model, Regressor
@@ -115,6 +113,8 @@ def combine(
     choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
 ) -> Scored:
     """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
+    from scipy.special import logsumexp
+
     ln_prior = np.array([_ln_prior(choices[-1], choice) for choice in choices])
     ln_law = np.log([hypotheses[law] for law in hypotheses])
     evidence = np.array([[result.log_evidence[law] for law in hypotheses] for result in results])
@@ -156,6 +156,9 @@ def _ln_prior(regressors: Choice, choice: Choice) -> float:
 
 def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
+    from scipy.optimize import brentq  # half a second to import: for who has regressors alone
+    from scipy.special import ndtr
+
     if parts.size == 0:
         return Coefficient(column, unit, *([math.nan] * 5))
     weight, mean, sd = parts[:, 0] / parts[:, 0].sum(), parts[:, 1], parts[:, 2]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+
+from selfcal import units
+from selfcal.model import RATIOS
 
 
 @dataclass(frozen=True)
@@ -46,3 +50,26 @@ class AxisResult:
     bias_mean: float
     bias_sd: float
     coefficients: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+
+    @property
+    def best(self) -> str:
+        """The most probable law."""
+        return max(self.probability, key=lambda name: self.probability[name])
+
+
+def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
+    """The result in `to` instead of `unit`: every number but alpha and the ratios, and the evidence, as a density per
+    unit."""
+    factor = units.factor(unit, to)
+    return AxisResult(
+        result.n,
+        {name: value - result.n * math.log(factor) for name, value in result.log_evidence.items()},
+        result.probability,
+        {
+            law: {name: e if name in ("alpha", *RATIOS) else e.scaled(factor) for name, e in estimates.items()}
+            for law, estimates in result.parameters.items()
+        },
+        result.bias_mean * factor,
+        result.bias_sd * factor,
+        {law: tuple((mean * factor, sd * factor) for mean, sd in pairs) for law, pairs in result.coefficients.items()},
+    )

@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 
 #: Rows looked at on either side of a long time step to tell missing samples from a late one.
 _NEIGHBOURS = 10
+#: Long steps looked at together, for the memory that they take.
+_AT_ONCE = 1 << 16
+#: Samples missing in a row that still count as a gap.
+_LONGEST_GAP = 2.0**53
 #: Steps in one window of the first estimate.
 _WINDOW = 64
 #: Lattice step over interval from which stamps are coarse; below it a step of one interval is never taken for two.
@@ -105,13 +109,18 @@ def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -
         return missing
     reach = np.arange(_NEIGHBOURS)
     last = np.concatenate(([0], long[:-1]))  # first row since the long step before
-    before = np.maximum(long[:, None] - 1 - reach, last[:, None])
-    after = np.minimum(long[:, None] + reach, time.size - 1)
-    # Relative to the row before the step, so that 10^8 rows cost no digits.
-    origin, start = long[:, None] - 1, time[long - 1][:, None]
-    early = (time[before] - start - (before - origin) * dt).min(axis=1)
-    late = (time[after] - start - (after - origin) * dt).min(axis=1)
-    missing[long] = np.maximum(0, np.rint((late - early) / dt)).astype(np.int64)
+    for at in range(0, long.size, _AT_ONCE):
+        rows = long[at : at + _AT_ONCE, None]
+        before = np.maximum(rows - 1 - reach, last[at : at + _AT_ONCE, None])
+        after = np.minimum(rows + reach, time.size - 1)
+        # Relative to the row before the step, so that 10^8 rows cost no digits.
+        origin, start = rows - 1, time[rows - 1]
+        early = (time[before] - start - (before - origin) * dt).min(axis=1)
+        late = (time[after] - start - (after - origin) * dt).min(axis=1)
+        gaps = np.rint((late - early) / dt)
+        if not gaps.max() < _LONGEST_GAP:
+            raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {dt:.3g} s")
+        missing[rows[:, 0]] = np.maximum(0, gaps).astype(np.int64)
     return missing
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from selfcal import _library32
 from selfcal.errors import UserError
@@ -37,7 +36,20 @@ def make_grid(nodes: int) -> Grid:
     """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/posterior.c)."""
     z = np.arange(nodes, dtype=float)
     knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
-    return Grid(nodes, np.linalg.inv(BSpline.design_matrix(z, knots, 5).toarray()))
+    return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
+
+
+def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """B-splines [points, splines] at `z` by the recursion of Cox and de Boor. The same as scipy's design matrix, whose
+    import takes longer than `identify` of an hour."""
+    interval = np.searchsorted(knots, z, side="right") - 1
+    interval = np.minimum(interval, len(knots) - degree - 2)  # the last point belongs to the last interval
+    basis = np.eye(len(knots) - 1)[interval]
+    for d in range(1, degree + 1):
+        span = knots[d:] - knots[:-d]
+        rise = np.where(span > 0.0, (z[:, None] - knots[:-d]) / np.where(span > 0.0, span, 1.0), 0.0)
+        basis = rise[:, :-1] * basis[:, :-1] + (1.0 - rise[:, 1:]) * basis[:, 1:]
+    return basis
 
 
 @dataclass(frozen=True)
@@ -109,6 +121,11 @@ class Tables:
     half_life_s: float = 0.0
 
     @property
+    def rate_hz(self) -> float:
+        """Of the samples."""
+        return self.block / self.dt_s
+
+    @property
     def nodes(self) -> int:
         """Filters of all hypotheses."""
         return sum(h.nodes for h in self.hypotheses)
@@ -145,7 +162,7 @@ def gate_table(model: Model, tables: Tables) -> GateTable | None:
     """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
     if model.gate is None or tables.block < 2:
         return None
-    gate, rate_hz = model.gate, tables.block / tables.dt_s
+    gate, rate_hz = model.gate, tables.rate_hz
     wanted = gate.window_s * rate_hz
     divisors = [n for n in range(2, tables.block + 1) if tables.block % n == 0]
     groups = [model.group_of(axis.name) for axis in tables.axes]

@@ -18,12 +18,14 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, short
 
 #: m/s^2 per g (3rd CGPM, 1901: exact by definition).
 STANDARD_GRAVITY = 9.80665
 #: A two-sided density is this many times the one-sided one.
 ONE_SIDED_TO_TWO_SIDED = 1.0 / math.sqrt(2.0)
+#: Allan deviation of flicker noise over its coefficient, the bias instability: sqrt(2 ln 2 / pi).
+FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Counts of the sensor's least significant bit; a scale turns them into a unit.
 LSB = "LSB"
 
@@ -44,7 +46,10 @@ _ACCELERATION = _dimension(length=1, time=-2)
 _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "1": (_NONE, 1.0),
     "rad": (_dimension(angle=1), 1.0),
+    "mrad": (_dimension(angle=1), 1e-3),
     "deg": (_dimension(angle=1), math.pi / 180.0),
+    "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
+    "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
     "m": (_dimension(length=1), 1.0),
     "s": (_TIME, 1.0),
     "ms": (_TIME, 1e-3),
@@ -70,7 +75,8 @@ _ZERO = {"degC": 273.15}
 
 #: What a recording's header may say, for error messages.
 RECORDING_UNITS = (
-    "deg/s", "rad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV", "s", "ms", "us", "ns",
+    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV",
+    "s", "ms", "us", "ns",
 )  # fmt: skip
 
 
@@ -84,24 +90,38 @@ class Unit:
     zero: float
 
 
-_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d+(?:\.\d+)?))?)\Z")
+_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
+#: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
+_LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
+#: Signs that a data sheet has, as this module writes them.
+_SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u"})
+
+
+def plain(name: str) -> str:
+    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²` -> `m/s^2`; what it does not know stays."""
+    return name.translate(_SIGNS)
 
 
 @cache
 def parse(name: str) -> Unit:
     """The unit called `name`. Raises UserError if it is not one."""
     dimension, size = _NONE, 1.0
+    unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
+    if len(name) > _LONGEST:
+        raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
         atom = match and (match["root"] or match["atom"])
         if match is None or atom not in _ATOMS:
-            raise UserError(f"unknown unit '{name}' (known: {', '.join(RECORDING_UNITS)})")
+            raise unknown
         power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
         if sign == "/":
             power = -power
         kind, scale = _ATOMS[atom]
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
+        if not _LEAST < size < _MOST:
+            raise unknown
     return Unit(name, dimension, size, _ZERO.get(name, 0.0))
 
 
@@ -159,3 +179,31 @@ def parameter_unit(parameter: str, unit: str) -> str:
         case "spectral_ratio" | "markov_ratio":
             return "1"
     raise ValueError(f"no such parameter: {parameter}")
+
+
+#: Units of data sheets, of a parameter of an angular rate and of an acceleration.
+_DATASHEET = {
+    "bias": ("deg/h", "ug"),
+    "sigma_m": ("deg/h", "ug"),
+    "B": ("deg/h", "ug"),
+    "N": ("deg/sqrt(h)", "ug/sqrt(Hz)"),
+    "K": ("deg/h/sqrt(h)", "ug/sqrt(h)"),
+}
+
+
+def datasheet_unit(parameter: str, unit: str) -> str:
+    """The unit that data sheets state a model parameter in, of an axis that reads in `unit`; that of `parameter_unit`
+    for what they do not state."""
+    if parameter in _DATASHEET:
+        for reading, of_kind in zip(("rad/s", "m/s^2"), _DATASHEET[parameter], strict=True):
+            if same_kind(unit, reading):
+                return of_kind
+    return parameter_unit(parameter, unit)
+
+
+def typeset(unit: str) -> str:
+    """A unit as print has it: `deg/s/sqrt(Hz)` -> `°/s/√Hz`."""
+    text = re.sub(r"sqrt\((\w+)\)", r"√\1", unit)
+    for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³"), ("°C", "°C")):
+        text = text.replace(plain, print_)
+    return text

@@ -6,8 +6,12 @@ missing stays incomplete: it is never filled up with older values.
 
 from __future__ import annotations
 
+import errno
+import logging
 import math
+import os
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -107,7 +111,7 @@ class Statistics:
     """Frames of one stream.
 
     `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
-    them. `refused` had a wrong form (id, length, item) or a counter that repeats or goes back.
+    them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
     """
 
     received: int = 0
@@ -226,6 +230,9 @@ class Decoder:
         values = {
             name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")
         }
+        if not all(_possible(definition.name, name, value) for name, value in values.items()):
+            self.statistics.refused += 1
+            return []
         if "time_ms" in values and int(values["time_ms"]) // 1000 % 256 != second:
             self.statistics.refused += 1
             return []
@@ -339,20 +346,39 @@ def _ahead(told: int, known: int, modulus: int) -> int:
     return (told - known + modulus // 2) % modulus - modulus // 2
 
 
+def _possible(message: str, signal: str, value: float) -> bool:
+    """Whether a module can mean this value.
+
+    In axis messages a value that is not a number says that the module has none. A law without any evidence has minus
+    infinity; a hair beyond 1 is a probability's rounding in float32.
+    """
+    if math.isnan(value):
+        return message.lower() in AXES
+    if signal.endswith("_probability"):
+        return 0.0 <= value <= 1.0 + 1e-6
+    return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)
+
+
 def _report(report: _Open, *, complete: bool) -> AxisReport:
     return AxisReport(report.axis, report.time_s, complete, report.values)
 
 
-class Link:
-    """A python-can bus whose `recv` survives what a damaged serial line does to it.
+#: Bytes of a serial line without an end that are kept: a frame's line has 22.
+LINE_MAX = 4096
 
-    `malformed` counts lines that were no frame; `closed` is set once the other side has gone.
+
+class Link:
+    """A python-can bus whose `recv` survives what a damaged line does to it.
+
+    `malformed` counts what came and was no frame; `closed` is set once the other side has gone. `again` opens the bus
+    anew.
     """
 
-    def __init__(self, bus: can.BusABC) -> None:
+    def __init__(self, bus: can.BusABC, again: Callable[[], can.BusABC] | None = None) -> None:
         self.bus = bus
         self.malformed = 0
         self.closed = False
+        self._again = again
 
     def recv(self, timeout: float) -> can.Message | None:
         """The next frame, or None after `timeout` seconds or once closed."""
@@ -365,20 +391,39 @@ class Link:
             except (IndexError, ValueError):  # python-can slcan: a line cut short, a digit that is none
                 self.malformed += 1
             except can.CanOperationError as error:
-                if not isinstance(error.__cause__, UnicodeDecodeError):
+                if error.__cause__ is None or isinstance(error.__cause__, OSError):
                     self.closed = True
                     break
                 self.malformed += 1
                 # python-can 4.6 keeps the line it cannot decode, so every later one would fail with it. Its flush()
                 # would throw away good frames that wait behind.
-                buffer = getattr(self.bus, "_buffer", None)
-                if isinstance(buffer, bytearray):
-                    buffer.clear()
+                self._shorten(0)
             except (OSError, can.CanError):
                 self.closed = True
+            finally:
+                self._shorten(LINE_MAX)
             if time.monotonic() >= end:
                 break
         return None
+
+    def _shorten(self, longest: int) -> None:
+        """Drop what a serial line has sent since its last end of line if that is longer than `longest` bytes."""
+        buffer = getattr(self.bus, "_buffer", None)
+        if isinstance(buffer, bytearray) and len(buffer) > longest:
+            self.malformed += 1 if longest else 0
+            buffer.clear()
+
+    def reconnect(self) -> bool:
+        """Open the bus anew; False if the other side is not back yet."""
+        if self._again is None:
+            return False
+        self.close()
+        try:
+            self.bus = self._again()
+        except UserError:
+            return False
+        self.closed = False
+        return True
 
     def open_again(self) -> None:
         """Open the channel of a serial line once more; on other buses nothing happens."""
@@ -416,21 +461,114 @@ class Link:
         self.close()
 
 
+#: s that a write to a serial line may take: on a pseudo-terminal that nobody reads it would never end.
+WRITE_S = 1.0
+#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 310, and a datagram takes 768 bytes.
+UDP_BUFFER = 4 << 20
+
+
 def open_bus(interface: str, channel: str, **options: Any) -> Link:
     """Open a python-can interface, a serial line for this process alone: of two readers each would lose what the other
     takes. Raises UserError when that fails."""
     import can
-    from can.interfaces.slcan import slcanBus
 
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # what its drivers lack is told by their errors
+    if interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise UserError(f"--interface {interface}: python-can has no such interface (there are {known})")
+    return Link(_bus(interface, channel, options), lambda: _bus(interface, channel, options))
+
+
+def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    import can
+    from can.interfaces.slcan import slcanBus
+    from can.interfaces.udp_multicast import UdpMulticastBus
+
+    if interface in ("slcan", "serial"):
+        _check_port(interface, channel)
     try:
         bus = can.Bus(interface=interface, channel=channel, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
-        raise UserError(f"{interface} {channel}: cannot open: {' '.join(str(error).split())}") from error
+    except Exception as error:  # python-can's drivers raise what the libraries below them raise
+        raise UserError(f"{interface} {channel}: {_reason(interface, channel, error)}") from error
     if isinstance(bus, slcanBus):
+        bus.serialPortOrig.write_timeout = WRITE_S
         try:
             bus.serialPortOrig.exclusive = True
         except OSError as error:
             bus.serialPortOrig.close()  # first: the order to close the channel would reach the other's module
             Link(bus).close()
             raise UserError(f"{interface} {channel}: another program has it open") from error
-    return Link(bus)
+    elif isinstance(bus, UdpMulticastBus):
+        import socket
+
+        with socket.socket(fileno=os.dup(bus.fileno())) as same:
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER)
+    return bus
+
+
+def _check_port(interface: str, channel: str) -> None:
+    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be one."""
+    if "://" in channel:
+        return
+    name, _, baud = channel.partition("@")
+    path = Path(name)
+    if baud and not baud.isdecimal():
+        raise UserError(f"{interface} {channel}: after the @ stands the line's rate, bit/s: {name}@115200")
+    if not name or not path.exists():
+        raise UserError(f"{interface} {channel}: there is no such port ({serial_ports()})")
+    if not path.is_char_device():
+        kind = "a folder" if path.is_dir() else "a file"
+        more = f"; `selfcal monitor --read {name}` reads a log of frames" if path.is_file() else ""
+        raise UserError(f"{interface} {channel}: this is {kind}, no serial port ({serial_ports()}){more}")
+
+
+def serial_ports() -> str:
+    """The machine's serial ports, in words."""
+    from serial.tools.list_ports import comports
+
+    found = sorted(port.device for port in comports())
+    if not found:
+        return "this machine has none: is the module plugged in?"
+    return f"there are {', '.join(found[:8])}{' and more' if len(found) > 8 else ''}"
+
+
+def _can_devices() -> str:
+    """The machine's CAN devices, in words. ARPHRD_CAN of linux/if_arp.h is 280."""
+    found = []
+    for device in sorted(Path("/sys/class/net").glob("*")):
+        try:
+            found += [device.name] if (device / "type").read_text().strip() == "280" else []
+        except OSError:
+            continue
+    return f"there are {', '.join(found)}" if found else "this machine has none"
+
+
+def _reason(interface: str, channel: str, error: BaseException) -> str:
+    """Why a bus cannot be opened, and what to do about it."""
+    below: BaseException | None = error
+    while below is not None and not (isinstance(below, OSError) and below.errno):
+        below = below.__cause__ or below.__context__
+    number = below.errno if isinstance(below, OSError) else None
+    said = " ".join(str(error).split()) or type(error).__name__
+    if interface == "socketcan":
+        if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT) or isinstance(error, AttributeError):
+            return "this system has no SocketCAN: load it (`modprobe can-raw`), or take another --interface"
+        if number == errno.ENODEV:
+            return f"there is no such CAN device ({_can_devices()})"
+        if number == errno.ENETDOWN:
+            return f"the device is down: `ip link set {channel} up type can bitrate 500000`"
+    if interface == "udp_multicast":
+        if number in (errno.ENODEV, errno.ENETUNREACH):
+            return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
+        if "msgpack" not in said:
+            return "this is no multicast group: take 239.74.163.2, python-can's own"
+    if interface in ("slcan", "serial"):
+        if number in (errno.EACCES, errno.EPERM):
+            return "no permission to open it: `sudo usermod -aG dialout $USER`, then log in anew"
+        if "Could not configure port" in said:
+            return f"this is no serial port ({serial_ports()})"
+        if number == errno.EBUSY:
+            return "another program has it open"
+    if isinstance(error, NameError | ImportError):
+        return "its driver is not installed on this machine"
+    return f"cannot open: {said}"

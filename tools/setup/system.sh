@@ -48,12 +48,12 @@ if [ -n "$missing" ]; then
         echo "    sudo apt-get install --no-install-recommends$missing" >&2
         exit 1
     fi
-    echo "Installing by apt:$missing"
+    echo "Installing by apt (a minute or two):$missing"
     export DEBIAN_FRONTEND=noninteractive
     # A list that is out of date, or none at all, shows as a failed install: then update and try once more.
     # shellcheck disable=SC2086  # one word a package
-    apt-get install -qq -y --no-install-recommends $missing >/dev/null 2>&1 ||
-        { apt-get update -qq; apt-get install -qq -y --no-install-recommends $missing >/dev/null; } || exit 1
+    apt-get install -qq -y --no-install-recommends $missing 2>/dev/null ||
+        { apt-get update -qq; apt-get install -qq -y --no-install-recommends $missing; } || exit 1
     missing_packages
     if [ -n "$missing" ]; then
         echo "Installed, yet still not usable:$missing" >&2

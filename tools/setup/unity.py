@@ -1,11 +1,14 @@
 """Fetch Unity, the C test framework, out of a Debian source package that carries it: python3 unity.py FOLDER
 
+Its files are taken if they are, byte for byte, those of a release that is stated here.
+
 No binary package has it. The sources of this machine's own apt configuration are asked, as deb-src, with lists and
 cache of their own, so that nothing on the system changes and root is not needed.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import subprocess
@@ -15,8 +18,21 @@ import tempfile
 from pathlib import Path
 
 PACKAGE = "ntpsec"
-#: Folder of Unity in the package, and what is taken from it.
-INSIDE = re.compile(r"[^/]+/tests/unity/([^/]+\.[ch])\Z")
+#: What is taken from the package's folder tests/unity, and its SHA-256 in the package's releases.
+FILES = {
+    "1.2.2 (Debian 12)": {
+        "unity.c": "2e3a0610268455520a5796345b503d00c34a47fe97ed3750349cbd4b2b1990f3",
+        "unity.h": "681ac98a63ac11effb11e59d580f6ca82abca1bd34069465c38e3b15344256c0",
+        "unity_internals.h": "adfd612c217e59468c5ebe978640e77e5f539e820ffc0c195a98c5a36f0ac868",
+    },
+    "1.2.3 and 1.2.4 (Debian 13)": {
+        "unity.c": "5570269535c6bcf7e8cdc5f96f650ff25e6a8bb889b86f85296c17683b0832fd",
+        "unity.h": "c5f8f6458ed9d380fde28421a50ca1aea1861484d625ca4f224c1f7246c25eb0",
+        "unity_internals.h": "6f8ebe5f102269d3bfbbd19198e45b37d92255a85f9d604091c49c535d15a950",
+    },
+}
+#: Bytes of one of them at most.
+LARGEST = 1 << 20
 
 
 def main() -> None:
@@ -90,18 +106,27 @@ def deb822_sources() -> str:
 
 
 def unpack(archive: Path, target: Path) -> None:
-    """Unity's .c and .h files of `archive` into `target`, which appears whole or not at all."""
+    """Unity's files of `archive` into `target`, which appears whole or not at all. Exits if they are not as stated."""
+    names = {name for files in FILES.values() for name in files}
+    found: dict[str, bytes] = {}
+    with tarfile.open(archive) as tar:
+        for member in tar:
+            match = re.fullmatch(r"[^/]+/tests/unity/([^/]+)", member.name)
+            if match and match[1] in names and member.isfile() and member.size <= LARGEST:
+                stream = tar.extractfile(member)
+                assert stream is not None
+                found[match[1]] = stream.read()
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in found.items()}
+    if digests not in FILES.values():
+        sys.exit(
+            f"{archive.name} holds no Unity of a stated SHA-256 (tools/setup/unity.py); a Unity that you trust: "
+            "make UNITY_ROOT=DIR"
+        )
     fresh = target.with_name(target.name + ".part")
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
-    with tarfile.open(archive) as tar:
-        for member in tar:
-            match = INSIDE.match(member.name)
-            stream = tar.extractfile(member) if match else None
-            if match and stream:
-                (fresh / match[1]).write_bytes(stream.read())
-    if not (fresh / "unity.c").is_file():
-        sys.exit(f"{archive.name} holds no Unity")
+    for name, content in found.items():
+        (fresh / name).write_bytes(content)
     shutil.rmtree(target, ignore_errors=True)
     fresh.rename(target)
 

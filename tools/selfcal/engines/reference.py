@@ -15,8 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize
 
 from selfcal import _reference
 from selfcal.errors import UserError
@@ -207,6 +205,8 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
     ln N, in which every posterior is narrow, is searched by zooming at each point of a coarse grid of the other
     parameters; the local maxima of that profile are polished.
     """
+    from scipy.optimize import minimize  # half a second to import, and every engine needs textbook_node()
+
     points = _SCAN[len(low) - 1]
     axes = [np.linspace(low[d + 1], high[d + 1], count) for d, count in enumerate(points)]
     rest = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(points)) if axes else np.empty((1, 0))
@@ -294,16 +294,20 @@ class _Lattice:
         self._spread()
 
     def _spread(self) -> None:
-        """Filter every node next to one above the depth."""
+        """Filter every node next to one above the depth. A turn looks beside the nodes that the last one added: beside
+        older ones all is there."""
         directions = np.eye(len(self.low), dtype=np.int64)
+        known = set(self._key(self.index).tolist())
+        seen = 0
         while True:
-            inside = self.index[self.value > self.top - _DEPTH]
+            inside = self.index[seen:][self.value[seen:] > self.top - _DEPTH]
             near = np.concatenate([inside + sign * direction for direction in directions for sign in (-1, 1)])
             near = near[((near >= 0) & (near <= self.count)).all(axis=1)]
-            keys = np.unique(self._key(near))
-            keys = keys[~np.isin(keys, self._key(self.index))]
+            keys = np.array(sorted(set(self._key(near).tolist()) - known), np.int64)
             if keys.size == 0:
                 return
+            known.update(keys.tolist())
+            seen = len(self.index)
             self._add(self._index(keys))
 
     def refine(self) -> None:
@@ -381,6 +385,8 @@ class _Lattice:
 
 
 def _estimate(lattice: _Lattice, d: int, prior: Prior) -> Estimate:
+    from scipy.interpolate import CubicSpline
+
     mass = lattice.mass(None)
     mass = mass / mass.sum()
     ln_theta = lattice.x(lattice.index)[:, d]

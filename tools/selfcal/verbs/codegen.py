@@ -10,6 +10,7 @@ from rich.console import Console
 
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Model
+from selfcal.output import whole
 from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
 
@@ -32,7 +33,7 @@ def codegen(
     Raises UserError for a bad model file or a folder that cannot be written.
     """
     loaded = Model.load(model)
-    tables = make_tables(loaded, rate or loaded.sensor_rate_hz, tuple(axes) if axes else None, target)
+    tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     write_tables(loaded, tables, Path(output))
     if loaded.gate is not None and gate_table(loaded, tables) is None:
         said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
@@ -40,14 +41,22 @@ def codegen(
     return tables
 
 
+def assumption(tables: Tables) -> str:
+    """What the tables take for granted of the samples that they are fed with."""
+    samples = "1 sample" if tables.block == 1 else f"{tables.block} samples"
+    make = "makes" if tables.block == 1 else "make"
+    return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
+
+
 def write_tables(model: Model, tables: Tables, folder: Path) -> None:
     """Write both files into `folder`. Raises UserError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "selfcal_model.h").write_text(_header(model, tables))
-        (folder / "selfcal_model.c").write_text(_source(model, tables))
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
+    with whole(folder / "selfcal_model.h") as header, whole(folder / "selfcal_model.c") as source:
+        header.write_text(_header(model, tables), encoding="utf-8")
+        source.write_text(_source(model, tables), encoding="utf-8")
 
 
 def _header(model: Model, tables: Tables) -> str:
@@ -76,7 +85,9 @@ def _header(model: Model, tables: Tables) -> str:
      SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) + \
      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
 /* Rate of the samples, Hz. */
-#define SELFCAL_MODEL_RATE_HZ {_f(tables.block / tables.dt_s)}
+#define SELFCAL_MODEL_RATE_HZ {_f(tables.rate_hz)}
+/* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */
+#define SELFCAL_MODEL_RATE_MILLIHZ {round(1000.0 * tables.rate_hz)}UL
 /* 1: every axis is one of lib/selfcal.dbc, in the unit that it has there. The library alone takes any. */
 #define SELFCAL_MODEL_UNITS_SENT {int(all(carries(axis.name, axis.unit) for axis in tables.axes))}
 /* 1: selfcal_model_gate is there. */

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal.errors import UserError
-from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus
+from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus, serial_ports
 
 if TYPE_CHECKING:
     import can
@@ -19,6 +19,8 @@ CHALLENGE = "challenge"
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
 #: s after a challenge or a wrong tag within which a module gives no other.
 PAUSE_S = 1.0
+#: Of every answer: whoever is on the wire can give it.
+UNVERIFIED = "unverified: an answer has a checksum, but no tag"
 #: Orders that go to no module.
 OWN_ORDERS = ("new-key", "build-flag")
 _MASK = 2**64 - 1
@@ -128,7 +130,7 @@ def argument_of(order: str, value: str | None) -> int:
 def command(
     order: str, value: str | None, *, key_file: Path | str, interface: str, channel: str, bitrate: int | None = None
 ) -> str:
-    """Have a module do `order`; returns its answer, the name of a result in the DBC.
+    """Have a module do `order`; returns its answer, the name of a result in the DBC. Nothing proves who gave it.
 
     Raises UserError for an order or argument that does not exist, a key that cannot be read, a channel that is not
     named or cannot be opened, or no answer.
@@ -138,7 +140,9 @@ def command(
         raise UserError(f"no such command: {order} (there are {', '.join((*orders, *OWN_ORDERS))})")
     argument = argument_of(order, value)
     if not channel:
-        raise UserError("to which module? --channel names its serial port (/dev/ttyACM0), or the --interface's channel")
+        raise UserError(
+            f"to which module? --channel names its serial port ({serial_ports()}), or the --interface's channel"
+        )
     key = read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
         for wait in (PAUSE_S, PAUSE_S, 0.0):

@@ -22,10 +22,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.model import LAWS, Group, Model, Prior
+from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
-from selfcal.verbs.identify import TABLE_WIDTH, write_json
 
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.
@@ -60,6 +61,7 @@ def montecarlo(
     Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
     records the calculated and actual probability of false identification, with the sd of their difference.
     """
+    check_writable(json)
     loaded = Model.load(model)
     if records < 2:
         raise UserError("--records must be at least 2")
@@ -170,7 +172,7 @@ def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str
     }
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The table of calculated against actual."""
     table = Table(
         box=box.SIMPLE_HEAD,
@@ -190,7 +192,7 @@ def show(document: Mapping[str, Any]) -> None:
                 f"{p['rms_actual'] / p['rms_calculated']:.3f}",
             )
         table.add_row(law, "bias now", f"{100 * entry['bias_coverage_90']:.1f} %", end_section=True)
-    console = Console()
+    console = Console(stderr=to_stderr)
     console.width = max(console.width, TABLE_WIDTH)
     console.print(table)
     f = document["false_identification"]

@@ -5,13 +5,15 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import math
+import os
 import re
 import shutil
 import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,30 +21,30 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.errors import UserError
+from selfcal.blocks import usable_blocks
+from selfcal.checks import Judged, judge
+from selfcal.document import Identified, check_writable, to_document, write_json
+from selfcal.ending import held
+from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import SUMS, Model
-from selfcal.plot import plot_run
+from selfcal.plot import check_picture, plot_run
 from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.result import in_unit
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import write_tables
-from selfcal.verbs.identify import (
-    Identified,
-    chosen_axes,
-    in_unit,
-    innovation_checks,
-    to_document,
-    usable_blocks,
-    write_json,
-)
+from selfcal.verbs.identify import chosen_axes
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
 
 MAGIC = b"SELFCAL1"
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
+GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
 #: s without a frame from an emulated module: its reports are slow, and so may the machine be.
 EMULATED_TIMEOUT_S = 600.0
-PLOT_FORMATS = (".png", ".pdf", ".svg", ".jpg")
+#: What a firmware is made of, and variables of the environment that its `make` file takes.
+SOURCES = (".c", ".h", ".ld", ".mk")
+BUILD_SETTINGS = ("CC", "POSIX_CFLAGS", "QEMU_CFLAGS")
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ def replay(
     model: Path | str | None = None,
     target: str = "host",
     transport: str = "slcan",
+    channel: str = "",
     report_every: float | None = None,
     gate: bool = False,
     json: Path | str | None = None,
@@ -85,23 +88,26 @@ def replay(
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
     The firmware is built for the model and the recording's rate if it is not there yet. `target`: this machine, or a
-    processor emulated by QEMU. `report_every`: seconds of the recording between reports, one bank interval at least
-    (default: a hundredth of it on the host, a tenth on the cortex-m4f, all of it on the cortex-m0). `gate`: only rest
-    counts, as the model's stationary gate sees it; while the sensor moves time passes as a gap. `plot`: file for the
-    picture of the run.
+    processor emulated by QEMU. `transport`: SLCAN over a pseudo-terminal, or `can`: frames over UDP within this machine
+    at the pace of a bus of 500 kbit/s, or over the CAN device `channel`. `report_every`: seconds of the recording
+    between reports, one bank interval at least (default: a hundredth of it on the host, a tenth on the cortex-m4f, all
+    of it on the cortex-m0). `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves
+    time passes as a gap. `plot`: file for the picture of the run.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
-    if transport != "slcan":
-        raise UserError(f"--transport {transport}: this build has the transport slcan only")
+    if transport not in ("slcan", "can"):
+        raise UserError(f"--transport {transport}: no such transport (there are slcan, can)")
+    if transport == "can" and TARGETS[target].board:
+        raise UserError("--transport can: an emulated board has a serial line alone; take --target host")
+    if channel and transport != "can":
+        raise UserError(f"--channel {channel}: goes with --transport can")
     if report_every is not None and not 0.001 <= report_every <= LONGEST_PERIOD_S:
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
-    if plot is not None and Path(plot).suffix not in PLOT_FORMATS:
-        raise UserError(f"{plot}: a plot is one of {', '.join(PLOT_FORMATS)}")
-    for file in (json, plot):
-        if file is not None and not Path(file).parent.is_dir():
-            raise UserError(f"{file}: cannot write: there is no such folder")
+    if plot is not None:
+        check_picture(plot)
+    check_writable(json, plot)
     loaded_model = Model.load(model)
     if loaded_model.regressors:
         raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
@@ -122,47 +128,72 @@ def replay(
             f"samples or more a bank interval ({loaded_model.bank_rate_hz:g} Hz)"
         )
     firmware = build(loaded_model, recording.rate_hz, names, target)
-    history = run(firmware, recording, loaded_model, names, report_every, target, gate)
+    history = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
     document = _document(recording, loaded_model, history, gate)
     if json is not None:
         write_json(document, json)
     if plot is not None:
         simulated = bool(recording.meta.get("simulated"))
         title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
-        plot_run(history, plot, title, recording.meta.get("truth") if simulated else None)
-        Console(stderr=True).print(f"plot: {plot}", highlight=False, soft_wrap=True)
+        truth = recording.meta.get("truth") if simulated else None
+        units = {name: recording.columns[name].unit for name in history}
+        plot_run(history, plot, title, truth if isinstance(truth, dict) else None, units)
+        note(f"plot: {plot}")
     return document
 
 
 def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host", nodes: str | None = None) -> Path:
-    """The firmware of a target for a model, a sampling rate and a choice of axes; made anew only if something changed.
+    """The firmware of a target for a model, a sampling rate and a choice of axes; made only if it is not there.
 
-    `nodes`: whose node counts it gets (default: the target's own).
+    `nodes`: whose node counts it gets (default: the target's own). Its folder is named by the content of all that it
+    is made of, and appears whole or not at all. Raises UserError if it cannot be made.
     """
-    core = nodes or target
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
-        made = Path(name)
-        write_tables(model, make_tables(model, rate_hz, tuple(axes), core), made)
-        digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(made.iterdir()))).hexdigest()[:12]
-        folder = ROOT / "build" / made_by.make / (digest if target == "host" else f"{target}-{digest}")
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("w") as lock:
+        tables = Path(name)
+        write_tables(model, make_tables(model, rate_hz, tuple(axes), nodes or target), tables)
+        key = _content(tables, made_by.make)
+        folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with folder.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            for file in made.iterdir():
-                if not (folder / file.name).exists():
-                    shutil.copy(file, folder)
-            makefile = f"port/{made_by.make}/{made_by.make}.mk"
-            command = ["make", "-s", "-f", makefile, made_by.make, f"MODEL_DIR={folder}", f"OUT={folder}"]
-            try:
-                done = subprocess.run(
-                    [*command, f"CORE={target}"], cwd=ROOT, capture_output=True, text=True, check=False
-                )
-            except OSError as error:
-                raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
-            if done.returncode != 0:
-                raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
+            if not folder.is_dir():
+                part = folder.with_suffix(".part")
+                shutil.rmtree(part, ignore_errors=True)  # a build that was killed leaves it
+                try:
+                    shutil.copytree(tables, part)
+                    _make(made_by.make, target, part.relative_to(ROOT))
+                    part.rename(folder)
+                except BaseException:
+                    shutil.rmtree(part, ignore_errors=True)
+                    raise
     return folder / made_by.image
+
+
+def _content(tables: Path, name: str) -> str:
+    """Names what a firmware is made of: its tables, every source, and settings that its `make` file takes."""
+    folders = [ROOT / "lib", ROOT / "port", *(ROOT / "port" / part for part in ("app", "replay", name)), tables]
+    files = [file for folder in folders for file in sorted(folder.glob("*.*")) if file.suffix in SOURCES]
+    said = hashlib.sha256(repr([os.environ.get(setting) for setting in BUILD_SETTINGS]).encode())
+    for file in files:
+        said.update(f"\0{file.name}\0".encode())
+        said.update(hashlib.sha256(file.read_bytes()).digest())
+    return said.hexdigest()[:16]
+
+
+def _make(name: str, target: str, folder: Path) -> None:
+    """Make a firmware in `folder`, which is relative to ROOT: a checkout's own path may hold spaces."""
+    command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
+    # Of a `make` around this program nothing is passed on: neither its options nor its variables.
+    environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
+    try:
+        done = subprocess.run(
+            [*command, f"CORE={target}"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        )
+    except OSError as error:
+        raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
+    if done.returncode != 0:
+        raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
 
 
 def _complaint(said: str) -> str:
@@ -194,6 +225,8 @@ def run(
     report_every: float | None,
     target: str = "host",
     gate: bool = False,
+    transport: str = "slcan",
+    channel: str = "",
 ) -> dict[str, list[AxisReport]]:
     """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts, and the
     gate's."""
@@ -205,19 +238,41 @@ def run(
         rows = Path(name) / "rows.bin"
         write_rows(recording, model, axes, rows)
         finished = False
-        with _module(firmware, rows, period_s, target, gate) as (module, channel, before):
-            if channel:
+        with ExitStack() as stack:
+            link, more = None, ["--timeout", f"{TIMEOUT_S:g}"]
+            if transport == "can":  # listening first: on a bus nobody waits for a listener
+                bus, link = can_bus(channel)
+                stack.enter_context(link)
+                more += ["--can", bus]
+            module, wire, before = stack.enter_context(running(firmware, rows, period_s, target, gate, more))
+            if link is None and wire:
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
-                with open_bus("slcan", channel, bitrate=500000, sleep_after_open=0.0) as link:
-                    finished = _watch(link, recording, history, target)
-                    link.close_channel()
-                    said = before + _ending(module)  # the emulator forgets what it holds of a line that is closed
-            else:
-                said = before + _ending(module)
+                link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
+            if link is not None and wire:
+                finished = _watch(link, recording, history, target, module)
+                link.close_channel()  # the emulator forgets what it holds of a line that is closed
+            said = before + _ending(module)
         if module.returncode != 0 or not finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
             raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
     return history
+
+
+def can_bus(channel: str, port: int | None = None) -> tuple[str, Link]:
+    """A CAN bus between programs of this machine: its name for the firmware (port/posix/can.h), and the host's link.
+
+    The CAN device `channel`, or else UDP in python-can's multicast group at `port` (default: one that is free).
+    """
+    from can.interfaces.udp_multicast import UdpMulticastBus
+
+    if channel:
+        return channel, open_bus("socketcan", channel)
+    if port is None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("", 0))
+            port = free.getsockname()[1]
+    group = UdpMulticastBus.DEFAULT_GROUP_IPv4
+    return f"{group}:{port}", open_bus("udp_multicast", group, port=port)
 
 
 def _ending(module: subprocess.Popen[str]) -> str:
@@ -229,39 +284,42 @@ def _ending(module: subprocess.Popen[str]) -> str:
 
 
 @contextmanager
-def _module(
-    firmware: Path, rows: Path, period_s: float, target: str, gate: bool
+def running(
+    firmware: Path, rows: Path, period_s: float, target: str, gate: bool = False, more: Sequence[str] = ()
 ) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
-    """The running firmware, the serial channel its telemetry comes by, and what it said before; killed at the end.
+    """The running firmware, the channel its telemetry comes by, and what it said before; killed at the end.
 
-    The channel is empty if the firmware did not get as far as having one: then it is ending.
+    `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware did not get as far as
+    having one: then it is ending.
     """
     with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
         if server is None:
-            command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--timeout", f"{TIMEOUT_S:g}"]
+            command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", *more]
             command += ["--gate"] if gate else []
         else:  # QEMU takes over a socket that listens already, so no port can be lost to another program
             uart = f"socket,id=uart,server=on,wait=off,fd={server.fileno()}"
             command = emulator(firmware, rows.name, period_s, target, uart, gate)
+        with held() as ending:  # a signal between start and `try` would leave it running
+            try:
+                module = subprocess.Popen(
+                    command,
+                    cwd=rows.parent,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                    errors="replace",
+                    pass_fds=() if server is None else (server.fileno(),),
+                )
+            except OSError as error:
+                raise UserError(f"cannot run the firmware: {command[0]}: {error.strerror}") from error
         try:
-            module = subprocess.Popen(
-                command,
-                cwd=rows.parent,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                pass_fds=() if server is None else (server.fileno(),),
-            )
-        except OSError as error:
-            raise UserError(f"cannot run the firmware: {command[0]}: {error.strerror}") from error
-        try:
+            ending.check()
             assert module.stdout is not None
             channel = said = ""
             for line in module.stdout:
                 word, _, rest = line.strip().partition(" ")
-                if word == "SELFCAL_PTY":
+                if word in ("SELFCAL_PTY", "SELFCAL_CAN"):
                     channel = rest
                 elif word == "SELFCAL_UART" and server is not None:
                     channel = f"socket://127.0.0.1:{server.getsockname()[1]}"
@@ -285,25 +343,41 @@ def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str,
     ]
 
 
-def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]], target: str) -> bool:
+def _watch(
+    link: Link,
+    recording: Recording,
+    history: dict[str, list[AxisReport]],
+    target: str,
+    module: subprocess.Popen[str],
+) -> bool:
     """Follow the telemetry until the module has finished; false if it fell silent before. Of `history` retired axes
     without a report are taken out."""
+    patience_s = EMULATED_TIMEOUT_S if TARGETS[target].board else TIMEOUT_S
+    whole: dict[str, bool] = {}  # the axis's last report
     decoder = Decoder(from_start=True)
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s) as view:
+        heard = time.monotonic()
         while not decoder.finished:
-            frame = link.recv(EMULATED_TIMEOUT_S if TARGETS[target].board else TIMEOUT_S)
+            frame = link.recv(1.0)
             if frame is None:
-                break
+                silent_s = time.monotonic() - heard
+                if link.closed or silent_s > patience_s or (module.poll() is not None and silent_s > GONE_S):
+                    break
+                continue
+            heard = time.monotonic()
             reports = decoder.feed(frame)
             view.show(reports)
             for report in reports:
+                whole[report.axis] = report.complete
                 if report.complete:
                     history[report.axis].append(report)
     said = frame_counts(decoder, link)
     if decoder.status.get("motion", 0.0) > 0.0:
         alarms, blocks = (decoder.status.get(name, 0.0) for name in ("gate_alarm_count", "blocks_moving_count"))
         said += f"\ngate: rest ended {alarms:.0f} times; {blocks:.0f} bank intervals begun and given up for motion"
+    for name in [name for name in history if not whole.get(name, True)]:
+        said += f"\n{name}: its last report did not arrive whole; its numbers are from the one before"
     retired = int(decoder.status.get("axes_retired", 0.0))
     for name in [name for name in history if retired >> AXES.index(name) & 1]:
         said += f"\n{name}: retired as dead on the way; "
@@ -319,22 +393,20 @@ def _watch(link: Link, recording: Recording, history: dict[str, list[AxisReport]
 def _document(
     recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], gate: bool
 ) -> dict[str, Any]:
-    found = {}
+    found: dict[str, Identified | UserError] = {}
     for name, reports in history.items():
         try:
             found[name] = _identified(recording, model, name, reports, gate)
         except UserError as error:
-            raise UserError(f"{recording.path}: column {name}: {error}") from error
+            found[name] = error
     document = to_document(recording, found)
     if gate:
-        for axis in document["axes"].values():
+        for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
     return document
 
 
-def _identified(
-    recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool
-) -> Identified:
+def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
     """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
     tables = make_tables(model, recording.rate_hz, (name,))
     group, unit = model.group_of(name), recording.columns[name].unit
@@ -346,5 +418,5 @@ def _identified(
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
-    checks = {} if gate else innovation_checks(blocks, tables, group, result, [])
-    return Identified(unit, in_unit(result, group.unit, unit), checks, blocks.kept_out)
+    judged = Judged({}, None) if gate else judge(blocks, tables, group, result)
+    return Identified(unit, group.unit, in_unit(result, group.unit, unit), judged, blocks.kept_out)

@@ -10,14 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from selfcal import _reference, recording, units
-from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, PLACES, Group, Model, Prior
+from selfcal.errors import UserError, printable, shown
+from selfcal.model import LARGEST, LAWS, PARAMETERS, PLACES, Group, Model, Prior
+from selfcal.output import check_place
 from selfcal.tables import bank_block
 
-#: A recording is made in memory: this many samples of six axes are 24 GB.
-SAMPLES_MAX = 500_000_000
+#: Readings, samples times axes, of a recording, which is made in memory: 4 GB.
+MOST_READINGS = 100_000_000
+#: Readings that the sensor takes for them: its rate over the recording's times as many; a quarter of an hour.
+MOST_TAKEN = 10_000_000_000
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
 _DRAWS = 2**32
 
@@ -93,6 +97,7 @@ def simulate(
     if `output` cannot be written.
     """
     model = Model.load(model_path)
+    check_place(output)
     if not 0 <= seed < 2**64:
         raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
     scene = _scene(model, seed)
@@ -102,7 +107,8 @@ def simulate(
     applied = [_apply(text, model, scene, axes) for text in effects]
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
-    values, temperature, supply, present, bias_now = _reference.simulate(scene, axes)
+    with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
+        values, temperature, supply, present, bias_now = _reference.simulate(scene, axes)
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
         truth[name] |= {
             "bias_now": now,
@@ -122,8 +128,20 @@ def simulate(
     columns |= {"temp": ("degC", temperature[present]), "supply": ("V", supply[present])}
     lattice = {name: axis.lsb for name, axis in zip(model.axes, axes, strict=True) if axis.lsb > 0.0}
     stamps = None if present.all() else np.flatnonzero(present) / scene.rate_hz
-    recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})
-    return meta
+    with Console(stderr=True).status(f"writing {scene.samples:,} samples"):
+        recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})
+    return {**meta, "samples": int(present.sum()), "rate_hz": scene.rate_hz}
+
+
+def show(meta: Mapping[str, Any], output: Path | str) -> None:
+    """Print what `simulate` has written, the truth's file too, and the truth."""
+    output = Path(output)
+    print(printable(f"{output}: {meta['samples']:,} samples at {meta['rate_hz']:g} Hz, seed {meta['seed']}"))
+    within = output.suffix.lower() == ".npz"
+    print("the truth, in its member `meta`:" if within else printable(f"{recording.meta_place(output)}: the truth:"))
+    for axis, truth in meta["truth"].items():
+        values = (f"{key} {truth[key]:.4g} {truth['units'][key]}" for key in ("bias", *LAWS[truth["hypothesis"]]))
+        print(f"  {axis}: {truth['hypothesis']}, {', '.join(values)}")
 
 
 def _scene(model: Model, seed: int) -> _reference.Scene:
@@ -133,12 +151,16 @@ def _scene(model: Model, seed: int) -> _reference.Scene:
     if scene.rate_hz > 1.01 * model.sensor_rate_hz:
         raise UserError(f"{model.path}: simulate.rate_hz: the sensor gives {model.sensor_rate_hz:g} Hz at most")
     duration_s = _positive(model, model.simulate.get("duration_s", 3600.0), "duration_s")
-    scene.samples = round(duration_s * scene.rate_hz)
+    scene.samples = round(min(duration_s * scene.rate_hz, 1e18))
     if scene.samples < 2:
         raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold fewer than two samples")
-    if scene.samples > SAMPLES_MAX:
-        raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold more than {SAMPLES_MAX:g} samples")
-    scene.block = max(1, round(model.sensor_rate_hz / scene.rate_hz))
+    readings, block = scene.samples * len(model.axes), max(1, round(model.sensor_rate_hz / scene.rate_hz))
+    for much, most, what in ((readings, MOST_READINGS, "readings"), (readings * block, MOST_TAKEN, "sensor samples")):
+        if much > most:
+            most_s = most / much * duration_s
+            said = f"{duration_s:g} s are more than {most:,} {what}: take {most_s:.3g} s or a lower rate"
+            raise UserError(f"{model.path}: simulate.duration_s: {said}")
+    scene.block = block
     scene.filter_taps = model.filter_taps
     return scene
 
@@ -146,11 +168,11 @@ def _scene(model: Model, seed: int) -> _reference.Scene:
 def _positive(model: Model, value: Any, where: str, *, signed: bool = False) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number) or isinstance(value, bool) or (number <= 0.0 and not signed):
+    if not abs(number) <= LARGEST or isinstance(value, bool) or (number <= 0.0 and not signed):
         what = "a number" if signed else "a number above 0"
-        raise UserError(f"{model.path}: simulate.{where}: must be {what}, not {value!r}")
+        raise UserError(f"{model.path}: simulate.{where}: must be {what}, not {shown(value)}")
     return number
 
 
@@ -170,7 +192,8 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
             raise UserError(f"{model.path}: simulate.{where}: must be a mapping of {', '.join(allowed)}")
         for key in fields:
             if key not in allowed:
-                raise UserError(f"{model.path}: simulate.{where}: unknown entry '{key}' (known: {', '.join(allowed)})")
+                known = f"(known: {', '.join(allowed)})"
+                raise UserError(f"{model.path}: simulate.{where}: unknown entry {shown(key)} {known}")
         # All are drawn, in one order, so that stating one leaves the others as they were.
         random = _reference.Random(seed, _DRAWS + number)
         priors = model.group_of(name).priors
@@ -179,8 +202,9 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         more = [parameter for parameter in priors if parameter not in ("bias", *PARAMETERS)]
         drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in (*PARAMETERS, *more)}
         law = fields.get("hypothesis", law)
-        if law not in LAWS:
-            raise UserError(f"{model.path}: simulate.{where}.hypothesis: unknown '{law}' (known: {', '.join(LAWS)})")
+        if not isinstance(law, str) or law not in LAWS:
+            known = f"(known: {', '.join(LAWS)})"
+            raise UserError(f"{model.path}: simulate.{where}.hypothesis: unknown {shown(law)} {known}")
         for key in PLACES.keys() | {"bias"}:
             if key not in fields:
                 continue

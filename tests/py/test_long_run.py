@@ -1,0 +1,42 @@
+"""tests/long_run.py: what `make campaigns` and its like leave behind. Truth: the exit codes of `true` and `false`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from conftest import ROOT
+
+sys.path.insert(0, str(ROOT / "tests"))
+import long_run
+
+
+@pytest.fixture(autouse=True)
+def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setattr(long_run, "RECORD", tmp_path / "long_runs.txt")
+    monkeypatch.setattr(long_run, "commit", lambda: "HEAD~0")
+    return tmp_path / "long_runs.txt"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["long_run.py", *arguments])
+    return long_run.main()
+
+
+def test_a_whole_run_is_written_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "make soak        no run is recorded" in long_run.say()
+    assert run(monkeypatch, "soak", "false", "--part") == 1  # --part is the command's here
+    assert "make soak        FAILED with exit code 1 after 0 min" in long_run.say()
+    assert run(monkeypatch, "campaigns", "true") == 0
+    assert run(monkeypatch, "soak", "true") == 0
+    assert [long_run.read()[name].outcome for name in ("campaigns", "soak")] == ["passed after 0 min"] * 2
+    if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, check=False).returncode == 0:
+        assert long_run.say().count("0 commits ago") == 2
+
+
+def test_a_part_is_not(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
+    assert run(monkeypatch, "--part", "tolerances", "false") == 1
+    assert not record.exists()

@@ -1,0 +1,29 @@
+"""The compiled likelihood of tools/bindings/likelihood.cpp."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+STATES_MAX: int
+COLUMNS_MAX: int
+
+def run(
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    r: NDArray[np.float64],
+    F: NDArray[np.float64],
+    Q: NDArray[np.float64],
+    h: NDArray[np.float64],
+    P0: NDArray[np.float64],
+    R: float,
+    marks: Sequence[int],
+    innovations: bool,
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]: ...

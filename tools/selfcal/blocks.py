@@ -1,0 +1,109 @@
+"""What the library's averager makes of a record, worked out on its own in double: the block means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.errors import UserError
+from selfcal.model import Group
+from selfcal.tables import Tables
+
+#: Bank samples a report needs (SELFCAL_REPORT_MIN).
+REPORT_MIN = 3
+#: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
+MOST_DENSE = 10_000_000
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
+
+    `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
+    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
+    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. Blocks beyond MOST_DENSE
+    intervals are not worked out.
+    """
+
+    mean: NDArray[np.float64]
+    r: NDArray[np.float64]
+    within_sd: float
+    kept_out: Mapping[str, int]
+    z: NDArray[np.float64]
+
+
+def usable_blocks(
+    samples: NDArray[np.float32],
+    missing_before: NDArray[np.int64],
+    tables: Tables,
+    group: Group,
+    columns: NDArray[np.float32] | None = None,
+) -> Blocks:
+    """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them."""
+    z = None if columns is None else columns.astype(np.float64)
+    blocks = block_means(samples.astype(np.float64), missing_before, tables.block, group, z)
+    present = blocks.mean[np.isfinite(blocks.mean)]
+    needed = REPORT_MIN + len(tables.regressors)
+    kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
+    if present.size < needed:
+        found = f"{present.size} averages of {tables.dt_s:g} s"
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
+    if not present.std() > 0.0:
+        equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
+        raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
+    return blocks
+
+
+def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:
+    """Which of `samples` [n] are not used, by reason."""
+    finite = np.isfinite(samples)
+    limit = np.float32(group.range) if group.range > 0.0 else np.inf
+    saturated = finite & (np.abs(samples) >= limit)
+    stuck = np.zeros(samples.size, bool)
+    if group.stuck_limit > 0:
+        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
+        run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
+        stuck = finite & (run >= group.stuck_limit)
+    return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
+
+
+def block_means(
+    samples: NDArray[np.float64],
+    missing_before: NDArray[np.int64],
+    block: int,
+    group: Group,
+    columns: NDArray[np.float64] | None = None,
+) -> Blocks:
+    """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
+    `columns` [n, p] of the regressors are averaged over the same samples."""
+    reasons = kept_out(samples, group)
+    usable = ~np.logical_or.reduce(list(reasons.values()))
+    counts = {"missing": int(missing_before.sum()), **{what: int(mask.sum()) for what, mask in reasons.items()}}
+    at = np.arange(samples.size) + np.cumsum(missing_before)
+    if not usable.any():
+        raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
+    at -= at[np.argmax(usable)]
+    columns = np.empty((samples.size, 0)) if columns is None else columns
+    values, index, rows = samples[usable], at[usable] // block, columns[usable]
+    count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
+    keep = index < count
+    values, index, rows = values[keep], index[keep], rows[keep]
+    used = np.bincount(index, minlength=count)
+    total = np.bincount(index, values, minlength=count)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        raw = total / used
+        sums = [np.bincount(index, column, minlength=count) for column in rows.T]
+        z = np.column_stack([np.empty((count, 0)), *sums]) / used[:, None]
+        mean = np.where(used * 2 >= block, raw, np.nan)
+        r = np.where(used * 2 >= block, block / used, 1.0)
+    good = np.isfinite(mean)[index]
+    freedom = int(good.sum()) - int(np.isfinite(mean).sum())
+    squares = float(((values - raw[index])[good] ** 2).sum())
+    within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
+    first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
+    return Blocks(mean[first:], r[first:], within, counts, z[first:])

@@ -1,0 +1,136 @@
+"""Checks of adequacy: what in a record speaks against its most probable law."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from selfcal.allan import Curve, curve_of, ratio_at
+from selfcal.blocks import MOST_DENSE, Blocks
+from selfcal.model import LAWS, Group
+from selfcal.result import AxisResult
+from selfcal.tables import Tables
+
+#: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
+CHECK_LIMIT = 4.0
+#: Bank samples without which there are no checks.
+FEWEST = 20
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A record against its most probable law, at its posterior medians: the `checks` of adequacy, and the `curve` of
+    its Allan deviation, None where the record is too short, or too long, to tell."""
+
+    checks: Mapping[str, Mapping[str, Any]]
+    curve: Curve | None
+
+
+def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: Sequence[int] = ()) -> Judged:
+    """What in the record speaks against the most probable law, with the columns `used`."""
+    law = result.best
+    medians = {name: estimate.median for name, estimate in result.parameters[law].items()}
+    if blocks.mean.size > MOST_DENSE or not all(math.isfinite(value) for value in medians.values()):
+        return Judged({}, None)
+    if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
+        return Judged({}, None)
+    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+    explained = z @ coefficients_of(result) if used else 0.0
+    curve = curve_of(
+        blocks.mean - explained,
+        tables.dt_s,
+        law,
+        result.parameters[law],
+        group,
+        white=float(blocks.r[np.isfinite(blocks.mean)].mean()),
+        half_life_s=tables.half_life_s,
+    )
+    checks = innovation_checks(blocks, tables, group, result, list(used))
+    return Judged({**checks, **(allan_checks(curve) if curve else {})}, curve)
+
+
+def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
+    """Posterior means [p] of the coefficients of the columns in use, under the most probable law."""
+    return np.array([mean for mean, _ in result.coefficients[result.best]])
+
+
+def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
+    """Is the record's Allan deviation the model's, at averaging times of 2, 4, 8 ... bank intervals to a fifth of the
+    record? `value` is the model's deviation over the record's less 1, `limit` how far on this side it may be, and
+    `deviations` by how many standard deviations the record's variance is above the model's.
+    """
+    limit = allan_limit(curve)
+    checks = {}
+    for k in np.flatnonzero(curve.octave):
+        deviations = float(curve.deviations[k])
+        edge = ratio_at(math.copysign(limit, deviations), float(curve.left[k]))
+        checks[f"allan_{curve.tau_s[k]:g}s"] = {
+            "value": float(curve.model[k]) / float(curve.recording[k]) - 1.0 if curve.recording[k] > 0.0 else math.inf,
+            "limit": abs(edge**-0.5 - 1.0) if edge > 0.0 else math.inf,
+            "passed": abs(deviations) <= limit,
+            "deviations": deviations,
+        }
+    return checks
+
+
+def allan_limit(curve: Curve) -> float:
+    """How many standard deviations an averaging time may be off. All together fail as often as one other check
+    (CHECK_LIMIT): a single one counts as outside beyond the limit that makes this so (Bonferroni's). Once one is, every
+    one beyond CHECK_LIMIT is named."""
+    off = np.abs(curve.deviations[curve.octave])
+    alone = float(-ndtri(ndtr(-CHECK_LIMIT) / max(off.size, 1)))
+    return CHECK_LIMIT if bool((off > alone).any()) else alone
+
+
+def innovation_checks(
+    blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
+) -> dict[str, dict[str, Any]]:
+    """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a
+    ramp that a random walk follows leaves one), white, normal and of one variance?"""
+    from selfcal import _reference
+    from selfcal.engines.reference import textbook_node
+
+    law = result.best
+    at = {name: np.array([estimate.median]) for name, estimate in result.parameters[law].items()}
+    drift, alpha, walk = (float(value[0]) for value in textbook_node(law, at, group.correlation_time_s))
+    offset = float(np.nanmean(blocks.mean))
+    z = blocks.z - np.array([column.reference for column in tables.regressors])
+    sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
+    nu = _reference.innovations(
+        np.ascontiguousarray(blocks.mean - offset),
+        tables.dt_s,
+        -offset,
+        group.priors["bias"].sd,
+        list(LAWS).index(law),
+        drift,
+        alpha,
+        float(at["N"][0]) / math.sqrt(tables.dt_s),
+        blocks.r,
+        np.ascontiguousarray(z[:, used]) if used else None,
+        sd[used] if used else None,
+        walk,
+    )[1 + len(used) :]  # the first ones are the bias and the coefficients
+    pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
+    whole = nu[np.isfinite(nu)]
+    n = whole.size
+    half = n // 2
+    lag1 = float((nu[1:] * nu[:-1])[pairs].sum() / (whole**2).sum())
+    kurtosis = float(((whole - whole.mean()) ** 4).mean() / whole.var() ** 2 - 3.0)
+    ratio = math.log(float(whole[half:].var() / whole[:half].var()))
+    # Standard deviations under white normal innovations.
+    checks = {
+        "innovation_mean": (float(whole.mean() / whole.std()), 1.0 / math.sqrt(n)),
+        "innovation_lag1": (lag1, 1.0 / math.sqrt(n)),
+        "innovation_excess_kurtosis": (kurtosis, math.sqrt(24.0 / n)),
+        "innovation_ln_variance_ratio_of_halves": (ratio, math.sqrt(8.0 / n)),
+    }
+    return {
+        name: {"value": value, "limit": CHECK_LIMIT * sd, "passed": abs(value) <= CHECK_LIMIT * sd}
+        for name, (value, sd) in checks.items()
+    }

@@ -1,0 +1,151 @@
+"""A spectral line: the periodogram of the innovations; harmonics of one fundamental are one finding."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.fft import next_fast_len, rfft
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import minimize_scalar
+
+from selfcal.diagnosis.fit import fit, moved
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import Look, Regressor, State, interval, net
+from selfcal.diagnosis.statemodel import Array
+
+#: Fewer turns in a record than this are drift.
+TURNS_LEAST = 3.0
+#: Widths of a band in bins of the periodogram.
+BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
+#: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
+BAND_LEAST = 12.0
+BAND_DEARER = 6.0
+#: Bands that one model may have.
+BANDS_MOST = 3
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """The strongest line, or a narrow band about a frequency that wanders, if that explains more."""
+    line, band = _line(state, record), _band(state, record)
+    if line and band:
+        return line if line[0].net > band[0].net - BAND_DEARER else band
+    return line or band
+
+
+def _band(state: State, record: Record) -> list[Look]:
+    """An oscillator driven by noise: amplitude, frequency and width are fitted."""
+    n = state.y.size
+    w = np.nan_to_num(state.whitened)
+    count = int(np.isfinite(state.y).sum())
+    power = np.abs(rfft(w)) ** 2 / count
+    low = max(4, math.ceil(10.0 * TURNS_LEAST))
+    best: tuple[float, int, int] | None = None
+    for width in BAND_WIDTHS:
+        if width > power.size // 8:
+            break
+        mean = uniform_filter1d(power, width, mode="reflect")
+        gain = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
+        gain[: low + width] = 0.0
+        at = int(np.argmax(gain))
+        if best is None or gain[at] > best[0]:
+            best = (float(gain[at]), at, width)
+    if best is None:
+        return []
+    ln_places = math.log(max(1.0, 0.5 * count)) + 1.0
+    if net(best[0], 2, ln_places) < BAND_LEAST or len(state.extras.bands) >= BANDS_MOST:
+        return []
+    f, width_hz = best[1] / (n * state.dt), best[2] / (n * state.dt)
+    extras = replace(state.extras, bands=(*state.extras.bands, f))
+    k = len(state.extras.bands)
+    terms = replace(state.best.terms, bands=extras.bands)
+    start = moved(state.best, terms)
+    start[terms.names.index(f"ln_band{k}")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
+    start[terms.names.index(f"ln_width{k}")] = math.log(max(1.1e-4, 0.3 * width_hz))
+    chosen = fit(state.series, terms, start, step=0.5)
+    gain_of_fit = chosen.ln_likelihood - state.best.ln_likelihood
+    worth = net(gain_of_fit, 3, ln_places)
+    if worth < 1.0:
+        return []
+    centre = f * math.exp(chosen.value(f"shift{k}"))
+    half_width = math.exp(chosen.value(f"ln_width{k}"))
+    rms = chosen.sigma * math.exp(chosen.value(f"ln_band{k}"))
+    turns = max(1.0, half_width * n * state.dt)
+    fits = tuple(one for one in (*state.fits, chosen))
+    return [
+        Look(
+            "periodic",
+            gain_of_fit,
+            worth,
+            {
+                "frequency_hz": interval(centre, half_width / math.sqrt(turns), "Hz"),
+                "amplitude": interval(rms * math.sqrt(2.0), rms / math.sqrt(turns), state.unit),
+                "width_hz": interval(half_width, half_width / math.sqrt(turns), "Hz"),
+            },
+            {"extras": extras, "fits": fits},
+            shown_by="band",
+        )
+    ]
+
+
+def _line(state: State, record: Record) -> list[Look]:
+    """The strongest line, refitted exactly at its best frequency."""
+    n = state.y.size
+    w = np.nan_to_num(state.whitened)
+    padded = next_fast_len(4 * n, real=True)
+    power = np.abs(rfft(w, padded)) ** 2 / np.isfinite(state.y).sum()
+    frequency = np.arange(power.size) / (padded * state.dt)
+    low = TURNS_LEAST / (n * state.dt)
+    power[(frequency < low) | (frequency > 0.5 / state.dt - low)] = 0.0
+    at = int(np.argmax(power))
+    ln_places = math.log(max(1.0, 0.5 * n)) + 0.7
+    if power[at] < ln_places:
+        return []
+    t = record.time_s
+
+    def columns(f: float) -> Array:
+        turns = 2.0 * math.pi * np.mod(f * t, 1.0)
+        return np.array([np.sin(turns), np.cos(turns)])
+
+    width = 1.0 / (n * state.dt)
+
+    def cost(f: float) -> float:
+        turns = np.exp(-2j * math.pi * np.mod(f * t, 1.0))
+        return -float(np.abs(turns @ w) ** 2)
+
+    f = float(
+        minimize_scalar(
+            cost,
+            bounds=(frequency[at] - 0.5 * width, frequency[at] + 0.5 * width),
+            method="bounded",
+            options={"xatol": 1e-4 * width},
+        ).x
+    )
+    pair = columns(f)
+    gain, chosen = state.with_columns(pair)
+    if f < 30.0 / (n * state.dt):
+        gain = min(gain, state.rich_gain(pair))
+    worth = net(gain, 2, ln_places)
+    if worth < 1.0:
+        return []
+    a, b = chosen.c[-2:]
+    amplitude = math.hypot(a, b)
+    sd = float(np.mean(chosen.sd[-2:]))
+    # Information of the frequency: pi^2 n T^2 A^2 / (3 s^2) per unit of 1/T.
+    spread = sd / max(amplitude, 1e-300) * math.sqrt(6.0) / (2.0 * math.pi * n * state.dt) * math.sqrt(2.0)
+    name = f"line_{f:.6g}Hz"
+    entry = {"kind": "periodic", "frequency_hz": f}
+    added = (
+        Regressor(f"{name}.sin", "periodic", pair[0], "1", entry),
+        Regressor(f"{name}.cos", "periodic", pair[1], "1", entry),
+    )
+    return [
+        Look(
+            "periodic",
+            gain,
+            worth,
+            {"frequency_hz": interval(f, spread, "Hz"), "amplitude": interval(amplitude, sd, state.unit)},
+            {"regressors": (*state.regressors, *added)},
+        )
+    ]

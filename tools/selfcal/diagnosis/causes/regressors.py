@@ -1,0 +1,117 @@
+"""Temperature, supply, another axis and a ramp: known columns that enter a reading times a constant."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.stats import chi2
+
+from selfcal.diagnosis.fit import run
+from selfcal.diagnosis.record import Record, smoothed
+from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, net
+from selfcal.diagnosis.statemodel import Array
+from selfcal.regressors import coefficient_unit
+
+#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does.
+SMOOTHING_S = (1.0, 10.0, 60.0)
+#: Bands of equal information that must agree on another axis' coefficient.
+BANDS = 16
+#: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
+LN_SMOOTHINGS = math.log(2.0)
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """One look for every column that the model does not have yet."""
+    found: list[Look] = []
+    known = {one.name for one in state.regressors}
+    t = record.time_s
+    middle = 0.5 * t[-1]
+    if "time" not in known:
+        found += _linear(
+            state, "ramp", [Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})], "slope"
+        )
+    for cause, values in record.channels.items():
+        if cause in known:
+            continue
+        unit = {"temperature": "degC", "supply": "V"}[cause]
+        column = record.channel_names[cause]
+        options = []
+        for width in SMOOTHING_S:
+            window = max(1, round(width * record.rate_hz))
+            smooth = smoothed(values, window)
+            reference = float(np.round(smooth.mean(), 3))
+            entry = {"kind": "column", "column": column, "unit": unit, "reference": reference}
+            options.append(Regressor(cause, cause, smooth - reference, unit, entry))
+            if window >= 60.0 * record.rate_hz or window >= values.size // 10:
+                break
+        found += _linear(state, cause, options, "coefficient", LN_SMOOTHINGS)
+    others = record.other_axes(state.axis)
+    options = [
+        Regressor(
+            f"axis_{name}",
+            "cross_axis",
+            values,
+            record.axes[name].unit,
+            {"kind": "column", "column": name, "unit": record.axes[name].unit, "reference": 0.0},
+        )
+        for name, values in others.items()
+        if f"axis_{name}" not in known and np.ptp(values) > 0.0
+    ]
+    if options:
+        found += _linear(state, "cross_axis", options, "coefficient", math.log(len(options)))
+    return found
+
+
+def _inconstancy(state: State, column: Array) -> float:
+    """-ln p of a coefficient that is the same at every frequency.
+
+    A reading that follows another axis does so at all frequencies alike. Two axes that share a line, a temperature or a
+    shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
+    Bands hold equal information; in each the coefficient is estimated by itself.
+    """
+    fit = state.best
+    _, white, _ = run(state.series.beside(column), fit.terms, fit.theta, innovations=True)
+    white = np.nan_to_num(white)
+    q, _ = np.linalg.qr(white[:, 1:-1])
+    u = white[:, -1] - q @ (q.T @ white[:, -1])
+    w = white[:, 0] - q @ (q.T @ white[:, 0])
+    c = float(u @ w) / float(u @ u)
+    U, W = rfft(u), rfft(w - c * u)
+    A, B = np.abs(U) ** 2, (np.conj(U) * W).real
+    edges = np.searchsorted(np.cumsum(A) / A.sum(), np.linspace(0.0, 1.0, BANDS + 1)[1:-1])
+    edges = np.unique(np.concatenate([[0], edges + 1, [A.size]]))
+    information = np.add.reduceat(A, edges[:-1])
+    score = np.add.reduceat(B, edges[:-1])
+    # The transform doubles every bin but the first: half of the bins' power is in the real part.
+    noise = float(np.var(w - c * u)) * u.size / 2.0
+    chi = float((score**2 / np.maximum(information, 1e-300)).sum()) / noise
+    freedom = information.size - 1
+    return float(-chi2.logsf(chi, freedom)) if freedom > 0 else 0.0
+
+
+def _linear(state: State, cause: str, options: list[Regressor], key: str, ln_looks: float = 0.0) -> list[Look]:
+    usable = [one for one in options if np.ptp(one.values) > 0.0]
+    if not usable:
+        return []
+    screen = state.scores(np.array([one.values for one in usable]))
+    if screen.max() < SCREEN:
+        return []
+    chosen = usable[int(np.argmax(screen))]
+    gain, fit = state.with_columns(chosen.values)
+    worth = net(gain, 1, ln_looks)
+    if worth < 1.0:
+        return []
+    if cause == "cross_axis":
+        if net(gain, 1, ln_looks) > 3.0 and _inconstancy(state, chosen.values) > NET_LEAST:
+            return []
+    else:
+        gain = min(gain, state.rich_gain(chosen.values))
+        worth = net(gain, 1, ln_looks)
+    unit = coefficient_unit(state.unit, chosen.unit)
+    estimate: dict[str, Any] = {key: interval(float(fit.c[-1]), float(fit.sd[-1]), unit)}
+    if cause == "cross_axis":
+        estimate["other"] = chosen.name.removeprefix("axis_")
+    return [Look(cause, gain, worth, estimate, {"regressors": (*state.regressors, chosen)})]

@@ -1,0 +1,116 @@
+"""The JSON of `diagnose` (schema selfcal.diagnose/1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from selfcal import units as unit_module
+from selfcal.diagnosis import findable, words
+from selfcal.diagnosis.loop import Diagnosed, Finding
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.score import gain, inflation
+from selfcal.recording import Recording
+
+SCHEMA = "selfcal.diagnose/1"
+
+
+def to_document(
+    recording: Recording, record: Record, found: Mapping[str, Diagnosed], model: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The document, in the units of the recording's columns. `model`: the extended model file's tree."""
+    return {
+        "schema": SCHEMA,
+        "recording": {
+            "path": str(recording.path),
+            "rate_hz": recording.rate_hz,
+            "samples": recording.samples,
+            "duration_s": recording.duration_s,
+        },
+        "axes": {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()},
+        "model": dict(model),
+    }
+
+
+def _axis(one: Diagnosed, record: Record, unit: str) -> dict[str, Any]:
+    factor = unit_module.factor(one.state.unit, unit)
+    findings = sorted(one.findings, key=lambda finding: finding.look.gain, reverse=True)
+    after = {row.name: row for row in one.after}
+    return {
+        "unit": unit,
+        "verdict": "adequate" if one.adequate else "inadequate",
+        "findings": [_finding(finding, record, factor, unit) for finding in findings],
+        "not_found": _not_found(one, record, factor, unit),
+        "discrepancies": [
+            {
+                "statistic": row.name,
+                "measured": row.measured,
+                "simulated_q005": row.q005,
+                "simulated_q995": row.q995,
+                "p": row.p,
+                "after": None
+                if row.name not in after
+                else {
+                    "measured": after[row.name].measured,
+                    "simulated_q005": after[row.name].q005,
+                    "simulated_q995": after[row.name].q995,
+                    "p": after[row.name].p,
+                },
+            }
+            for row in one.before
+            if not row.q005 <= row.measured <= row.q995
+        ],
+    }
+
+
+def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict[str, Any]:
+    look = finding.look
+    inner = finding.before.unit
+    held_out, reason = gain(look, finding.before, finding.after, record)
+    if held_out is not None:
+        held_out["bias_rmse"]["unit"] = unit
+        for row in held_out["bias_rmse"]["horizon_s"].values():
+            row.update({key: value * factor for key, value in row.items()})
+        # A density per unit: its logarithm moves with the unit.
+        for key in ("before", "after"):
+            held_out["log_score_per_sample"][key] -= math.log(factor)
+    factors = inflation(finding.before, finding.after)
+    estimate = {key: _in_unit(value, inner, factor, unit) for key, value in look.estimate.items()}
+    return {
+        "cause": look.cause,
+        "words": words.sentence(look.cause, estimate),
+        "evidence_gain_nats": look.gain,
+        "net_nats": look.net,
+        "estimate": estimate,
+        "when": list(look.when) if look.when else None,
+        "found_in_round": finding.round,
+        "also_possible": list(finding.also_possible),
+        "record_next": words.NEXT[look.cause],
+        "shared_with": list(finding.shared_with),
+        "gain": held_out,
+        **({} if reason is None else {"gain_reason": reason}),
+        "inflation": dict(factors),
+        "inflation_words": words.inflation_sentence(factors),
+    }
+
+
+def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
+    rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
+    for row in rows:
+        sizes = row["would_have_been_found"]
+        row["would_have_been_found"] = {
+            key: _in_unit(value, one.state.unit, factor, unit) for key, value in sizes.items()
+        }
+    return rows
+
+
+def _in_unit(value: Any, inner: str, factor: float, unit: str) -> Any:
+    """An interval in the recording's unit where its own begins with the axis' one."""
+    if not isinstance(value, Mapping):
+        return value
+    own = str(value["unit"])
+    if own != inner and not own.startswith(f"{inner}/"):
+        return dict(value)
+    scaled = {key: entry * factor for key, entry in value.items() if key != "unit"}
+    return {**scaled, "unit": unit + own[len(inner) :]}

@@ -1,0 +1,168 @@
+"""Maximum likelihood of a noise model with regressors, by one Kalman filter over the record and every column."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from selfcal import _likelihood
+from selfcal.diagnosis.statemodel import Array, Terms, matrices
+
+#: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
+FTOL = 0.01
+
+
+@dataclass(frozen=True)
+class Series:
+    """One axis on an even grid: `y` float64[n] (NaN: missing), `dt` s, `r` float64[n] variance of the white noise
+    relative to the nominal one. `columns` [p, n] of known disturbances; the first is the bias, all ones."""
+
+    y: Array
+    dt: float
+    r: Array
+    columns: Array
+
+    @property
+    def n(self) -> int:
+        return int(np.isfinite(self.y).sum())
+
+    @property
+    def duration_s(self) -> float:
+        return self.y.size * self.dt
+
+    def beside(self, more: Array) -> Series:
+        """The same with further columns [k, n]."""
+        return replace(self, columns=np.ascontiguousarray(np.vstack([self.columns, np.atleast_2d(more)])))
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What one pass of the filter leaves: Gram matrix [1 + p, 1 + p] of the whitened record and columns, sum of ln s,
+    samples used."""
+
+    G: Array
+    D: float
+    n: float
+    x: Array  # [1 + p, states]: predicted state of the next sample, of the record and of each column
+
+    def coefficients(self) -> tuple[Array, Array, float]:
+        """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares."""
+        A, B = self.G[1:, 1:], self.G[1:, 0]
+        scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
+        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
+        c = inverse @ B
+        return c, inverse, max(float(self.G[0, 0] - B @ c), 1e-300)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
+    standard deviations `sd`, and `ln_likelihood` at its maximum."""
+
+    terms: Terms
+    theta: Array
+    sigma: float
+    c: Array
+    sd: Array
+    ln_likelihood: float
+    n: float
+    dt: float
+    duration_s: float
+
+    def value(self, name: str) -> float:
+        """One parameter of the vector."""
+        return float(self.theta[self.terms.names.index(name)])
+
+
+def run(
+    series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
+) -> tuple[list[Sums], Array, Array]:
+    """One pass; sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their variances [n]."""
+    m = matrices(terms, theta, series.dt, series.duration_s)
+    at = list(marks) or [series.y.size]
+    G, D, n, x, white, s = _likelihood.run(
+        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, at, innovations
+    )
+    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
+
+
+def ln_likelihood(sums: Sums) -> float:
+    """At the best sigma and coefficients."""
+    rss = sums.coefficients()[2]
+    return -0.5 * (sums.n * (math.log(2.0 * math.pi * rss / sums.n) + 1.0) + sums.D)
+
+
+def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 0.7) -> Fit:
+    """Best `theta` by the simplex method from `start`, or from the best of a few starts."""
+    limits = np.array(terms.limits(series.dt)).reshape(-1, 2)
+
+    def cost(theta: Array) -> float:
+        outside = np.maximum(limits[:, 0] - theta, 0.0) + np.maximum(theta - limits[:, 1], 0.0)
+        inside = np.clip(theta, limits[:, 0], limits[:, 1])
+        return -ln_likelihood(run(series, terms, inside)[0][0]) + float((outside**2).sum()) * 1e3
+
+    if not terms.names:
+        return finish(series, terms, np.empty(0))
+    starts = [start] if start is not None else _starts(terms, limits)
+    theta = min(starts, key=cost) if len(starts) > 1 else starts[0]
+    theta = np.clip(theta, limits[:, 0], limits[:, 1])
+    simplex = np.vstack([theta, *(theta + _step(theta, limits, k, step) for k in range(theta.size))])
+    found = minimize(
+        cost,
+        theta,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "fatol": FTOL, "xatol": 0.05, "maxfev": 60 * theta.size + 40},
+    )
+    return finish(series, terms, np.clip(found.x, limits[:, 0], limits[:, 1]))
+
+
+def finish(series: Series, terms: Terms, theta: Array) -> Fit:
+    """The fit at given parameters."""
+    sums = run(series, terms, theta)[0][0]
+    c, inverse, rss = sums.coefficients()
+    sigma = math.sqrt(rss / sums.n)
+    sd = sigma * np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    return Fit(terms, theta, sigma, c, sd, ln_likelihood(sums), sums.n, series.dt, series.duration_s)
+
+
+def _step(theta: Array, limits: Array, k: int, step: float) -> Array:
+    move = np.zeros(theta.size)
+    size = step * (0.05 if limits[k, 1] - limits[k, 0] < 1.0 else 1.0)
+    move[k] = size if theta[k] + size <= limits[k, 1] else -size
+    return move
+
+
+_GUESSES: dict[str, tuple[float, ...]] = {
+    "ln_rho": (-6.0, -4.0, -2.0),
+    "ln_markov": (-3.0, -1.5, 0.0),
+    "ln_alpha": (-7.0, -5.0, -3.0),
+    "ln_flicker": (-3.0, -1.5),
+    "color": (0.3, -0.3),
+}
+
+
+def _starts(terms: Terms, limits: Array) -> list[Array]:
+    """All combinations of a few guesses a parameter; further ones at the middle of their limits."""
+    grids = [_GUESSES.get(name, (0.5 * (low + high),)) for name, (low, high) in zip(terms.names, limits, strict=True)]
+    if len(grids) > 3:
+        grids = [guess[: 2 if k < 2 else 1] for k, guess in enumerate(grids)]
+    mesh = np.meshgrid(*grids, indexing="ij")
+    return [np.array(point) for point in zip(*(axis.ravel() for axis in mesh), strict=True)]
+
+
+def best(fits: Sequence[Fit]) -> Fit:
+    """The likeliest."""
+    return max(fits, key=lambda one: one.ln_likelihood)
+
+
+def moved(fit_: Fit, terms: Terms, other: Fit | None = None) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, then those of `other`; new ones begin
+    small."""
+    known = {} if other is None else dict(zip(other.terms.names, other.theta, strict=True))
+    known |= dict(zip(fit_.terms.names, fit_.theta, strict=True))
+    fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
+    return np.array([known.get(name, fresh.get(name, -2.0 if name.startswith("ln_") else 0.0)) for name in terms.names])

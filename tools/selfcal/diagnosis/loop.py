@@ -1,0 +1,198 @@
+"""The loop: fit, show what does not fit, name the cause, put it into the model, look again until nothing stands out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from selfcal.diagnosis import integrity
+from selfcal.diagnosis.causes import noise, periodic, regressors, step
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, Look, State
+from selfcal.diagnosis.statistics import Statistic, combined, judged
+
+#: Causes that one round tries on an axis.
+LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
+    regressors.looks,
+    step.looks,
+    periodic.looks,
+    noise.colored,
+    noise.flicker,
+    noise.variance_change,
+    noise.outliers,
+)
+#: Those that motion must not be taken for, and what they must show to be taken first.
+STATIONARY = (periodic.looks, noise.colored)
+CERTAIN = 50.0
+#: Rounds at most: a recording that holds more is told as it is then.
+ROUNDS = 10
+#: Two causes whose worth differs by less than this, nats, cannot be told apart.
+ALIKE = 3.0
+#: The statistics together call an axis inadequate by chance once in so many records.
+P_UNEXPLAINED = 1.5e-3
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One named cause on one axis."""
+
+    look: Look
+    round: int
+    before: State
+    after: State
+    also_possible: tuple[str, ...] = ()
+    shared_with: tuple[str, ...] = ()
+
+
+@dataclass
+class Diagnosed:
+    """One axis after the loop: what it began as, what it is, and what was found."""
+
+    first: State
+    state: State
+    findings: list[Finding] = field(default_factory=list)
+    before: list[Statistic] = field(default_factory=list)
+    after: list[Statistic] = field(default_factory=list)
+    refused: list[Look] = field(default_factory=list)
+
+    @property
+    def adequate(self) -> bool:
+        return not self.findings
+
+
+def diagnose_record(
+    record: Record, axes: Sequence[str], advance: Callable[[str], None] = lambda text: None
+) -> dict[str, Diagnosed]:
+    """Walk the loop on every axis of `axes`; the others of the record serve as side channels."""
+    states: dict[str, State] = {}
+    for name, state in record.axes.items():
+        advance(f"{name}: fit")
+        states[name] = state.refit()
+    record = replace(record, axes=states)
+    found = {name: Diagnosed(states[name], states[name]) for name in axes}
+    # Lines and colour first: motion is what stands out of the noise once these are known.
+    for name in states:
+        one = found.get(name) or Diagnosed(states[name], states[name])
+        _rounds(record, one, advance, STATIONARY, CERTAIN)
+        states[name] = one.state
+    record = replace(record, axes=states)
+    record = _integrity(record, found)
+    for name in axes:
+        _rounds(record, found[name], advance)
+    _directions(record, found)
+    _share(found)
+    for name in axes:
+        advance(f"{name}: statistics")
+        _unexplained(found[name])
+        one = found[name]
+        one.before = judged(one.first, seed=1) if one.findings else one.after
+    return found
+
+
+def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+    gone = integrity.missing(record)
+    if gone is not None and gone[1].any():
+        masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
+        record = replace(record, axes=masked)
+    states = dict(record.axes)
+    moved = integrity.motion(record)
+    if moved:
+        mask = next(iter(moved.values()))[1]
+        for name in states:
+            states[name] = integrity.masked(states[name], mask).refit()
+    for name, one in found.items():
+        if name in moved:
+            one.findings.append(
+                Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
+            )
+        if gone is not None:
+            one.findings.append(Finding(gone[0], 0, one.state, states[name]))
+    for name in states:
+        clipped = integrity.saturation(states[name])
+        if clipped is not None:
+            if name in found:
+                found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
+            states[name] = clipped[1]
+        lattice = integrity.quantization(states[name])
+        if lattice is not None:
+            before = states[name]
+            states[name] = replace(before, stated_lsb=before.lsb)
+            if name in found:
+                found[name].findings.append(Finding(lattice, 0, before, states[name]))
+        if name in found:
+            found[name].state = states[name]
+    return replace(record, axes=states)
+
+
+def _rounds(
+    record: Record,
+    one: Diagnosed,
+    advance: Callable[[str], None],
+    causes: tuple[Callable[[State, Record], list[Look]], ...] = LOOKS,
+    least: float = NET_LEAST,
+) -> None:
+    first = 1 + max((finding.round for finding in one.findings), default=0)
+    for number in range(first, ROUNDS + 1):
+        advance(f"{one.state.axis}: round {number}")
+        looks = sorted(
+            (look for cause in causes for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
+        )
+        one.refused = looks
+        if not looks or looks[0].net < least:
+            return
+        best = looks[0]
+        rivals = tuple(
+            dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
+        )
+        before, one.state = one.state, one.state.refit(**best.changes)
+        one.findings.append(Finding(best, number, before, one.state, also_possible=rivals))
+
+
+def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """Two axes that each blame the other: the reading that follows is the one that gains more by it."""
+    pairs = {
+        (name, str(finding.look.estimate["other"])): finding
+        for name, one in found.items()
+        for finding in one.findings
+        if finding.look.cause == "cross_axis"
+    }
+    for (name, other), finding in pairs.items():
+        back = pairs.get((other, name))
+        if back is not None and back.look.gain > finding.look.gain:
+            found[name].findings.remove(finding)
+
+
+def _share(found: Mapping[str, Diagnosed]) -> None:
+    """The same cause on several axes is one finding with its size on each."""
+    for name, one in found.items():
+        for k, finding in enumerate(one.findings):
+            others = tuple(
+                other
+                for other, two in found.items()
+                if other != name and any(_same(finding.look, more.look) for more in two.findings)
+            )
+            one.findings[k] = replace(finding, shared_with=tuple(dict.fromkeys((*finding.shared_with, *others))))
+
+
+def _same(a: Look, b: Look) -> bool:
+    if a.cause != b.cause:
+        return False
+    if a.cause == "step":
+        return a.when is not None and b.when is not None and abs(a.when[0] - b.when[0]) < 30.0
+    if a.cause == "periodic":
+        f, g = a.estimate["frequency_hz"]["median"], b.estimate["frequency_hz"]["median"]
+        return bool(abs(f / g - 1.0) < 0.01)
+    return a.cause in ("temperature", "supply", "motion", "missing_samples")
+
+
+def _unexplained(one: Diagnosed) -> None:
+    one.after = judged(one.state, seed=1)
+    p = combined(one.after)
+    if p < P_UNEXPLAINED:
+        worst = one.after[0]
+        nats = min(1e6, -math.log(max(p, 1e-300)))
+        look = Look(
+            "unexplained", nats, nats, {"statistic": worst.name, "measured": worst.measured}, {}, shown_by=worst.name
+        )
+        one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))

@@ -1,0 +1,555 @@
+"""The page of `selfcal diagnose --report`: one file that loads nothing, with pictures and the tables behind them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import selfcal
+from selfcal import units as unit_module
+from selfcal.diagnosis import pictures
+from selfcal.diagnosis.chart import Figure, draw, number, scrolled
+from selfcal.diagnosis.loop import Diagnosed, Finding
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.words import WORDS
+from selfcal.errors import UserError
+
+#: Bytes of the page without its style, at most.
+SIZE_MOST = 990_000
+LEFT_OUT = "<p>This picture is left out to keep the page small: ask for this axis alone with <code>--axis</code>.</p>"
+#: Findings told at the top of the page at most; the rest stand below.
+TOP = 40
+
+STYLE = """
+:root{color-scheme:light dark;--paper:#fff;--ink:#1b1f24;--soft:#555e68;--rule:#ccd2d9;--card:#f5f7f9;--blue:#0b4f9e;
+--band:#e9b44c;--edge:#7a5200;--bad:#9b1c1c;--good:#1b6533;--fit:#9b1c6b}
+@media(prefers-color-scheme:dark){:root{--paper:#14171a;--ink:#e8eaed;--soft:#aab3bd;--rule:#3d454e;--card:#1e2328;
+--blue:#7db7ff;--band:#7a5b16;--edge:#e5bd62;--bad:#ff9d94;--good:#86d8a0;--fit:#ff9bdc}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.5 system-ui,sans-serif}
+header,main,footer{max-width:1180px;margin:0 auto;padding:0 16px}
+h1{font-size:1.7rem;line-height:1.2;margin:1.2rem 0 .4rem;overflow-wrap:anywhere}
+h2{font-size:1.35rem;margin:2.4rem 0 .6rem;padding-top:.5rem;border-top:2px solid var(--rule)}
+h3{font-size:1.1rem;margin:1.6rem 0 .4rem}
+h4{font-size:1rem;margin:1rem 0 .3rem}
+p{margin:.4rem 0;max-width:75ch}
+a{color:var(--blue)}
+a:focus-visible,summary:focus-visible,.scroll:focus-visible,pre:focus-visible{outline:3px solid var(--blue);
+outline-offset:2px}
+.skip{position:absolute;left:-999px}.skip:focus{left:8px;top:8px;background:var(--paper);padding:8px}
+.soft{color:var(--soft)}
+.bad,.good{font-weight:700}.bad{color:var(--bad)}.good{color:var(--good)}
+nav ul,.findings{padding-left:1.2rem}nav ul{display:flex;flex-wrap:wrap;gap:.2rem 1.5rem;list-style:none;padding:0}
+.findings li{margin:.5rem 0;max-width:85ch}
+.finding{background:var(--card);border:1px solid var(--rule);border-radius:8px;padding:.2rem 16px 12px;margin:1rem 0}
+.finding h3{margin-top:.8rem}
+dl{display:grid;grid-template-columns:minmax(8rem,max-content) 1fr;gap:.2rem 1rem;margin:.6rem 0}
+dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
+figure{margin:.8rem 0;min-width:0}
+.panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,290px),1fr));gap:.5rem 1rem;max-width:860px}
+.panels svg{width:100%;max-width:420px;height:auto;display:block}
+@media(min-width:1150px){figure{display:grid;grid-template-columns:minmax(0,3fr) minmax(0,1fr);gap:0 1.2rem}
+figure details{grid-column:1/-1}.key{display:block;white-space:normal;margin:.4rem 0 0}figcaption{padding-top:1.6rem}}
+svg text{fill:var(--ink);font-size:12.5px;font-family:inherit}
+svg .name{font-weight:700;font-size:13.5px}
+svg .tick{fill:var(--soft)}
+path{fill:none;vector-effect:non-scaling-stroke}
+.grid{stroke:var(--rule);stroke-width:1}
+.measured{stroke:var(--blue);stroke-width:1.8}
+.fitted{stroke:var(--fit);stroke-width:2.6;stroke-dasharray:7 4}
+.dots{fill:var(--blue)}
+.simulated{fill:var(--band);fill-opacity:.45;stroke:var(--edge);stroke-width:1;stroke-dasharray:3 2}
+.spread{fill:var(--soft);fill-opacity:.3}
+.mark{stroke:var(--ink);stroke-width:1.2;stroke-dasharray:1 3}
+figcaption{font-size:.88rem;color:var(--soft)}
+.key{white-space:nowrap;margin-left:.7rem;color:var(--ink)}
+.key svg{width:28px;height:16px;vertical-align:-3px;margin-right:.3rem}
+details{margin:.4rem 0}summary{cursor:pointer;padding:.25rem 0;font-size:.92rem}
+.scroll{overflow-x:auto;max-width:100%;margin:.4rem 0}
+table{border-collapse:collapse;font-size:.88rem;font-variant-numeric:tabular-nums}
+caption{text-align:left;color:var(--soft);padding:.2rem 0}
+caption span{display:inline-block;position:sticky;left:0;max-width:min(75ch,82vw)}
+th,td{border-bottom:1px solid var(--rule);padding:.25rem .7rem .25rem 0;text-align:left;vertical-align:top}
+thead th{border-bottom-width:2px}
+@media(max-width:600px){main>section>.scroll td{min-width:7.5rem}}
+pre{overflow-x:auto;background:var(--card);border:1px solid var(--rule);padding:10px;font-size:.85rem}
+code{font-size:.92em;overflow-wrap:anywhere}
+@media(max-width:600px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}.finding{padding:.2rem 10px 10px}}
+@media print{details{display:none}}
+"""
+
+
+def write_page(path: Path | str, document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
+    text = page(document, record, found)
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            Path(name).chmod(0o666 & ~_umask())
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the report: {error.strerror or error}") from error
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> str:
+    """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and `found`.
+
+    The same arguments give the same page: the simulated records of the bands have a fixed seed."""
+    name = Path(str(document["recording"]["path"])).name
+    body = _body(document, record, found)
+    parts = [
+        "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width,initial-scale=1'>",
+        # No request is made whatever a file's text holds.
+        "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline'\">",
+        f"<title>Diagnosis of {escape(name)}</title><style>{STYLE}</style></head><body>",
+        "<a class=skip href='#findings'>Skip to the findings</a>",
+        *_head(document, record, name),
+        "<main>",
+        *body,
+        "</main>",
+        *_foot(),
+        "</body></html>",
+    ]
+    return "".join(parts)
+
+
+def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    axes: Mapping[str, Mapping[str, Any]] = document["axes"]
+    sections: list[list[_Part]] = []
+    for k, (axis, entry) in enumerate(axes.items()):
+        sections.append(list(_axis(k, axis, entry, record, found[axis])))
+    rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading()]
+    parts = [_Part(text) for text in (*_summary(axes), *_contents(axes))]
+    parts += [part for section in sections for part in section]
+    parts += [_Part(text) for text in rest]
+    return _within(parts, SIZE_MOST)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A piece of HTML. `nats`: the evidence of the finding that it pictures; infinite for what the page must have."""
+
+    text: str
+    nats: float = math.inf
+
+
+def _within(parts: Sequence[_Part], most: int) -> list[str]:
+    """The texts, without pictures of the weakest findings if they would go beyond `most` bytes."""
+    size = sum(len(part.text.encode()) for part in parts)
+    dropped: set[int] = set()
+    for k in sorted(range(len(parts)), key=lambda k: parts[k].nats):
+        if size <= most or math.isinf(parts[k].nats):
+            break
+        size -= len(parts[k].text.encode()) - len(LEFT_OUT)
+        dropped.add(k)
+    return [LEFT_OUT if k in dropped else part.text for k, part in enumerate(parts)]
+
+
+def _head(document: Mapping[str, Any], record: Record, name: str) -> Iterator[str]:
+    recording = document["recording"]
+    means = f", looked at as means at {number(record.rate_hz)} Hz" if _decimated(document, record) else ""
+    yield f"<header><h1>Diagnosis of {escape(name)}</h1>"
+    yield (
+        f"<p class=soft>{recording['samples']} samples at {number(recording['rate_hz'])} Hz, "
+        f"{number(recording['duration_s'])} s{means}; axes {escape(', '.join(document['axes']))}</p></header>"
+    )
+
+
+def _decimated(document: Mapping[str, Any], record: Record) -> bool:
+    return record.rate_hz < 0.999 * float(document["recording"]["rate_hz"])
+
+
+def _verdict(entry: Mapping[str, Any]) -> str:
+    """With a sign beside the colour."""
+    if entry["verdict"] == "adequate":
+        return "<span class=good>✓ adequate</span>"
+    return f"<span class=bad>✗ {escape(str(entry['verdict']))}</span>"
+
+
+def _cause(cause: str) -> str:
+    return escape(cause.replace("_", " "))
+
+
+def _summary(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    bad = [name for name, entry in axes.items() if entry["verdict"] != "adequate"]
+    good = [name for name in axes if name not in bad]
+    yield "<section aria-labelledby=findings><h2 id=findings>What was found</h2>"
+    if bad:
+        yield (
+            f"<p><span class=bad>✗ Not adequate: {escape(', '.join(bad))}.</span> "
+            "The recording differs from what the model simulates.</p>"
+        )
+    if good:
+        yield (
+            f"<p><span class=good>✓ Adequate: {escape(', '.join(good))}.</span> "
+            "Nothing in the recording speaks against the model.</p>"
+        )
+    groups = _grouped(axes)
+    if groups:
+        yield "<ol class=findings>"
+        for members in groups[:TOP]:
+            yield f"<li>{_told(members)}</li>"
+        yield "</ol>"
+    if len(groups) > TOP:
+        yield f"<p>{len(groups) - TOP} weaker findings are told with their axes below.</p>"
+    yield "</section>"
+
+
+def _grouped(axes: Mapping[str, Mapping[str, Any]]) -> list[list[tuple[str, int, Mapping[str, Any]]]]:
+    """Findings as (axis, number, finding), those that several axes share together; the strongest first."""
+    groups: dict[tuple[Any, ...], list[tuple[str, int, Mapping[str, Any]]]] = {}
+    for axis, entry in axes.items():
+        for k, finding in enumerate(entry["findings"]):
+            shared = tuple(sorted({axis, *(finding.get("shared_with") or ())}))
+            key: tuple[Any, ...] = (finding["cause"], shared)
+            while any(member[0] == axis for member in groups.get(key, ())):
+                key = (*key, k)  # two of one kind on one axis
+            groups.setdefault(key, []).append((axis, k, finding))
+    return sorted(groups.values(), key=lambda members: -max(_nats(member[2]) for member in members))
+
+
+def _nats(finding: Mapping[str, Any]) -> float:
+    value = finding["evidence_gain_nats"]
+    return float(value) if value is not None else math.inf
+
+
+def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
+    """One finding of the summary, with its size on each axis."""
+    findings = [finding for _, _, finding in members]
+    first = findings[0]
+    links = ", ".join(f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>" for axis, k, _ in members)
+    sizes = [_sizes(finding) for finding in findings]
+    if len(set(sizes)) == 1:
+        told = escape(str(first.get("words") or sizes[0]))
+    else:
+        told = f"{escape(WORDS.get(first['cause'], ''))} "
+        told += "; ".join(f"{escape(axis)}: {escape(size)}" for (axis, _, _), size in zip(members, sizes, strict=True))
+        told += "."
+    nats = sorted(_nats(finding) for finding in findings)
+    evidence = _evidence(first) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
+    text = f"<strong>{_cause(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
+    if len(members) == 1 and first.get("inflation_words"):
+        text += f" {escape(str(first['inflation_words']))}"
+    return text
+
+
+def _evidence(finding: Mapping[str, Any]) -> str:
+    text = f"{_whole(_nats(finding))} nats"
+    net = finding.get("net_nats")
+    if net is not None and math.isfinite(net):
+        text += f", {_whole(net)} net of the search"
+    return text
+
+
+def _whole(nats: float) -> str:
+    return f"{nats:.0f}" if 100.0 <= nats < 1e7 else number(nats, 3)
+
+
+def _id(axis: str, k: int) -> str:
+    return f"f-{''.join(c if c.isalnum() else '-' for c in axis)}-{k + 1}"
+
+
+def _sizes(finding: Mapping[str, Any]) -> str:
+    """The estimate: each size with its 90 % interval."""
+    told = []
+    for key, value in finding["estimate"].items():
+        name = _quantity(key)
+        if isinstance(value, Mapping) and "median" in value:
+            unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
+            text = f"{name} {number(value['median'])}{unit}"
+            if value.get("q05") is not None and value["q05"] != value["q95"]:
+                text += f" ({number(value['q05'])} to {number(value['q95'])})"
+        else:
+            text = f"{name} {number(value) if isinstance(value, float) else value}"
+        told.append(text)
+    return ", ".join(told)
+
+
+def _quantity(key: str) -> str:
+    """The name of an estimate without its unit, which stands with the number."""
+    return key.removesuffix("_hz").removesuffix("_s").replace("_", " ")
+
+
+def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    yield "<nav aria-label='On this page'><ul>"
+    for k, (axis, entry) in enumerate(axes.items()):
+        yield f"<li><a href='#axis-{k}'>{escape(axis)}</a> {_verdict(entry)}</li>"
+    for key, title in (("gain", "Gain"), ("not-found", "Not found"), ("again", "Reproduce"), ("read", "How to read")):
+        yield f"<li><a href='#{key}'>{title}</a></li>"
+    yield "</ul></nav>"
+
+
+def _axis(place: int, axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[_Part]:
+    unit = str(entry["unit"])
+    overview, own = pictures.figures(one, record, unit_module.factor(one.state.unit, unit), unit)
+    yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>")
+    for k, finding in enumerate(entry["findings"]):
+        match = _match(finding, one.findings)
+        yield from _finding(_id(axis, k), finding, own[match] if match is not None else [])
+    yield _Part("<h3>Whole record, measured against simulated</h3>")
+    for figure in overview:
+        yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}")
+    yield _Part("".join(_statistics(entry, one)) + "</section>")
+
+
+def _match(finding: Mapping[str, Any], candidates: Sequence[Finding]) -> int | None:
+    """Which finding of the loop the document's is: same cause, nearest evidence."""
+    same = [k for k, one in enumerate(candidates) if one.look.cause == finding["cause"]]
+    if not same:
+        return None
+    return min(same, key=lambda k: abs(candidates[k].look.gain - _nats(finding)))
+
+
+def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure]) -> Iterator[_Part]:
+    words = f"<p>{escape(str(finding['words']))}</p>" if finding.get("words") else ""
+    facts = "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in _facts(finding))
+    yield _Part(f"<div class=finding><h3 id={key}>{_cause(finding['cause'])}</h3>{words}<dl>{facts}</dl>")
+    for figure in shown:
+        yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}", min(_nats(finding), 1e300))
+    yield _Part("</div>")
+
+
+def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and text (HTML) of what is known of a finding."""
+    yield "Size (90 % interval)", escape(_sizes(finding))
+    when = finding.get("when")
+    if when:
+        yield "When", f"{number(when[0], 6)} s" + ("" if when[0] == when[1] else f" to {number(when[1], 6)} s")
+    yield "Evidence", _evidence(finding)
+    if finding.get("shared_with"):
+        yield "Also on", escape(", ".join(finding["shared_with"]))
+    if finding.get("also_possible"):
+        yield "It may also be", ", ".join(_cause(cause) for cause in finding["also_possible"])
+    if finding.get("record_next"):
+        yield "To make sure", escape(str(finding["record_next"]))
+    gain = finding.get("gain")
+    if gain:
+        yield "Held-out gain", f"{_score(gain)} nats a sample"
+    elif finding.get("gain_reason"):
+        yield "Held-out gain", f"none: {escape(str(finding['gain_reason']))}"
+    if finding.get("inflation_words"):
+        yield "Inflation", escape(str(finding["inflation_words"]))
+
+
+def _score(gain: Mapping[str, Any]) -> str:
+    score = gain["log_score_per_sample"]
+    return f"{_signed(score['after'] - score['before'])} ± {number(score['sd'], 2)}"
+
+
+def _signed(value: float) -> str:
+    return ("+" if value >= 0.0 else "") + number(value, 3)
+
+
+def _statistics(entry: Mapping[str, Any], one: Diagnosed) -> Iterator[str]:
+    """Every statistic before and after, those outside their band first."""
+    if not one.before:
+        return
+    after = {row.name: row for row in one.after}
+    rows = []
+    outside = [0, 0]
+    for row in sorted(one.before, key=lambda row: (row.q005 <= row.measured <= row.q995, row.p)):
+        later = after.get(row.name)
+        cells = f"<th scope=row>{escape(row.name.replace('_', ' '))}</th>"
+        for side, this in enumerate((row, later)):
+            if this is None:
+                cells += "<td>–</td><td>–</td><td>–</td>"
+                continue
+            out = not this.q005 <= this.measured <= this.q995
+            outside[side] += out
+            sign = "<span class=bad>✗ outside</span>" if out else "inside"
+            cells += f"<td>{number(this.measured, 3)}</td><td>{number(this.q005, 3)} to {number(this.q995, 3)}</td>"
+            cells += f"<td>{sign}</td>"
+        rows.append(f"<tr>{cells}</tr>")
+    name = "Statistics of the residual innovations"
+    yield (
+        f"<h3>{name}</h3><p>{outside[0]} of {len(one.before)} lie outside their simulated band of 99 % before, "
+        f"{outside[1]} of {len(one.after)} after. By chance about one in a hundred does.</p>"
+    )
+    sides = "".join(f"<th scope=colgroup colspan=3>{side}</th>" for side in ("Before", "After"))
+    heads = "<th scope=col>measured</th><th scope=col>simulated</th><th scope=col>verdict</th>" * 2
+    table = (
+        f"<colgroup></colgroup><colgroup span=3></colgroup><colgroup span=3></colgroup>"
+        f"<thead><tr><th scope=col rowspan=2>statistic</th>{sides}</tr><tr>{heads}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody>"
+    )
+    caption = "Before and after the findings are in the model. Simulated: 0.5 to 99.5 %."
+    yield f"<details><summary>Table: {name}</summary>{scrolled(name, caption, table)}</details>"
+
+
+def _gains(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    yield "<section aria-labelledby=gain><h2 id=gain>What naming the causes gains</h2>"
+    rows = [(axis, finding) for axis, entry in axes.items() for finding in entry["findings"]]
+    if not rows:
+        yield "<p>There is no finding, so there is no gain.</p></section>"
+        return
+    horizons: dict[str, None] = {}
+    for _, finding in rows:
+        for horizon in ((finding.get("gain") or {}).get("bias_rmse") or {}).get("horizon_s") or {}:
+            horizons.setdefault(str(horizon))
+    ahead = sorted(horizons, key=float)
+    yield (
+        "<p>Parameters come from the first part of the record. The score is of the later part, each sample predicted "
+        "from earlier ones only. A gain above 0 is a better model.</p>"
+    )
+    heads = "".join(f"<th scope=col>bias error {escape(h)} s ahead, before → after</th>" for h in ahead)
+    body = []
+    for axis, finding in rows:
+        cells = f"<th scope=row>{escape(axis)}: {_cause(finding['cause'])}</th>"
+        gain = finding.get("gain")
+        if not gain:
+            reason = escape(str(finding.get("gain_reason") or "not measured"))
+            body.append(f"<tr>{cells}<td colspan={3 + len(ahead)}>none: {reason}</td></tr>")
+            continue
+        score = gain["log_score_per_sample"]
+        cells += f"<td>{number(score['before'])}</td><td>{number(score['after'])}</td><td>{_score(gain)}</td>"
+        errors = gain.get("bias_rmse") or {}
+        unit = escape(str(errors.get("unit") or ""))
+        for horizon in ahead:
+            row = (errors.get("horizon_s") or {}).get(horizon)
+            cells += (
+                f"<td>{number(row['before'], 3)} → {number(row['after'], 3)} {unit}{_spread(row)}</td>"
+                if row
+                else "<td>–</td>"
+            )
+        body.append(f"<tr>{cells}</tr>")
+    table = (
+        "<thead><tr><th scope=col>finding</th><th scope=col>score before</th><th scope=col>score after</th>"
+        f"<th scope=col>gain</th>{heads}</tr></thead><tbody>{''.join(body)}</tbody>"
+    )
+    caption = (
+        "Log predictive score in nats a sample, and error of the predicted bias (root mean square), "
+        "on time that the fit did not see. ±: one standard deviation."
+    )
+    yield scrolled("Held-out gain", caption, table)
+    yield from _inflation(rows)
+    yield "</section>"
+
+
+def _spread(row: Mapping[str, Any]) -> str:
+    return f" (change ± {number(row['sd'], 2)})" if row.get("sd") is not None else ""
+
+
+def _inflation(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Iterator[str]:
+    """By how much plain noise numbers are off."""
+    told = [(axis, finding, finding["inflation"]) for axis, finding in rows if finding.get("inflation")]
+    if not told:
+        return
+    keys: dict[str, None] = {}
+    for _, _, factors in told:
+        keys.update(dict.fromkeys(factors))
+    yield "<h3>How far plain white noise and random walk numbers are off without the cause</h3>"
+    heads = "".join(f"<th scope=col>{escape(key)} without / with</th>" for key in keys)
+    body = "".join(
+        f"<tr><th scope=row>{escape(axis)}: {_cause(finding['cause'])}</th>"
+        + "".join(f"<td>{_factor(factors.get(key))}</td>" for key in keys)
+        + "</tr>"
+        for axis, finding, factors in told
+    )
+    table = f"<thead><tr><th scope=col>finding</th>{heads}</tr></thead><tbody>{body}</tbody>"
+    yield scrolled("Inflation", "Fitted without the cause, over the same fitted with it.", table)
+
+
+def _factor(value: Any) -> str:
+    if value is None or not math.isfinite(value):
+        return "any factor"
+    return f"{number(float(value), 3)} ×"
+
+
+def _not_found(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    yield "<section aria-labelledby=not-found><h2 id=not-found>Looked for and not found</h2>"
+    sizes: dict[str, dict[str, str]] = {}
+    for axis, entry in axes.items():
+        for row in entry.get("not_found") or ():
+            sizes.setdefault(str(row["cause"]), {})[axis] = _least(row.get("would_have_been_found") or {})
+    if not sizes:
+        yield "<p>No list came with this diagnosis.</p></section>"
+        return
+    yield "<p>A cause of this size or more would have been found here in about half of such records.</p>"
+    heads = "".join(f"<th scope=col>{escape(axis)}</th>" for axis in axes)
+    body = "".join(
+        f"<tr><th scope=row>{_cause(cause)}</th>"
+        + "".join(f"<td>{escape(found.get(axis, 'found: see above'))}</td>" for axis in axes)
+        + "</tr>"
+        for cause, found in sizes.items()
+    )
+    table = f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody>"
+    caption = "Size that would have been found, by cause and axis."
+    yield f"{scrolled('Looked for and not found', caption, table)}</section>"
+
+
+def _least(size: Mapping[str, Any]) -> str:
+    told = []
+    for key, value in size.items():
+        inner = value if isinstance(value, Mapping) else {"value": value}
+        unit = "" if inner.get("unit") in (None, "1") else f" {inner['unit']}"
+        size_of = inner.get("value", inner.get("median"))
+        text = number(float(size_of), 3) if isinstance(size_of, int | float) else str(size_of)
+        told.append(f"{_quantity(key)} {text}{unit}")
+    return ", ".join(told)
+
+
+def _reproduce(document: Mapping[str, Any], record: Record) -> Iterator[str]:
+    log = shlex.quote(str(document["recording"]["path"]))
+    axes = "".join(f" --axis {shlex.quote(axis)}" for axis in document["axes"])
+    rate = f" --decimate {record.rate_hz:g}" if _decimated(document, record) else ""
+    lines = [
+        f"selfcal diagnose {log}{axes}{rate} --report report.html --json report.json --write-model extended.yaml",
+        "selfcal simulate extended.yaml -o simulated.npz --seed 1",
+        "selfcal diagnose simulated.npz",
+        f"selfcal identify {log}{axes} --model extended.yaml",
+    ]
+    yield "<section aria-labelledby=again><h2 id=again>Reproduce it</h2>"
+    yield (
+        f"<p>With selfcal {escape(selfcal.__version__)}. Add the options <code>--model</code>, <code>--rate</code>, "
+        "<code>--column</code>, <code>--unit</code> and <code>--scale</code> if the recording was read with them.</p>"
+    )
+    yield f"<pre tabindex=0 aria-label=Commands role=group><code>{escape(chr(10).join(lines))}</code></pre>"
+    if document.get("model"):
+        plain = json.loads(json.dumps(document["model"], default=float))  # numpy's numbers too
+        text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=100)
+        yield "<details><summary>The extended model file</summary>"
+        yield f"<pre tabindex=0 aria-label='Extended model file' role=group><code>{escape(text)}</code></pre></details>"
+    yield "</section>"
+
+
+def _reading() -> Iterator[str]:
+    yield "<section aria-labelledby=read><h2 id=read>How to read this page</h2>"
+    yield (
+        f"<p>Each band is the range of {pictures.RECORDS} records that were simulated from the fitted model. They have "
+        "the recording's own length, rate, gaps, lattice and limits. A model that fits leaves about one point in ten "
+        "of a curve outside such a range.</p><p>Before: the model without the cause. After: the model with it. "
+        "Residual innovations are the errors of predicting each sample from the earlier ones.</p>"
+        "<p>Evidence is in nats: 10 nats are odds of 22 000 to 1. Net of the search: less what the best of all the "
+        "places looked at gains by chance.</p>"
+    )
+    yield (
+        "<p>Spectra are two-sided densities, so that white noise shows its N. "
+        "A curve has at most 400 points; a table shows every few of them.</p></section>"
+    )
+
+
+def _foot() -> Iterator[str]:
+    yield f"<footer><p class=soft>Made by selfcal {escape(selfcal.__version__)}. This file loads nothing.</p></footer>"

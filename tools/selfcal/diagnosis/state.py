@@ -1,0 +1,160 @@
+"""What is known of one axis at a point of the loop: its record, the model so far, and what a candidate would gain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
+from selfcal.diagnosis.statemodel import Array, Terms
+
+#: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
+P_LOOK = 3e-4
+NET_LEAST = -math.log(P_LOOK)
+#: Score gains below this are not worth a refit: the refit gains about as much.
+SCREEN = 2.0
+
+
+#: No term beside white noise and the drift.
+NONE = Terms()
+
+
+@dataclass(frozen=True)
+class Regressor:
+    """A column that is in an axis' model. `entry` is the model file's (without prior), `unit` the column's."""
+
+    name: str
+    cause: str
+    values: Array
+    unit: str
+    entry: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class State:
+    """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
+
+    `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
+    theirs. `lsb`: the lattice the values lie on (0: none), `stated_lsb` the model file's.
+    """
+
+    axis: str
+    unit: str
+    y: Array
+    dt: float
+    level: float
+    r: Array
+    regressors: tuple[Regressor, ...] = ()
+    extras: Terms = NONE
+    lsb: float = 0.0
+    stated_lsb: float = 0.0
+    fits: tuple[Fit, ...] = ()
+    whitened: Array = field(default_factory=lambda: np.empty(0))
+    variance: Array = field(default_factory=lambda: np.empty(0))
+    causes: tuple[str, ...] = ()
+
+    @property
+    def series(self) -> Series:
+        columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
+        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns))
+
+    @property
+    def best(self) -> Fit:
+        return best(self.fits)
+
+    def bases(self) -> tuple[Terms, ...]:
+        """The drifts that the model may have, with its extras: the paper's laws; walk includes the constant."""
+        return (replace(self.extras, walk=True), replace(self.extras, markov=True))
+
+    def refit(self, **changes: Any) -> State:
+        """The state with `changes`, fitted."""
+        state = replace(self, **changes)
+        series = state.series
+        fits = tuple(_fit_from(series, terms, self.fits) for terms in state.bases())
+        state = replace(state, fits=fits)
+        chosen = state.best
+        _, white, s = run(series, chosen.terms, chosen.theta, innovations=True)
+        residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
+        return replace(state, whitened=residual, variance=s * chosen.sigma**2)
+
+    def with_columns(self, more: Array) -> tuple[float, Fit]:
+        """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
+        series = self.series.beside(more)
+        fits = [_fit_from(series, terms, self.fits) for terms in self.bases()]
+        return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
+
+    def rich_gain(self, more: Array) -> float:
+        """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column."""
+        terms = replace(self.extras, walk=True, markov=True)
+        before = fit(self.series, terms, moved(self.best, terms))
+        after = fit(self.series.beside(more), terms, before.theta)
+        return after.ln_likelihood - max(before.ln_likelihood, self.best.ln_likelihood)
+
+    def scores(self, more: Array) -> Array:
+        """Gain [k] of each further column alone at the fitted drift: one pass for all of them."""
+        found: list[float] = []
+        for at in range(0, len(more), 8):
+            series = self.series.beside(more[at : at + 8])
+            G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
+            known = 1 + len(self.regressors) + 1
+            inner = np.linalg.pinv(G[1:known, 1:known], rcond=1e-12, hermitian=True)
+            for k in range(known, len(G)):
+                cross = G[1:known, k]
+                A = G[k, k] - cross @ inner @ cross
+                B = G[k, 0] - cross @ inner @ G[1:known, 0]
+                found.append(0.5 * B * B / A if 1e-9 * G[k, k] < A and A > 0.0 else 0.0)
+        return np.array(found)
+
+
+def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
+    same = [one for one in known if one.terms == terms]
+    if same:
+        return fit(series, terms, same[0].theta, step=0.5)
+    near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
+    richest = max(known, key=lambda one: len(one.terms.names), default=None)
+    if near and richest is not None:
+        return fit(series, terms, moved(near[0], terms, richest))
+    return fit(series, terms)
+
+
+def net(gain: float, freedom: int = 1, ln_looks: float = 0.0) -> float:
+    """-ln of the probability that noise alone gains as much in the best of exp(ln_looks) looks (capped at 0)."""
+    if gain <= 0.0:
+        return 0.0
+    ln_p = float(chi2.logsf(2.0 * gain, freedom))
+    if not math.isfinite(ln_p):
+        ln_p = -gain
+    return max(0.0, -(ln_p + ln_looks))
+
+
+@dataclass(frozen=True)
+class Look:
+    """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
+    interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be."""
+
+    cause: str
+    gain: float
+    net: float
+    estimate: Mapping[str, Any]
+    changes: Mapping[str, Any]
+    words: str = ""
+    when: tuple[float, float] | None = None
+    shown_by: str = ""
+    others: tuple[str, ...] = ()
+
+
+def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
+    """A posterior that is normal, in the form of the contract."""
+    return {
+        "mean": value,
+        "median": value,
+        "sd": sd,
+        "q05": value - 1.6448536269514722 * sd,
+        "q95": value + 1.6448536269514722 * sd,
+        "unit": unit,
+    }

@@ -1,0 +1,153 @@
+"""Noise models as small state models: which terms a model has, and the matrices that its parameters make.
+
+Everything is relative to the white noise of one sample (standard deviation 1), at the recording's own rate. Parameters
+are a vector of unbounded numbers: logarithms of sizes and rates, atanh of correlations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: A Gauss-Markov drift keeps within these correlation rates, 1/s: faster ones are coloured noise.
+ALPHA_LIMITS = (2e-4, 0.2)
+#: Sizes relative to the white noise of one sample.
+SIZE_LIMITS = (1e-5, 1e2)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The terms of a noise model beside white noise: the drift's, 1/f noise, the colour of the white noise, and narrow
+    bands (oscillators, each about its own `bands` frequency in Hz)."""
+
+    walk: bool = False
+    markov: bool = False
+    flicker: bool = False
+    color: Literal["", "ma", "ar"] = ""
+    bands: tuple[float, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the vector's order."""
+        names: list[str] = []
+        names += ["ln_rho"] if self.walk else []
+        names += ["ln_markov", "ln_alpha"] if self.markov else []
+        names += ["ln_flicker"] if self.flicker else []
+        names += ["color"] if self.color else []
+        for k in range(len(self.bands)):
+            names += [f"ln_band{k}", f"ln_width{k}", f"shift{k}"]
+        return tuple(names)
+
+    def limits(self, dt: float) -> list[tuple[float, float]]:
+        """Low and high of each parameter; dt: sampling interval, s."""
+        size = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
+        found: list[tuple[float, float]] = []
+        for name in self.names:
+            if name == "ln_alpha":
+                found.append((math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])))
+            elif name == "color":
+                found.append((-2.6, 2.6))
+            elif name.startswith("ln_width"):
+                found.append((math.log(1e-4), math.log(0.3 / dt)))
+            elif name.startswith("shift"):
+                found.append((-0.1, 0.1))
+            else:
+                found.append(size)
+        return found
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """Transition F, process noise Q, observation h, first covariance P0, and the variance R of the white noise."""
+
+    F: Array
+    Q: Array
+    h: Array
+    P0: Array
+    R: float
+
+
+def flicker_rates(duration_s: float, dt: float) -> Array:
+    """Correlation rates, 1/s, a decade apart, of the Gauss-Markov terms that together make 1/f noise over a record."""
+    low, high = math.log10(0.5 / duration_s), math.log10(1.0 / dt)
+    count = max(2, min(7, math.ceil(high - low)))
+    return np.logspace(low, high, count)
+
+
+def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matrices:
+    """The state model of `terms` at the parameters `theta`.
+
+    Flicker noise of coefficient B has the one-sided spectrum B^2 / (2 pi f). Terms of variance v whose rates are a
+    factor g apart make v / (ln g f), so v = B^2 ln g / (2 pi).
+    """
+    value = dict(zip(terms.names, theta, strict=True))
+    phi: list[float] = []
+    q: list[float] = []
+    p0: list[float] = []
+    h: list[float] = []
+
+    def markov(variance: float, rate: float) -> None:
+        f = math.exp(-rate * dt)
+        phi.append(f)
+        q.append(-variance * math.expm1(-2.0 * rate * dt))
+        p0.append(variance)
+        h.append(1.0)
+
+    if terms.walk:
+        phi.append(1.0)
+        q.append(math.exp(2.0 * value["ln_rho"]))
+        p0.append(0.0)
+        h.append(1.0)
+    if terms.markov:
+        markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
+    if terms.flicker:
+        rates = flicker_rates(duration_s, dt)
+        apart = math.log(rates[1] / rates[0])
+        for rate in rates:
+            markov(math.exp(2.0 * value["ln_flicker"]) * apart / (2.0 * math.pi), float(rate))
+    R = 1.0
+    if terms.color == "ar":  # the white noise itself is a first-order process
+        f = math.tanh(value["color"])
+        phi.append(f)
+        q.append(1.0 - f * f)
+        p0.append(1.0)
+        h.append(1.0)
+        R = 1e-9
+    F, Q, P0 = np.diag(phi), np.diag(q), np.diag(p0)
+    if terms.color == "ma":  # e_i + theta e_(i-1)
+        m = math.tanh(value["color"])
+        unit = 1.0 / (1.0 + m * m)
+        F, Q, P0 = (
+            _joined(F, [[0.0, 0.0], [1.0, 0.0]]),
+            _joined(Q, [[unit, 0.0], [0.0, 0.0]]),
+            _joined(P0, np.eye(2) * unit),
+        )
+        h += [1.0, m]
+        R = 1e-9
+    for k, frequency in enumerate(terms.bands):
+        variance, width = math.exp(2.0 * value[f"ln_band{k}"]), math.exp(value[f"ln_width{k}"])
+        turn = 2.0 * math.pi * frequency * math.exp(value[f"shift{k}"]) * dt
+        f = math.exp(-2.0 * math.pi * width * dt)
+        F = _joined(F, f * np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]))
+        Q = _joined(Q, np.eye(2) * variance * (1.0 - f * f))
+        P0 = _joined(P0, np.eye(2) * variance)
+        h += [1.0, 0.0]
+    if not h:
+        F, Q, P0, h = np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), [0.0]
+    return Matrices(np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R)
+
+
+def _joined(a: Array, b: object) -> Array:
+    """Block diagonal of two square matrices."""
+    c = np.asarray(b, np.float64)
+    out = np.zeros((len(a) + len(c), len(a) + len(c)))
+    out[: len(a), : len(a)] = a
+    out[len(a) :, len(a) :] = c
+    return out

@@ -1,0 +1,222 @@
+"""Statistics of the innovations that show a misfit whatever its cause, and their bands by simulation.
+
+Each is about normal under the model after its stated transformation. Its mean and spread there come from records that
+are simulated from the fitted model with the recording's own length, gaps, lattice and limits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.stats import norm
+
+from selfcal.diagnosis.fit import run
+from selfcal.diagnosis.state import State
+from selfcal.diagnosis.statemodel import Array, matrices
+
+#: Simulated records a band rests on.
+ENSEMBLE = 48
+#: Lags of the correlation, roughly a factor 1.6 apart.
+LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One statistic: `measured`, the simulated 0.5 and 99.5 % points, and the probability `p` of one as extreme."""
+
+    name: str
+    measured: float
+    q005: float
+    q995: float
+    p: float
+
+
+def all_statistics(w: Array, y: Array, lsb: float) -> dict[str, float]:
+    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]."""
+    present = np.isfinite(w)
+    x = w[present]
+    n = x.size
+    found: dict[str, float] = {}
+    if n < 50:
+        return found
+    sd = float(x.std())
+    x = (x - x.mean()) / sd
+    filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
+    lagged = _lagged(filled, min(1 + max(LAGS), n // 8)) / math.sqrt(n)
+    for lag in LAGS:
+        if lag < lagged.size:
+            found[f"innovation_lag{lag}"] = float(lagged[lag])
+    found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
+    found["innovation_excess_kurtosis"] = float(np.mean(np.clip(x, -12, 12) ** 4) - 3.0) * math.sqrt(n / 24.0)
+    found["innovation_skewness"] = float(np.mean(np.clip(x, -12, 12) ** 3)) * math.sqrt(n / 6.0)
+    found["innovation_largest"] = _largest(x)
+    # Spread of the noise level over the record, in pieces of three lengths.
+    for pieces in (8, 40, 200):
+        size = n // pieces
+        if size < 10:
+            break
+        energy = np.minimum(x[: size * pieces] ** 2, 16.0).reshape(pieces, size).mean(axis=1)
+        # In units of the pieces' own expected spread, from the fourth moment.
+        spread = float(np.var(np.minimum(x * x, 16.0))) / size
+        found[f"noise_level_of_{pieces}_pieces"] = _root(
+            float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1
+        )
+    # Magnitudes, not squares: their products have no heavy tail.
+    square = np.minimum(np.abs(filled), 3.5)
+    square = np.where(present, square - square[present].mean(), 0.0)
+    scale = math.sqrt(n) * float(square[present].var())
+    lagged = _lagged(square, min(101, n // 8)) / scale
+    for lag in (1, 3, 10, 30, 100):
+        if lag < lagged.size:
+            found[f"innovation_magnitude_lag{lag}"] = float(lagged[lag])
+    # Level over the record: means of pieces against white noise.
+    for pieces in (8, 40):
+        size = n // pieces
+        if size < 10:
+            break
+        means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
+        found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
+    # The spectrum in bands of a third of an octave.
+    power = np.abs(rfft(filled)) ** 2 / n
+    worst, places = 0.0, 0
+    high = power.size - 1
+    while high > 8:
+        low = max(1, int(high / 2 ** (1.0 / 3.0)))
+        if high - low < 4:
+            break
+        part = power[low:high]
+        z = _root(2.0 * float(part.sum()), 2 * part.size)
+        places += 1
+        worst = z if abs(z) > abs(worst) else worst
+        high = low
+    if places:
+        found["spectrum_worst_third_octave"] = worst
+    # Readings that repeat the one before, beyond what the lattice makes them.
+    step = np.diff(y)
+    both = np.isfinite(step)
+    repeats = float((step[both] == 0.0).mean()) if both.any() else 0.0
+    found["repeated_readings"] = repeats * math.sqrt(max(1, both.sum()))
+    if lsb > 0.0:
+        runs = _longest_run(y)
+        found["longest_repeat"] = math.log(runs)
+        remainder = np.rint((y[np.isfinite(y)] + 0.0) / lsb).astype(np.int64)
+        _, counts = np.unique(remainder % 2, return_counts=True)
+        found["odd_even_codes"] = float(counts[0] - counts[-1]) / math.sqrt(counts.sum()) if counts.size == 2 else 9.0
+    return found
+
+
+def _lagged(x: Array, count: int) -> Array:
+    """sum x_i x_(i+k) for k below `count`."""
+    size = next_fast_len(x.size + count, real=True)
+    found: Array = irfft(np.abs(rfft(x, size)) ** 2, size)[:count]
+    return found
+
+
+def _root(value: float, freedom: int) -> float:
+    """A chi-square as a normal deviate (Wilson and Hilferty)."""
+    a = 2.0 / (9.0 * freedom)
+    return (math.cbrt(max(value, 1e-12) / freedom) - 1.0 + a) / math.sqrt(a)
+
+
+def _largest(x: Array) -> float:
+    """The largest of n as a normal deviate."""
+    ln_p = math.log(2.0) + float(norm.logsf(np.abs(x).max())) + math.log(x.size)
+    p = -math.expm1(-math.exp(min(ln_p, 5.0)))
+    return float(norm.isf(min(max(p, 1e-300), 1.0 - 1e-16)))
+
+
+def _longest_run(y: Array) -> int:
+    change = np.flatnonzero(np.diff(y, prepend=np.nan) != 0.0)
+    return int(np.diff(np.append(change, y.size)).max())
+
+
+def simulated(state: State, random: np.random.Generator) -> Array:
+    """One record of the fitted model, read out as the recording: gaps, lattice, limits."""
+    fit = state.best
+    n = state.y.size
+    m = matrices(fit.terms, fit.theta, fit.dt, fit.duration_s)
+    # Reading out on the lattice adds lsb^2 / 12, which the fitted white noise holds already.
+    white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
+    y = np.sqrt(white * state.r) * random.standard_normal(n)
+    y += _states(m.F, m.Q, m.h, m.P0, n, random) * fit.sigma
+    y += fit.c @ state.series.columns
+    y = np.where(np.isfinite(state.y), y, np.nan)
+    if state.lsb > 0.0:
+        y = np.rint((y + state.level) / state.lsb) * state.lsb - state.level
+    return y
+
+
+def _states(F: Array, Q: Array, h: Array, P0: Array, n: int, random: np.random.Generator) -> Array:
+    """h x over n steps. Diagonal and small blocks: each is filtered by itself."""
+    from scipy.signal import lfilter
+
+    d = len(F)
+    out = np.zeros(n)
+    k = 0
+    while k < d:
+        paired = k + 1 < d and (F[k, k + 1] != 0.0 or F[k + 1, k] != 0.0)
+        if not paired:
+            start = math.sqrt(max(P0[k, k], 0.0)) * random.standard_normal()
+            noise = math.sqrt(max(Q[k, k], 0.0)) * random.standard_normal(n)
+            noise[0] = start
+            out += h[k] * lfilter([1.0], [1.0, -F[k, k]], noise)
+            k += 1
+            continue
+        f = F[k : k + 2, k : k + 2]
+        if f[0, 0] == 0.0:  # the moving average: e_i and e_(i-1)
+            e = math.sqrt(Q[k, k]) * random.standard_normal(n + 1)
+            out += h[k] * e[1:] + h[k + 1] * e[:-1]
+        else:  # an oscillator, as a complex first-order process
+            pole = complex(f[0, 0], -f[0, 1])
+            e = math.sqrt(Q[k, k]) * (random.standard_normal(n) + 1j * random.standard_normal(n))
+            e[0] = math.sqrt(P0[k, k]) * (random.standard_normal() + 1j * random.standard_normal())
+            out += h[k] * lfilter([1.0], [1.0, -pole], e).real
+        k += 2
+    return out
+
+
+def whitened_of(state: State, y: Array) -> Array:
+    """Residual innovations of a record under the fitted noise model, the coefficients refitted."""
+    from dataclasses import replace
+
+    fit = state.best
+    sums, white, _ = run(replace(state.series, y=y), fit.terms, fit.theta, innovations=True)
+    c, _, rss = sums[0].coefficients()
+    return (white[:, 0] - white[:, 1:] @ c) / math.sqrt(rss / sums[0].n)
+
+
+def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
+    """Every statistic of the state against its band; the most striking first."""
+    measured = all_statistics(state.whitened, state.y, state.lsb)
+    random = np.random.default_rng(seed)
+    rows: dict[str, list[float]] = {name: [] for name in measured}
+    for _ in range(count):
+        y = simulated(state, random)
+        for name, value in all_statistics(whitened_of(state, y), y, state.lsb).items():
+            if name in rows:
+                rows[name].append(value)
+    found: list[Statistic] = []
+    for name, value in measured.items():
+        sample = np.array(rows[name])
+        if sample.size < 8:
+            continue
+        mean, sd = float(sample.mean()), float(max(sample.std(ddof=1), 0.05))
+        # Student's t of a new value against the ensemble: its spread is known to 1/sqrt(2 count).
+        z = (value - mean) / (sd * math.sqrt(1.0 + 1.0 / sample.size))
+        freedom = sample.size - 1
+        from scipy.stats import t as student
+
+        p = 2.0 * float(student.sf(abs(z), freedom)) if abs(z) < 8 else 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
+        half = float(student.isf(0.005, freedom)) * sd
+        found.append(Statistic(name, value, mean - half, mean + half, p))
+    return sorted(found, key=lambda one: one.p)
+
+
+def combined(statistics: list[Statistic]) -> float:
+    """Probability that the most striking of all is as striking by chance."""
+    if not statistics:
+        return 1.0
+    return min(1.0, statistics[0].p * len(statistics))

@@ -1,0 +1,69 @@
+"""What a finding says in words: the cause as an engineer says it, and what to record next to make sure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+WORDS: Mapping[str, str] = {
+    "temperature": "The bias follows the temperature.",
+    "supply": "The bias follows the supply voltage.",
+    "cross_axis": "Another axis leaks into this one.",
+    "ramp": "The bias drifts at a constant rate.",
+    "step": "The bias jumps once.",
+    "periodic": "A periodic disturbance of one frequency is in the readings.",
+    "flicker": "The bias has flicker (1/f) noise, or drifts on two time scales at once.",
+    "colored_noise": "The white noise has memory: neighbouring samples are correlated.",
+    "quantization": "The readings lie on a coarse lattice that the model file does not state.",
+    "outliers": "Single samples are far off.",
+    "variance_change": "The noise level changes once.",
+    "saturation": "Readings are clipped at a limit.",
+    "missing_samples": "Samples are missing.",
+    "motion": "The sensor was moved or shaken while it should have rested.",
+    "unexplained": "The readings differ from every model tried, and no known cause explains it.",
+}
+
+NEXT: Mapping[str, str] = {
+    "temperature": "Cycle the temperature up and down, so that it does not only rise with time.",
+    "supply": "Change the supply by 0.1 V and back, twice, at a constant temperature.",
+    "cross_axis": "Turn the sensor so that the other axis reads something else.",
+    "ramp": "Record three times as long, with the temperature beside it.",
+    "step": "Record again without touching the mount or the cable.",
+    "periodic": "Record at another rate: a line that moves is an alias.",
+    "flicker": "Record three times as long, and at 10 Hz or more.",
+    "colored_noise": "Record at the sensor's full rate with its filter off.",
+    "quantization": "State the lsb in the model file, or record with a finer range.",
+    "outliers": "Check the bus: log the raw words of those samples.",
+    "variance_change": "Look for what was switched on at that time.",
+    "saturation": "Choose a wider range.",
+    "missing_samples": "Check the logger's buffer and the data-ready line.",
+    "motion": "Record on a heavy table, away from traffic.",
+    "unexplained": "Record again: if the statistic stands out a second time, it is the sensor's own.",
+}
+
+
+def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
+    """The cause with its size."""
+    parts = []
+    for key, value in estimate.items():
+        if isinstance(value, Mapping):
+            half = 0.5 * (value["q95"] - value["q05"])
+            unit = "" if value["unit"] == "1" else f" {value['unit']}"
+            spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
+            parts.append(f"{key.replace('_', ' ')} {value['median']:.4g}{spread}{unit}")
+        else:
+            parts.append(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}")
+    return f"{WORDS[cause]} {', '.join(parts)}."
+
+
+def inflation_sentence(inflation: Mapping[str, float]) -> str:
+    """The answer to "why must I multiply by ten?"."""
+    told = [
+        f"{name} {'by any factor' if not math.isfinite(factor) else f'{factor:.2f} times'}"
+        for name, factor in inflation.items()
+        if not 0.95 < factor < 1.05
+    ]
+    if not told:
+        return ""
+    return f"Without it, plain white noise and random walk come out too large: {', '.join(told)}."

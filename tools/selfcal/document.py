@@ -1,0 +1,175 @@
+"""The JSON of `identify` and `replay`: `selfcal.identify/1`, and how every verb writes its JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from selfcal import units
+from selfcal.allan import Sampled
+from selfcal.checks import Judged, allan_limit
+from selfcal.errors import UserError
+from selfcal.output import check_place, write_text
+from selfcal.recording import Recording
+from selfcal.regressors import Scored
+from selfcal.result import AxisResult
+
+SCHEMA = "selfcal.identify/1"
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
+    known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
+    its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`."""
+
+    unit: str
+    group_unit: str
+    result: AxisResult
+    judged: Judged
+    kept_out: Mapping[str, int]
+    scored: Scored | None = None
+    sampled: Sampled | None = None
+
+    @property
+    def adequate(self) -> bool:
+        """All checks passed: nothing in the record speaks against the best model."""
+        return all(bool(check["passed"]) for check in self.judged.checks.values())
+
+
+def to_document(recording: Recording, found: Mapping[str, Identified | UserError]) -> dict[str, Any]:
+    """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
+    if no axis has a result."""
+    reasons = {
+        name: str(axis).removeprefix(f"{recording.path}: ")
+        for name, axis in found.items()
+        if isinstance(axis, UserError)
+    }
+    if len(reasons) == len(found):
+        columns: dict[str, list[str]] = {}
+        for name, reason in reasons.items():
+            columns.setdefault(reason, []).append(name)
+        said = "; ".join(
+            f"column{'s' if len(names) > 1 else ''} {', '.join(names)}: {reason}" for reason, names in columns.items()
+        )
+        raise UserError(f"{recording.path}: {said or 'no axis has a result'}")
+    return {
+        "schema": SCHEMA,
+        "recording": {
+            "path": str(recording.path),
+            "rate_hz": recording.rate_hz,
+            "samples": recording.samples,
+            "duration_s": recording.duration_s,
+        },
+        "axes": {
+            name: {"error": reasons[name]}
+            if isinstance(axis, UserError)
+            else {
+                "hypotheses": dict(axis.result.probability),
+                "log_evidence": dict(axis.result.log_evidence),
+                "parameters": {
+                    law: {
+                        parameter: {
+                            "mean": e.mean,
+                            "median": e.median,
+                            "sd": e.sd,
+                            "q05": e.q05,
+                            "q95": e.q95,
+                            "unit": units.parameter_unit(parameter, axis.unit),
+                            "identified": e.identified,
+                            "off_grid": e.off_grid,
+                        }
+                        for parameter, e in estimates.items()
+                    }
+                    for law, estimates in axis.result.parameters.items()
+                },
+                "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
+                "samples_kept_out": dict(axis.kept_out),
+                "adequate": axis.adequate,
+                "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
+                "allan": _allan(axis),
+                **_regressors(axis.scored),
+            }
+            for name, axis in found.items()
+        },
+    }
+
+
+def _allan(axis: Identified) -> dict[str, Any] | None:
+    """The Allan deviation of the record's bank samples and of the most probable law, and of its own samples if that was
+    asked for; None where it is not known."""
+    curve, sampled = axis.judged.curve, axis.sampled
+    if curve is None:
+        return None
+    factor, limit = units.factor(axis.group_unit, axis.unit), allan_limit(curve)
+    found: dict[str, Any] = {
+        "unit": axis.unit,
+        "tau_s": curve.tau_s.tolist(),
+        "recording": (curve.recording * factor).tolist(),
+        "degrees_of_freedom": curve.freedom.tolist(),
+        "model": (curve.model * factor).tolist(),
+        "model_q05": (curve.model_q05 * factor).tolist(),
+        "model_q95": (curve.model_q95 * factor).tolist(),
+        "adequate_from": (curve.within(-limit) * factor).tolist(),
+        "adequate_to": (curve.within(limit) * factor).tolist(),
+    }
+    if sampled is not None:
+        found["samples"] = {
+            "tau_s": sampled.tau_s.tolist(),
+            "deviation": (sampled.deviation * factor).tolist(),
+            "q05": (sampled.q05 * factor).tolist(),
+            "q95": (sampled.q95 * factor).tolist(),
+        }
+    return found
+
+
+def _regressors(scored: Scored | None) -> dict[str, Any]:
+    """The keys an axis has beyond the contract's if its model has regressors."""
+    if scored is None:
+        return {}
+    return {
+        "regressors": {
+            name: {
+                "probability": inclusion.probability,
+                "coefficients": {
+                    c.column: {key: getattr(c, key) for key in ("mean", "median", "sd", "q05", "q95", "unit")}
+                    for c in inclusion.coefficients
+                },
+            }
+            for name, inclusion in scored.inclusion.items()
+        },
+        "regressors_in_use": [one.name for one in scored.choices[scored.best]],
+        "subsets": [
+            {"regressors": [one.name for one in choice], "probability": probability}
+            for choice, probability in zip(scored.choices, scored.probability, strict=True)
+        ],
+    }
+
+
+def check_writable(*files: Path | str | None) -> None:
+    """Raise UserError now, before the work, for a file that could not be written after it. None and '-' are none."""
+    for file in files:
+        if file is not None and str(file) != "-":
+            check_place(file)
+
+
+def write_json(document: Mapping[str, Any], path: Path | str) -> None:
+    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
+    text = json.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+    if str(path) == "-":
+        sys.stdout.write(text)
+        return
+    write_text(path, text)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,86 @@
+"""How a command ends before its time: Ctrl-C, SIGTERM and SIGHUP alike, each once, at a point where nothing is lost."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Ended(KeyboardInterrupt):
+    """A signal asked for the end; `number` of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+class _State:
+    """What came while signals are held."""
+
+    holding = False
+    came: int | None = None
+    raised: int | None = None
+
+
+_state = _State()
+
+
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    if _state.holding and _state.came is None:
+        _state.came = number  # a second one ends at once, whatever is held
+        return
+    for other in SIGNALS[1:]:
+        signal.signal(other, signal.SIG_IGN)  # the end is under way: it is not to be cut short
+    _end(number)
+
+
+def _end(number: int) -> NoReturn:
+    _state.raised = number
+    raise Ended(number)
+
+
+def last_signal() -> int:
+    """Exit code for the signal that was raised, 128 + its number; 0: none was."""
+    return 0 if _state.raised is None else 128 + _state.raised
+
+
+def install() -> None:
+    """Have the signals raise Ended. One that is ignored stays so: `nohup`, a shell's background job."""
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _on_signal)
+
+
+class Held:
+    """Whether a signal has asked for the end."""
+
+    @property
+    def asked(self) -> bool:
+        """One came."""
+        return _state.came is not None
+
+    def check(self) -> None:
+        """Raise Ended if one came."""
+        if _state.came is not None:
+            number, _state.came = _state.came, None
+            _end(number)
+
+
+@contextmanager
+def held() -> Iterator[Held]:
+    """Within, a signal is noted instead of raised, if `install()` has been called; the caller asks `asked`.
+
+    What came stays noted after the end of the block until `check()` raises it.
+    """
+    before, _state.holding = _state.holding, True
+    if not before:
+        _state.came = None
+    try:
+        yield Held()
+    finally:
+        _state.holding = before

@@ -1,0 +1,185 @@
+"""The table of `identify` and `replay`: what a person reads of the document `selfcal.identify/1`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from selfcal import units
+from selfcal.errors import printable
+from selfcal.model import LAWS, RATIOS, SUMS
+
+#: The table never folds its numbers: a narrower terminal wraps its lines.
+TABLE_WIDTH = 140
+#: Laws of smaller probability are not spoken of where the grid does not bear them.
+TOLD_OF = 0.01
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
+    """The table a person reads: per axis the laws, their probabilities and parameters, and the bias.
+
+    It goes to stderr where stdout is the JSON's. `datasheet`: each number in the unit of data sheets, and the bias
+    instability beside the bias. In a terminal that is too narrow columns lose their intervals, first that of 1/alpha,
+    then N's, then K's.
+    """
+    console = Console(stderr=to_stderr)
+    for left_out in range(4):
+        table, notes = _law_table(document, left_out, datasheet)
+        needed = console.measure(table, options=console.options.update(width=10 * TABLE_WIDTH)).maximum
+        if not console.is_terminal or needed <= console.width:
+            break
+    if not console.is_terminal:
+        console.width = max(console.width, TABLE_WIDTH)
+    console.print(table)
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    if any("regressors" in axis for axis in axes.values()):
+        console.print(_regressor_table(axes))
+    for line in notes:
+        console.print(line, highlight=False, markup=False)
+
+
+def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
+    """The table without the intervals of its last `left_out` columns, and the lines below it."""
+    recording = document["recording"]
+    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        collapse_padding=left_out > 0,
+        pad_edge=left_out == 0,
+        title=f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s",
+        title_justify="left",
+        caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
+        "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
+        caption_justify="left",
+    )
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    laws = {law for axis in axes.values() for law in axis["hypotheses"]}
+    drift = "K or sigma_m" if "flicker" not in laws else "K, sigma_m or B"
+    second = "1/alpha, s" + (", or ratio" if laws & {law for law in SUMS if LAWS[law][2] in RATIOS} else "")
+    for heading in ("law", "P", "N", drift, second):
+        table.add_column(heading, no_wrap=True)
+    failed = [
+        f"no result: {name}: {axis['error']}; choose axes with --axis"
+        for name, axis in document["axes"].items()
+        if name not in axes
+    ]
+    kept: list[str] = []
+    for name, axis in axes.items():
+        best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
+        bias = axis["bias_now"]
+        level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
+        heading, floor = f"{name} \\[{bias['unit']}]", ""
+        if datasheet:
+            unit = units.datasheet_unit("bias", bias["unit"])
+            factor = units.factor(bias["unit"], unit)
+            level = f"bias {bias['mean'] * factor:.6g} ± {bias['sd'] * factor:.2g} {units.typeset(unit)}"
+            heading, floor = name, _instability(axis, unit)
+        level, _, spread = level.partition(" ±") if brief["N"] else (level, "", "")
+        table.add_row(heading, "", level, floor or (f"±{spread}" if spread else ""), "", style="cyan")
+        for law, probability in axis["hypotheses"].items():
+            parameters = axis["parameters"][law]
+            table.add_row(
+                law,
+                f"{probability:.4f}",
+                _interval(parameters, ("N",), datasheet=bias["unit"] if datasheet else "", brief=brief["N"]),
+                _interval(
+                    parameters, ("K", "sigma_m", "B"), datasheet=bias["unit"] if datasheet else "", brief=brief["K"]
+                ),
+                _interval(parameters, ("alpha",), inverse=True, brief=brief["alpha"])
+                or _interval(parameters, RATIOS, brief=brief["alpha"]),
+                style="bold" if law == best else None,
+                end_section=law == list(axis["hypotheses"])[-1],
+            )
+        coarse = [
+            law
+            for law, parameters in axis["parameters"].items()
+            if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
+        ]
+        if coarse:
+            failed.append(f"not borne by the grid of nodes: {name}: {', '.join(coarse)}")
+        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
+        if counts:
+            kept.append(f"kept out: {name}: {', '.join(counts)}")
+        for check, outcome in axis["checks"].items():
+            if not outcome["passed"] and not check.startswith("allan_"):
+                failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
+        off = [
+            f"{check.removeprefix('allan_')} {100.0 * outcome['value']:+.0f} %"
+            for check, outcome in axis["checks"].items()
+            if not outcome["passed"] and check.startswith("allan_")
+        ]
+        if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
+            failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
+    return table, [*kept, *failed]
+
+
+def _regressor_table(axes: Mapping[str, Any]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        caption="coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset",
+        caption_justify="left",
+    )
+    for heading in ("axis", "regressor", "P(in use)", "coefficient", "unit"):
+        table.add_column(heading, no_wrap=True)
+    for name, axis in axes.items():
+        entries = list(axis.get("regressors", {}).items())
+        for regressor, entry in entries:
+            for column, c in entry["coefficients"].items():
+                table.add_row(
+                    name,
+                    column,
+                    f"{entry['probability']:.4f}",
+                    "-" if not math.isfinite(c["median"]) else f"{c['median']:.4g} \\[{c['q05']:.4g}, {c['q95']:.4g}]",
+                    c["unit"],
+                    style="bold" if regressor in axis["regressors_in_use"] else None,
+                    end_section=(regressor, entry) == entries[-1],
+                )
+    return table
+
+
+def _instability(axis: Mapping[str, Any], unit: str) -> str:
+    """Bias instability at the floor of the recording's Allan deviation; an upper limit if it still falls at the end."""
+    allan = axis.get("allan")
+    if not allan or not allan["recording"]:
+        return ""
+    place = min(range(len(allan["recording"])), key=lambda k: allan["recording"][k])
+    value = allan["recording"][place] * units.factor(allan["unit"], unit) / units.FLICKER_FLOOR
+    below = "< " if place == len(allan["recording"]) - 1 else ""
+    return f"bias instability {below}{value:.3g} {units.typeset(unit)} at {allan['tau_s'][place]:g} s"
+
+
+def _interval(
+    parameters: Mapping[str, Any],
+    names: Sequence[str],
+    *,
+    inverse: bool = False,
+    datasheet: str = "",
+    brief: bool = False,
+) -> str:
+    """Median and interval of the one of `names` that a law has, `brief` without the interval; `datasheet`: unit of the
+    axis, to be turned into that of data sheets."""
+    name = next((name for name in names if name in parameters), None)
+    if name is None:
+        return ""
+    estimate = parameters[name]
+    low, middle, high = estimate["q05"], estimate["median"], estimate["q95"]
+    if not math.isfinite(middle):
+        return "-"
+    if inverse:
+        low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
+    unit = ""
+    if datasheet:
+        to = units.datasheet_unit(name, datasheet)
+        factor = units.factor(estimate["unit"], to)
+        low, middle, high, unit = low * factor, middle * factor, high * factor, f" {units.typeset(to)}"
+    mark = "" if estimate["identified"] else "~"
+    if brief:
+        return f"{mark}{middle:.3g}{unit}"
+    return f"{mark}{middle:.3g} \\[{low:.3g}, {high:.3g}]{unit}"

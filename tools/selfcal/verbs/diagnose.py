@@ -1,0 +1,131 @@
+"""`selfcal diagnose`: what the simulation gets wrong in a recording, why, and what mending it gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.extend import as_text, extended
+from selfcal.diagnosis.loop import diagnose_record
+from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.words import WORDS
+from selfcal.document import check_writable, write_json
+from selfcal.errors import UserError, printable
+from selfcal.model import Model
+from selfcal.output import write_text
+from selfcal.recording import Scale, load
+from selfcal.verbs.identify import chosen_axes
+
+
+def diagnose(
+    log: Path | str,
+    *,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    decimate: float | None = None,
+    json: Path | str | None = None,
+    report: Path | str | None = None,
+    write_model: Path | str | None = None,
+    fail_on: str | None = None,
+    rate: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    scale: Mapping[str, Scale] | None = None,
+) -> dict[str, Any]:
+    """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
+
+    `axes`: those reported on; every other column may explain them. `decimate`: look at block means at this rate, Hz.
+    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on` is only checked here.
+    Numbers are in the recording's units. Raises UserError for what the user can put right.
+    """
+    if fail_on is not None and fail_on not in ("inadequate", *WORDS):
+        raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
+    check_writable(json, report, write_model)
+    loaded = Model.load(model)
+    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)
+    record = of_recording(recording, loaded, decimate)
+    stuck = [name for name in names if name not in record.axes]
+    names = tuple(name for name in names if name in record.axes)
+    if not names:
+        raise UserError(f"{recording.path}: every reading of {', '.join(stuck)} is the same: choose others with --axis")
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("diagnose", total=None)
+        found = diagnose_record(record, names, lambda text: progress.update(task, description=text))
+        progress.update(task, description="held-out gain")
+        tree = extended(loaded, record, found)
+        document = to_document(recording, record, found, tree)
+    if write_model is not None:
+        write_text(write_model, as_text(tree, recording.path))
+    if report is not None:
+        from selfcal.diagnosis.page import write_page
+
+        write_page(report, document, record, found)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def failing(document: Mapping[str, Any], wanted: str) -> bool:
+    """Whether `--fail-on` applies: `inadequate`, or the id of a cause that some axis shows."""
+    for axis in document["axes"].values():
+        if wanted == "inadequate" and axis["verdict"] != "adequate":
+            return True
+        if any(finding["cause"] == wanted for finding in axis["findings"]):
+            return True
+    return False
+
+
+def show(document: Mapping[str, Any]) -> None:
+    """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
+    recording = document["recording"]
+    console = Console()
+    console.print(
+        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s\n",
+        highlight=False,
+        markup=False,
+    )
+    for name, axis in document["axes"].items():
+        colour = "green" if axis["verdict"] == "adequate" else "bold red"
+        console.print(f"{name} [{axis['unit']}]: {axis['verdict']}", style=colour, highlight=False, markup=False)
+        for finding in axis["findings"]:
+            for line in _lines(finding):
+                console.print(f"  {line}", highlight=False, markup=False)
+
+
+def _lines(finding: Mapping[str, Any]) -> list[str]:
+    """One finding in a few lines."""
+    gain = finding["gain"]
+    lines = [f"{finding['cause']}: {finding['words']}"]
+    evidence = f"  evidence {finding['evidence_gain_nats']:.1f} nats, {finding['net_nats']:.1f} net of the search"
+    if finding["when"]:
+        evidence += f"; at {finding['when'][0]:.6g} s"
+        evidence += "" if finding["when"][0] == finding["when"][1] else f" to {finding['when'][1]:.6g} s"
+    lines.append(evidence)
+    if gain is not None:
+        score = gain["log_score_per_sample"]
+        errors = ", ".join(
+            f"{horizon} s {row['before']:.3g} -> {row['after']:.3g}"
+            for horizon, row in gain["bias_rmse"]["horizon_s"].items()
+        )
+        lines.append(
+            f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample; "
+            f"bias error ahead, {gain['bias_rmse']['unit']}: {errors}"
+        )
+    elif finding.get("gain_reason"):
+        lines.append(f"  no held-out gain: {finding['gain_reason']}")
+    if finding["inflation_words"]:
+        lines.append(f"  {finding['inflation_words']}")
+    if finding["shared_with"]:
+        lines.append(f"  also on {', '.join(finding['shared_with'])}")
+    if finding["also_possible"]:
+        lines.append(f"  this record cannot tell it from: {', '.join(finding['also_possible'])}")
+    lines.append(f"  next: {finding['record_next']}")
+    return lines
