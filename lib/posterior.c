@@ -1004,8 +1004,9 @@ static bool step_search(selfcal_work_t *work) {
     const selfcal_range_t before = *range;
     if (rows && next_range(range, work->scratch.grid.height, work->best - work->depth, &limit) && work->pass < PASSES_MAX) {
         work->pass++;
+        /* Huge samples shrink the range to a few roundings at the prior's end: there at may be all samples. */
         const selfcal_real_t at = (range->lo - before.lo) / (before.hi - before.lo) * (selfcal_real_t)SAMPLES;
-        work->range[0] = work->scratch.grid.found[at > R(0.0) ? (unsigned)at : 0U];
+        work->range[0] = work->scratch.grid.found[at > R(0.0) ? (unsigned)r_fmin(at, (selfcal_real_t)(SAMPLES - 1U)) : 0U];
         begin_pass(work);
         return false;
     }
