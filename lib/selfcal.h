@@ -96,7 +96,7 @@ extern "C" {
 /* Cells a dimension that a report integrates over, about where the likelihood counts. With 24 the mean, sd and evidence are good to 0.01 sd,
  * 2 % and 0.01 nat, and quantiles as a rule to 0.05 sd. Twice as many: four times the sums' part of the time. */
 #ifndef SELFCAL_REPORT_CELLS
-#define SELFCAL_REPORT_CELLS 24
+#define SELFCAL_REPORT_CELLS 80
 #endif
 #if SELFCAL_REPORT_CELLS < 16 || SELFCAL_REPORT_CELLS > 255
 #error "SELFCAL_REPORT_CELLS must be 16 to 255"
@@ -104,10 +104,10 @@ extern "C" {
 
 /* Cells of sigma_v in those that a limit cuts, and bins of a parameter's histogram, which its quantiles are read from. */
 #ifndef SELFCAL_SIGMA_CELLS
-#define SELFCAL_SIGMA_CELLS 24
+#define SELFCAL_SIGMA_CELLS 48
 #endif
 #ifndef SELFCAL_HISTOGRAM
-#define SELFCAL_HISTOGRAM 64
+#define SELFCAL_HISTOGRAM 128
 #endif
 #if SELFCAL_SIGMA_CELLS < 8 || SELFCAL_HISTOGRAM < 32
 #error "SELFCAL_SIGMA_CELLS must be 8 and SELFCAL_HISTOGRAM 32 at least"
