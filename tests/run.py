@@ -40,7 +40,7 @@ QUICK = (
     "test_reference.py::test_bank_over_time_follows_equations_11_to_14",
     "test_report.py::test_report_over_the_whole_prior[100]",
     "test_cli.py::test_version_is_the_headers",
-    "test_cli.py::test_identify_loads_no_scipy",
+    "test_cli.py::test_identify_loads_no_scipy_optimize",
     "test_units.py",
     "test_export.py",
     "test_firmware_faults.py::test_saturation",

@@ -17,7 +17,7 @@ qemu: $(OUT)/selfcal-qemu.elf
 $(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/library.mk port/arm.mk
 	@rm -rf $(OUT)/objects
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(QEMU_CFLAGS))'
-	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(QEMU_CFLAGS) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
-	    -I$(MODEL_DIR),$(QEMU_SOURCES),$(OUT)/objects)
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
+	    -I$(MODEL_DIR),$(QEMU_SOURCES) $(filter %.c,$(QEMU_CFLAGS)),$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
 	    $(OUT)/objects/*.o -lm -o $@

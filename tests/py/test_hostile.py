@@ -345,3 +345,11 @@ def test_a_name_that_looks_like_markup_is_shown_as_it_is(tmp_path: Path) -> None
     done = subprocess.run([*command, "--rate", "1"], capture_output=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     assert b"[red]\\udcff\\x1b[2J.csv: 300 samples" in done.stdout
+
+
+def test_a_packed_text_that_grows_without_bound_is_refused(tmp_path: Path) -> None:
+    """Equal rows pack to a thousandth: a small file would take gigabytes. Refused while it is read."""
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(gzip.compress(b"t[s],gx[deg/s]\n" + b"0,0\n" * 8_000_000))
+    with pytest.raises(UserError, match="unpacks to more than 200 times its size"):
+        load(path)

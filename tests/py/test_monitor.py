@@ -136,7 +136,7 @@ def test_a_serial_line_has_one_reader() -> None:
         (["--read", "no-such.asc"], "there is no such file"),
         (["--read", "/tmp"], ".asc, .blf, .csv, .log, .trc"),
         (["--channel", "x", "--axis", "temp"], "axis 'temp'"),
-        (["--channel", "x", "--json", "/no-such-folder/x.json"], "no such folder"),
+        (["--channel", "x", "--json", "/no-such-folder/x.json"], "there is no folder"),
         (["--channel", "x", "--plot", "x.gif"], "a plot is one of"),
         (["--channel", "x", "--log", "frames.db"], ".asc, .blf, .csv, .log, .trc"),
         (["--channel", "x", "--duration", "0"], "--duration"),
@@ -183,7 +183,7 @@ def test_view_shows_what_did_not_arrive_as_missing(monkeypatch: pytest.MonkeyPat
         picture = shown(view)
     assert f"{first.truth['count']:.0f}" not in picture
     assert f"{first.truth['bias_mean']:.5g}" not in picture
-    assert "? ± ? deg/s" in picture
+    assert "? ± ? °/s" in picture
     law = max(("constant", "random_walk", "gauss_markov"), key=lambda name: second.truth[f"{name}_probability"])
     assert f"N {second.truth[f'{law}_N_median']:.3g} [" in picture
 
@@ -196,7 +196,7 @@ def test_view_of_a_record_outside_the_priors(monkeypatch: pytest.MonkeyPatch) ->
         view = View(Decoder(), Link(bus), "test")
         view.show([report])
         picture = shown(view)
-    assert "- ± - deg/s" in picture
+    assert "- ± - °/s" in picture
     assert "outside the priors" in picture
     assert "600" in picture
     assert "?" not in picture
@@ -302,8 +302,8 @@ def test_view_of_six_axes_fits(monkeypatch: pytest.MonkeyPatch, width: int, heig
     assert re.search(r"^axis averages  P constant", text, re.MULTILINE)
     for axis in ("gx", "gy", "gz", "ax", "ay", "az"):
         assert re.search(rf"^{axis} +36000  0\.000 ·{{12,}}  0\.063 █+·+  0\.937 █{{11,}}·+ +12 s$", text, re.MULTILINE)
-    assert len(re.findall(r"bias -0\.036521 ± 0\.0025 (?:deg/s|m/s²) +[▁▂▃▄▅▆▇█]{8,}", text)) == 6
-    assert text.count("N 0.0423 [0.0414, 0.0431] deg/s/√Hz") == 3
+    assert len(re.findall(r"bias -0\.036521 ± 0\.0025 (?:°/s|m/s²) +[▁▂▃▄▅▆▇█]{8,}", text)) == 6
+    assert text.count("N 0.0423 [0.0414, 0.0431] °/s/√Hz") == 3
     assert text.count("sigma_m 0.00859 [0.00517, 0.0403] m/s²") == 3
     assert text.count("1/alpha 119 [36, 2.86e+03] s") == 3
 

@@ -431,6 +431,8 @@ def test_signals_end_it_with_the_cursor_back_and_a_log_that_can_be_read(
                 os.kill(pid, number)
                 signalled = math.inf
         os.close(terminal)
+        if signalled != math.inf or time.monotonic() >= end:
+            os.kill(pid, signal.SIGKILL)  # it did not end: the status says so
         status = os.waitpid(pid, 0)[1]
     assert os.WIFEXITED(status), status
     assert os.WEXITSTATUS(status) == 0

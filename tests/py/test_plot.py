@@ -59,7 +59,7 @@ def test_verdict_values_units_and_scales(figure: Any) -> None:
     assert panels["gx"][4].get_title("right") == "100 [80, 125]"  # 1/alpha
     assert panels["gy"][2].get_title("right") == ""  # K of a law that is out of the question
     assert [panel.get_ylabel() for panel in panels["ax"][1:]] == ["g/√Hz", "g/s/√Hz", "g", "s"]
-    assert panels["gx"][2].get_ylabel() == "deg/s²/√Hz"
+    assert panels["gx"][2].get_ylabel() == "°/s²/√Hz"
     for column in range(1, 5):
         assert panels["gx"][column].get_ylim() == panels["gy"][column].get_ylim()
     assert panels["gx"][1].get_ylim() != panels["ax"][1].get_ylim()

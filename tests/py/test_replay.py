@@ -305,7 +305,7 @@ def test_a_rate_that_no_board_has(tmp_path: Path) -> None:
 def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     log = part_of_shipped(tmp_path / "part.npz", 60.0)
     for option in ("--plot", "--json"):
-        assert_one_line(command(log, option, tmp_path / "no-such-folder" / "file.png"), "there is no such folder")
+        assert_one_line(command(log, option, tmp_path / "no-such-folder" / "file.png"), "there is no folder")
     short = (log, "--axis", "gx", "--report-every", "30")
     assert_one_line(command(*short, "--plot", tmp_path / "plot.xyz"), "a plot is one of .png")
 

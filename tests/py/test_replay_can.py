@@ -20,12 +20,12 @@ import pytest
 from rich.console import Console
 from test_replay import SHIPPED, part_of_shipped
 
+from selfcal import table
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import load
-from selfcal.verbs import identify as identify_module
+from selfcal.table import show
 from selfcal.verbs.demo import demo
-from selfcal.verbs.identify import show
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import build, can_bus, replay, write_rows
 
@@ -194,7 +194,7 @@ def test_the_final_table_fits_the_terminal(
 ) -> None:
     """Nothing wrapped, nothing cut: a narrow one shows medians where there is no room for their intervals."""
     document = _document()
-    monkeypatch.setattr(identify_module, "Console", lambda: Console(width=width, force_terminal=True))
+    monkeypatch.setattr(table, "Console", lambda **_: Console(width=width, force_terminal=True))
     show(document)
     plain = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     rows = plain.splitlines()

@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal import units
 from selfcal.errors import UserError
-from selfcal.output import whole
+from selfcal.plot import save_picture
 
 #: The model's colour, and that of what does not fit.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
@@ -60,13 +60,7 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
         Line2D([], [], color=OUTSIDE, marker="o", markersize=9, fillstyle="none", linestyle="", label="outside"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    try:
-        with whole(path) as temporary:
-            figure.savefig(temporary, dpi=110)
-    except ValueError as error:
-        raise UserError(f"{path}: cannot save the plot: {error}") from error
-    finally:
-        pyplot.close(figure)
+    save_picture(figure, path, dpi=110)
 
 
 def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> None:

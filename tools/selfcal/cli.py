@@ -195,9 +195,28 @@ def diagnose(
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
-    verb.show(result)
+    verb.show(result, to_stderr=str(json) == "-")
     if fail_on is not None and verb.failing(result, fail_on):
         sys.exit(1)
+
+
+@app.command()
+def compare(
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG LOG...", help="Recordings of one part", show_default=False)
+    ],
+    axis: Axis = None,
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Diagnose block means at this rate; default: every sample")
+    ] = None,
+    json: Json = None,
+) -> None:
+    """What changed between recordings of one part, beyond what each leaves open."""
+    from selfcal.verbs import compare as verb
+
+    result = verb.compare(logs, axes=axis or (), model=model, decimate=decimate, json=json)
+    verb.show(result, to_stderr=str(json) == "-")
 
 
 @app.command()

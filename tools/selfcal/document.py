@@ -42,6 +42,16 @@ class Identified:
         return all(bool(check["passed"]) for check in self.judged.checks.values())
 
 
+def recording_entry(recording: Recording) -> dict[str, Any]:
+    """What a document says of its recording."""
+    return {
+        "path": str(recording.path),
+        "rate_hz": recording.rate_hz,
+        "samples": recording.samples,
+        "duration_s": recording.duration_s,
+    }
+
+
 def to_document(recording: Recording, found: Mapping[str, Identified | UserError]) -> dict[str, Any]:
     """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
     if no axis has a result."""
@@ -60,12 +70,7 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
         raise UserError(f"{recording.path}: {said or 'no axis has a result'}")
     return {
         "schema": SCHEMA,
-        "recording": {
-            "path": str(recording.path),
-            "rate_hz": recording.rate_hz,
-            "samples": recording.samples,
-            "duration_s": recording.duration_s,
-        },
+        "recording": recording_entry(recording),
         "axes": {
             name: {"error": reasons[name]}
             if isinstance(axis, UserError)

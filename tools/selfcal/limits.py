@@ -17,6 +17,8 @@ MOST_NUMBERS = 400_000_000
 MOST_COLUMNS, LONGEST_HEADING = 1000, 256
 #: A text recording is read by as many bytes; no line is longer.
 BLOCK_BYTES = 1 << 22
+#: What a packed text recording may unpack to, times its size: readings of a sensor pack to a twentieth at best.
+MOST_GROWTH = 200
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
 #: What a MATLAB or R file may unpack to; the libraries hold it twice.

@@ -57,7 +57,7 @@ PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3,
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
-    "column": ("column", "unit", "reference"),
+    "column": ("column", "unit", "reference", "window_s"),
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
@@ -107,7 +107,7 @@ class Regressor:
     probability: float = 0.5
     reference: float = 0.0
     column: str = ""
-    window_s: float = math.nan
+    window_s: float = math.nan  # of a rate; of a column that is smoothed
     frequency_hz: float = math.nan
     time_s: float = math.nan
 
@@ -376,7 +376,7 @@ class _Reader:
         needed = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
             for key in ("window_s", "frequency_hz", "time_s")
-            if key in REGRESSORS[kind]
+            if key in REGRESSORS[kind] and (kind != "column" or key in fields)
         }
         return Regressor(
             name=self.text(fields, "name", where),
@@ -482,7 +482,7 @@ class _Reader:
             groups=groups,
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
             nodes={name: self.nodes(fields, f"nodes.{name}", weights) for name, fields in targets.items()},
-            simulate=self.only(simulate, ("rate_hz", "duration_s", "axes"), "simulate"),
+            simulate=self.only(simulate, ("rate_hz", "duration_s", "axes", "effects"), "simulate"),
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,

@@ -47,6 +47,19 @@ def check_picture(path: Path | str) -> None:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
+def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
+    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
+    from matplotlib import pyplot
+
+    try:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=dpi)
+    except ValueError as error:
+        raise UserError(f"{path}: cannot save the plot: {error}") from error
+    finally:
+        pyplot.close(figure)
+
+
 def plot_run(
     history: Mapping[str, Sequence[AxisReport]],
     path: Path | str,
@@ -134,13 +147,7 @@ def plot_run(
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     for panel in grid[-1]:
         panel.set_xlabel("time, s")
-    try:
-        with whole(path) as temporary:
-            figure.savefig(temporary, dpi=100)
-    except ValueError as error:
-        raise UserError(f"{path}: cannot save the plot: {error}") from error
-    finally:
-        pyplot.close(figure)
+    save_picture(figure, path, dpi=100)
 
 
 def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:

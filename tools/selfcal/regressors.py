@@ -59,9 +59,10 @@ class Scored:
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """float64[n, p]: every column of `regressors`, in the unit of each, at every row of the recording.
 
-    Time is that since the first row, s. A step is 1 from its time on. A rate is what the channel gained over the last
-    `window_s`, in the first window what it gained since the first row, over `window_s`: both need no later value, so
-    that a module can form them. Raises UserError for a column that is absent or of another kind.
+    Time is that since the first row, s. A column with a `window_s` is the mean over that time up to each row. A step is
+    1 from its time on. A rate is what the channel gained over the last `window_s`, in the first window what it gained
+    since the first row, over `window_s`. None needs a later value, so that a module can form them. Raises UserError for
+    a column that is absent or of another kind.
     """
     found = [column for one in regressors for column in _columns(one, recording)]
     return np.ascontiguousarray(np.column_stack(found)) if found else np.empty((recording.samples, 0))
@@ -83,8 +84,19 @@ def _columns(one: Regressor, recording: Recording) -> list[NDArray[np.float64]]:
         )
     values = recording.in_unit(one.column, one.unit.removesuffix("/s") if one.kind == "rate" else one.unit)
     if one.kind == "column":
-        return [values]
+        return [trailing_mean(values, 1 if math.isnan(one.window_s) else round(one.window_s * recording.rate_hz))]
     return [(values - np.interp(t - one.window_s, t, values)) / one.window_s]
+
+
+def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """float64[n]: mean of the last `window` values at each, of fewer at the beginning: a module can form it too."""
+    if window <= 1:
+        return values
+    offset = values[0]
+    total = np.concatenate([[0.0], np.cumsum(values - offset)])
+    end = np.arange(1, values.size + 1)
+    start = np.maximum(end - window, 0)
+    return np.asarray((total[end] - total[start]) / (end - start) + offset)
 
 
 def offered(model: Model, axis: str) -> Choice:
@@ -106,6 +118,8 @@ def mask_of(regressors: Choice, choice: Choice) -> int:
 def coefficient_unit(unit: str, regressor: str) -> str:
     """Unit of a coefficient: `unit` of the axis per unit of the `regressor`; deg/s per degC/s is deg/s/degC*s."""
     swap = str.maketrans("*/", "/*")
+    if unit == regressor:  # another axis of the same kind
+        return "1"
     return unit if regressor == "1" else f"{unit}/{regressor.translate(swap)}"
 
 

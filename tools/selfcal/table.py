@@ -117,6 +117,8 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         ]
         if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
             failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
+    if any(line.startswith("not adequate") for line in failed):
+        failed.append(f"why, and what mends it: selfcal diagnose {printable(recording['path'])}")
     return table, [*kept, *failed]
 
 

@@ -20,7 +20,15 @@ from rich.console import Console
 from rich.progress import wrap_file
 
 from selfcal.errors import UserError, note, short
-from selfcal.limits import BLOCK_BYTES, LONGEST_HEADING, MOST_COLUMNS, MOST_LEADING_LINES, MOST_NUMBERS, reading
+from selfcal.limits import (
+    BLOCK_BYTES,
+    LONGEST_HEADING,
+    MOST_COLUMNS,
+    MOST_GROWTH,
+    MOST_LEADING_LINES,
+    MOST_NUMBERS,
+    reading,
+)
 
 #: Bytes of a file from which on reading it shows its progress.
 _SLOW_BYTES = 1 << 26
@@ -210,6 +218,7 @@ class _Lines:
         self.path, self.stream = path, stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
+        self._packed, self._unpacked = path.stat().st_size if path.suffix.lower() == ".gz" else 0, 0
 
     def more(self) -> list[str]:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
@@ -224,6 +233,10 @@ class _Lines:
                 if b"\0" in self._carry:
                     self._text(self._carry)  # says so
                 raise UserError(f"{self.path}: line {self._next + 1}: longer than {BLOCK_BYTES:,} bytes")
+            self._unpacked += len(block)
+            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
+                more = f"unpacks to more than {MOST_GROWTH} times its size"
+                raise UserError(f"{self.path}: {more}: no sensor's readings do")
             if end:
                 lines = self._text(data[:end]).replace("\r\n", "\n").removesuffix("\n").split("\n")
                 self.number, self._next = self._next, self._next + len(lines)

@@ -61,6 +61,13 @@ if [ -n "$missing" ]; then
     fi
 fi
 
+# Only the tests of the diagnosis page want a browser; they are skipped without one.
+if ! have chromium >/dev/null; then
+    { [ "$(id -u)" -eq 0 ] && have apt-get >/dev/null &&
+        DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null 2>&1; } ||
+        echo "No chromium: the tests of the diagnosis page in a browser will be skipped" >&2
+fi
+
 "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
     echo "$PYTHON is $("$PYTHON" -V 2>&1); 3.11 or later is needed (make PYTHON=... names another)" >&2
     exit 1

@@ -11,24 +11,26 @@ from selfcal.diagnosis import findable, words
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
+from selfcal.document import recording_entry
 from selfcal.recording import Recording
 
 SCHEMA = "selfcal.diagnose/1"
 
 
 def to_document(
-    recording: Recording, record: Record, found: Mapping[str, Diagnosed], model: Mapping[str, Any]
+    recording: Recording,
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    errors: Mapping[str, str],
+    model: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The document, in the units of the recording's columns. `model`: the extended model file's tree."""
+    """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
+    model file's tree."""
+    axes = {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()}
     return {
         "schema": SCHEMA,
-        "recording": {
-            "path": str(recording.path),
-            "rate_hz": recording.rate_hz,
-            "samples": recording.samples,
-            "duration_s": recording.duration_s,
-        },
-        "axes": {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()},
+        "recording": recording_entry(recording),
+        "axes": {**axes, **{name: {"error": reason} for name, reason in errors.items()}},
         "model": dict(model),
     }
 

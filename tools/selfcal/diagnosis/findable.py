@@ -38,7 +38,7 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         "periodic": np.sin(2.0 * math.pi * frequency * t),
     }
     for cause, values in record.channels.items():
-        columns[cause] = smoothed(values, max(1, round(record.rate_hz))) - float(values.mean())
+        columns[cause] = smoothed(values, round(10.0 * record.rate_hz)) - float(values.mean())
     for name, values in record.other_axes(state.axis).items():
         columns[f"axis_{name}"] = values
     least = {cause: _least(state, values, NET_LEAST) for cause, values in columns.items()}

@@ -159,10 +159,8 @@ def best(fits: Sequence[Fit]) -> Fit:
     return max(fits, key=lambda one: one.ln_likelihood)
 
 
-def moved(fit_: Fit, terms: Terms, other: Fit | None = None) -> Array:
-    """A start for `terms` from another model's fit: shared parameters are kept, then those of `other`; new ones begin
-    small."""
-    known = {} if other is None else dict(zip(other.terms.names, other.theta, strict=True))
-    known |= dict(zip(fit_.terms.names, fit_.theta, strict=True))
+def moved(fit_: Fit, terms: Terms) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small."""
+    known = dict(zip(fit_.terms.names, fit_.theta, strict=True))
     fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
-    return np.array([known.get(name, fresh.get(name, -2.0 if name.startswith("ln_") else 0.0)) for name in terms.names])
+    return np.array([known.get(name, fresh.get(name, 0.0)) for name in terms.names])

@@ -21,7 +21,9 @@ LATTICE_LEAST = 0.5
 #: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
 MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 #: A burst counts from this worth on, net of the search; several that each could be chance are none together.
-BURST_LEAST = 1.5
+BURST_LEAST = 2.5
+#: All bursts together, nats net: more than for another cause, since lattices and drifts of several axes join in.
+MOTION_LEAST = 11.0
 #: What the axes beside the strongest must show, nats: an event of one axis meets chance on the others.
 REST_PRICE = 4.0
 
@@ -29,10 +31,11 @@ REST_PRICE = 4.0
 def missing(record: Record) -> tuple[Look, Mask] | None:
     """Gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is those."""
     held = _held(record)
-    gone = int((~record.present).sum() + held.sum())
-    if gone <= MISSING_LEAST * record.present.size:
-        return None
+    gone = record.missing + int(held.sum())
+    span = max(record.present.size, record.missing)
     where = np.flatnonzero(~record.present | held) / record.rate_hz
+    if gone <= MISSING_LEAST * span or not where.size:
+        return None
     look = Look(
         "missing_samples",
         float(gone),
@@ -134,7 +137,7 @@ def _unclipped(state: State, at_edge: Mask, edge: float, sign: int) -> State:
         drawn = predicted + s * truncnorm.rvs(low, np.inf, random_state=random)
         y = state.y.copy()
         y[at_edge] = sign * drawn
-        state = state.refit(y=y)
+        state = state.refit(y=y, redrawn=True)
     return state
 
 
@@ -167,8 +170,8 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         strongest = gain.argmax(axis=0)
         rest = gain.sum(axis=0) - gain.max(axis=0)
         others = (mean.sum(axis=0) - np.take_along_axis(mean, strongest[None], axis=0)[0]) / (count - 1)
-        # Windows half a length apart, of every length.
-        ln_looks = math.log(2.0 * n / window) + math.log(len(MOTION_S))
+        # Windows a quarter of a length apart, of every length.
+        ln_looks = math.log(4.0 * n / window) + math.log(len(MOTION_S))
         each = -chi2.logsf(2.0 * gain.sum(axis=0), count)  # a size of its own on every axis
         common = -chi2.logsf(window * count * _excess(mean.mean(axis=0)), 1)  # one size on all
         beside = np.maximum(-chi2.logsf(2.0 * rest, count - 1), -chi2.logsf(window * (count - 1) * _excess(others), 1))
@@ -181,10 +184,10 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         at = int(np.argmax(left))
         a, b = max(0, at - int(half[at])), min(n, at + int(half[at]) + 1)
         bursts.append((a, b))
-        total += float(left[at]) + math.log(len(bursts))
+        total += float(left[at])
         margin = max(1, round(2.0 * rate))
         left[max(0, a - margin) : b + margin] = 0.0
-    if total < NET_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
+    if total < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
     pad = max(1, round(0.5 * rate))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 from selfcal.diagnosis import integrity
@@ -29,8 +31,8 @@ CERTAIN = 50.0
 ROUNDS = 10
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
-#: The statistics together call an axis inadequate by chance once in so many records.
-P_UNEXPLAINED = 1.5e-3
+#: Probability that the statistics together call an axis of a fitting record inadequate.
+P_UNEXPLAINED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,38 +67,54 @@ def diagnose_record(
     record: Record, axes: Sequence[str], advance: Callable[[str], None] = lambda text: None
 ) -> dict[str, Diagnosed]:
     """Walk the loop on every axis of `axes`; the others of the record serve as side channels."""
-    states: dict[str, State] = {}
-    for name, state in record.axes.items():
-        advance(f"{name}: fit")
-        states[name] = state.refit()
+    advance("fit")
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        states = dict(zip(record.axes, pool.map(lambda state: state.refit(), record.axes.values()), strict=True))
+    # An axis below its stated lattice is judged by nobody, and explains nobody.
+    left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
+    states = {name: state for name, state in states.items() if name not in left_out}
+    axes = [name for name in axes if name not in left_out]
     record = replace(record, axes=states)
     found = {name: Diagnosed(states[name], states[name]) for name in axes}
-    # Lines and colour first: motion is what stands out of the noise once these are known.
-    for name in states:
-        one = found.get(name) or Diagnosed(states[name], states[name])
-        _rounds(record, one, advance, STATIONARY, CERTAIN)
-        states[name] = one.state
-    record = replace(record, axes=states)
-    record = _integrity(record, found)
-    for name in axes:
-        _rounds(record, found[name], advance)
-    _directions(record, found)
-    _share(found)
-    for name in axes:
-        advance(f"{name}: statistics")
-        _unexplained(found[name])
-        one = found[name]
-        one.before = judged(one.first, seed=1) if one.findings else one.after
+    record = _integrity(record, found, advance)
+    # Threads: nearly all the time goes into the compiled filter and the transforms, which run side by side.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(lambda name: _rounds(record, found[name], advance), axes))
+        _directions(record, found)
+        _share(found)
+        list(pool.map(lambda name: _end(found[name], advance), axes))
     return found
 
 
-def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+def _stated(state: State) -> bool:
+    """Whether the model file states the lattice."""
+    return state.stated_lsb > 0.0 and abs(state.lsb / state.stated_lsb - 1.0) < 0.02
+
+
+def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
+    """What is left over, and the statistics of the model that the loop began with."""
+    advance(f"{one.state.axis}: statistics")
+    _unexplained(one)
+    one.before = judged(one.first, seed=1) if one.findings and not one.first.below_lattice else one.after
+
+
+def _provisional(state: State, record: Record, advance: Callable[[str], None]) -> State:
+    """The state with the lines and the colour that are beyond doubt: motion is what stands out of such noise."""
+    one = Diagnosed(state, state)
+    _rounds(record, one, advance, STATIONARY, CERTAIN)
+    return one.state
+
+
+def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
         masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
-    moved = integrity.motion(record)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        quieted = pool.map(lambda state: _provisional(state, record, advance), states.values())
+        quiet = dict(zip(states, quieted, strict=True))
+    moved = integrity.motion(replace(record, axes=quiet)) if len(states) > 1 else {}
     if moved:
         mask = next(iter(moved.values()))[1]
         for name in states:
@@ -109,7 +127,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed]) -> Record:
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
-        clipped = integrity.saturation(states[name])
+        clipped = None if states[name].below_lattice else integrity.saturation(states[name])
         if clipped is not None:
             if name in found:
                 found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
@@ -134,6 +152,8 @@ def _rounds(
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
     for number in range(first, ROUNDS + 1):
+        if one.state.below_lattice:
+            return
         advance(f"{one.state.axis}: round {number}")
         looks = sorted(
             (look for cause in causes for look in cause(one.state, record)), key=lambda look: look.net, reverse=True
@@ -150,7 +170,10 @@ def _rounds(
 
 
 def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Two axes that each blame the other: the reading that follows is the one that gains more by it."""
+    """Two axes that each blame the other: the reading that follows is the one that gains more by it.
+
+    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
+    coupling is kept: a mechanical one is below 1."""
     pairs = {
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
@@ -159,8 +182,17 @@ def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
     }
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
-        if back is not None and back.look.gain > finding.look.gain:
-            found[name].findings.remove(finding)
+        if back is None:
+            continue
+        ahead = back.look.gain - finding.look.gain
+        if abs(ahead) < ALIKE:
+            sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
+            ahead = sizes[0] - sizes[1]
+        if ahead > 0.0:
+            one = found[name]
+            one.findings.remove(finding)
+            kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
+            one.state = one.state.refit(regressors=kept)
 
 
 def _share(found: Mapping[str, Diagnosed]) -> None:
@@ -187,6 +219,8 @@ def _same(a: Look, b: Look) -> bool:
 
 
 def _unexplained(one: Diagnosed) -> None:
+    if one.state.below_lattice:
+        return
     one.after = judged(one.state, seed=1)
     p = combined(one.after)
     if p < P_UNEXPLAINED:

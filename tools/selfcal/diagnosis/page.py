@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shlex
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -22,7 +20,7 @@ from selfcal.diagnosis.chart import Figure, draw, number, scrolled
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.words import WORDS
-from selfcal.errors import UserError
+from selfcal.output import write_text
 
 #: Bytes of the page without its style, at most.
 SIZE_MOST = 990_000
@@ -91,26 +89,7 @@ code{font-size:.92em;overflow-wrap:anywhere}
 
 def write_page(path: Path | str, document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    text = page(document, record, found)
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o666 & ~_umask())
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise UserError(f"{path}: cannot write the report: {error.strerror or error}") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    write_text(path, page(document, record, found))
 
 
 def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> str:
@@ -137,12 +116,13 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
 
 
 def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    axes: Mapping[str, Mapping[str, Any]] = document["axes"]
+    axes = {axis: entry for axis, entry in document["axes"].items() if "error" not in entry}
+    failed = {axis: str(entry["error"]) for axis, entry in document["axes"].items() if "error" in entry}
     sections: list[list[_Part]] = []
     for k, (axis, entry) in enumerate(axes.items()):
         sections.append(list(_axis(k, axis, entry, record, found[axis])))
     rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading()]
-    parts = [_Part(text) for text in (*_summary(axes), *_contents(axes))]
+    parts = [_Part(text) for text in (*_summary(axes, failed), *_contents(axes))]
     parts += [part for section in sections for part in section]
     parts += [_Part(text) for text in rest]
     return _within(parts, SIZE_MOST)
@@ -193,7 +173,7 @@ def _cause(cause: str) -> str:
     return escape(cause.replace("_", " "))
 
 
-def _summary(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _summary(axes: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> Iterator[str]:
     bad = [name for name, entry in axes.items() if entry["verdict"] != "adequate"]
     good = [name for name in axes if name not in bad]
     yield "<section aria-labelledby=findings><h2 id=findings>What was found</h2>"
@@ -207,6 +187,8 @@ def _summary(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             f"<p><span class=good>✓ Adequate: {escape(', '.join(good))}.</span> "
             "Nothing in the recording speaks against the model.</p>"
         )
+    for axis, error in failed.items():
+        yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
     groups = _grouped(axes)
     if groups:
         yield "<ol class=findings>"

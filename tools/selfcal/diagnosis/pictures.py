@@ -134,6 +134,8 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
     if cause in ("temperature", "supply", "cross_axis", "ramp", "step"):
         return [_series(finding, record, factor, unit), *_evidence(finding, record)]
     if cause == "periodic":
+        if not np.ptp(_effect(finding)) > 0.0:  # a band about a frequency that wanders, a term of the noise
+            return [_spectrum(before, after, factor, unit), _correlation(before, after)]
         return [_line(finding, factor, unit), *_evidence(finding, record)]
     if cause == "flicker":
         return [_allan(before, after, factor, unit)]
@@ -144,11 +146,11 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
     if cause == "outliers":
         return [_largest(finding, record), _histogram(before, after)]
     if cause == "motion":
-        return [_largest(finding, record)]
+        return [_largest(finding, record), _level(finding, record, pieces=POINTS // 2)]
     if cause in ("quantization", "saturation"):
         return [_readings(finding, factor, unit)]
     if cause == "missing_samples":
-        return [_missing(record)]
+        return [_missing(finding, record)]
     return [_unexplained(finding, record, factor, unit)]
 
 
@@ -303,7 +305,7 @@ def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz
 
 
-def _reduced(edges: Indices, values: Array) -> Array:
+def _reduced(edges: Indices, values: Array | NDArray[np.bool_]) -> Array:
     """Mean of the finite values in each piece."""
     good = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -311,8 +313,8 @@ def _reduced(edges: Indices, values: Array) -> Array:
         return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
 
 
-def _level(finding: Finding, record: Record, means: bool = False) -> Compared:
-    edges, middle = _pieces(record, PIECES)
+def _level(finding: Finding, record: Record, means: bool = False, pieces: int = PIECES) -> Compared:
+    edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
 
     def summary(y: Array, w: Array) -> Array:
@@ -327,7 +329,9 @@ def _level(finding: Finding, record: Record, means: bool = False) -> Compared:
         middle,
         (finding.before, finding.after),
         (summary, summary),
-        marks=finding.look.when[:1] if finding.look.when and finding.look.cause == "variance_change" else (),
+        marks=finding.look.when[:1]
+        if finding.look.when and finding.look.cause in ("variance_change", "motion")
+        else (),
     )
 
 
@@ -415,16 +419,19 @@ def _readings(finding: Finding, factor: float, unit: str) -> Compared:
     )
 
 
-def _missing(record: Record) -> Figure:
+def _missing(finding: Finding, record: Record) -> Figure:
+    """Gaps in the stamps, and rows that the logger held."""
     edges, middle = _pieces(record, POINTS // 2)
-    share = _reduced(edges, (~record.present.astype(bool)).astype(float)) * 100.0
-    gone = np.flatnonzero(~record.present.astype(bool))
-    runs = np.split(gone, np.flatnonzero(np.diff(gone) > 1) + 1) if gone.size else []
+    before, after = finding.before.y, finding.after.y
+    held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
+    gone = held | ~record.present.astype(bool)
+    where = np.flatnonzero(gone)
+    runs = np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if where.size else []
     longest = max((run.size for run in runs), default=0)
     return Figure(
         "Missing samples",
-        f"{gone.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
-        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, share)])],
+        f"{where.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
+        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * _reduced(edges, gone))])],
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,9 @@ from selfcal.recording import Recording
 
 #: Columns that are no axis but may explain one, by cause: name and unit.
 CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
+#: LSB over the noise of a reading from which on an axis counts as below its lattice: rounding alone has a standard
+#: deviation of lsb / sqrt(12), so the white noise itself is then below a third of an LSB.
+BELOW_LATTICE = 2.2
 #: Samples that a diagnosis needs at least.
 LEAST = 200
 
@@ -23,13 +27,15 @@ LEAST = 200
 @dataclass(frozen=True)
 class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
-    [n] in degC and V, bridged where samples are missing; `channel_names` their columns."""
+    [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `missing` samples of the
+    recording, at its own rate."""
 
     rate_hz: float
     axes: Mapping[str, State]
     channels: Mapping[str, Array]
     channel_names: Mapping[str, str]
     present: Mask
+    missing: int = 0
 
     @property
     def time_s(self) -> Array:
@@ -45,6 +51,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
 
     `decimate`, Hz: means of whole blocks at the rate nearest to it; a block of which half is missing is missing.
     """
+    if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
+        raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
     at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
     at -= at[0]
     block = 1 if decimate is None else max(1, round(recording.rate_hz / decimate))
@@ -70,6 +78,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if not np.ptp(values) > 0.0:
             continue
         y = on_grid(values)
+        q = lattice(values)
         level = float(np.nanmedian(y))
         states[name] = State(
             axis=name,
@@ -78,8 +87,10 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             dt=block / recording.rate_hz,
             level=level,
             r=np.where(present, block / np.maximum(used, 1), 1.0),
-            lsb=lattice(values) if block == 1 else 0.0,
+            lsb=q if block == 1 else 0.0,
             stated_lsb=group.lsb,
+            redrawn=block > 1,
+            below_lattice=q > BELOW_LATTICE * float(np.diff(values).std()) / math.sqrt(2.0),
         )
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
@@ -89,7 +100,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             if np.ptp(values) > 0.0:
                 channels[cause] = bridged(on_grid(values))
                 names[cause] = column
-    return Record(recording.rate_hz / block, states, channels, names, present)
+    return Record(recording.rate_hz / block, states, channels, names, present, int(recording.missing_before.sum()))
 
 
 def bridged(values: Array) -> Array:
@@ -105,7 +116,7 @@ def lattice(values: Array) -> float:
     """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
     where every difference is a whole multiple of it."""
     unique = np.unique(values)
-    if unique.size < 3 or unique.size > max(50, values.size // 4):
+    if unique.size < 2:
         return 0.0
     gaps = np.diff(unique)
     gaps = gaps[gaps > 1e-9 * max(np.ptp(unique), np.abs(unique).max())]
@@ -118,5 +129,5 @@ def lattice(values: Array) -> float:
 
 
 def smoothed(values: Array, window: int) -> Array:
-    """Centred mean over `window` samples."""
-    return values if window <= 1 else uniform_filter1d(values, window, mode="nearest")
+    """Centred mean over `window` samples. It has no lag: the size that it shows is the cause's own."""
+    return values if window <= 1 else np.asarray(uniform_filter1d(values, window, mode="nearest"))

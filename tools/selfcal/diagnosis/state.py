@@ -14,7 +14,7 @@ from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 3e-4
+P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
@@ -40,7 +40,10 @@ class State:
     """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
 
     `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
-    theirs. `lsb`: the lattice the values lie on (0: none), `stated_lsb` the model file's.
+    theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
+    they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
+    noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
+    the model file's.
     """
 
     axis: str
@@ -56,7 +59,8 @@ class State:
     fits: tuple[Fit, ...] = ()
     whitened: Array = field(default_factory=lambda: np.empty(0))
     variance: Array = field(default_factory=lambda: np.empty(0))
-    causes: tuple[str, ...] = ()
+    redrawn: bool = False
+    below_lattice: bool = False
 
     @property
     def series(self) -> Series:
@@ -116,9 +120,8 @@ def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     if same:
         return fit(series, terms, same[0].theta, step=0.5)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
-    richest = max(known, key=lambda one: len(one.terms.names), default=None)
-    if near and richest is not None:
-        return fit(series, terms, moved(near[0], terms, richest))
+    if near:
+        return fit(series, terms, moved(near[0], terms))
     return fit(series, terms)
 
 

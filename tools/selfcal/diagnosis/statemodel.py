@@ -25,13 +25,17 @@ SIZE_LIMITS = (1e-5, 1e2)
 @dataclass(frozen=True)
 class Terms:
     """The terms of a noise model beside white noise: the drift's, 1/f noise, the colour of the white noise, and narrow
-    bands (oscillators, each about its own `bands` frequency in Hz)."""
+    bands (oscillators driven by noise).
+
+    `bands`: those found, each with its frequency in Hz, half width in Hz and ln of its size, all fixed: refitting them
+    with every later cause would cost much and change little. `trial`, Hz: one more, whose numbers are fitted."""
 
     walk: bool = False
     markov: bool = False
     flicker: bool = False
     color: Literal["", "ma", "ar"] = ""
-    bands: tuple[float, ...] = ()
+    bands: tuple[tuple[float, float, float], ...] = ()
+    trial: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -41,8 +45,7 @@ class Terms:
         names += ["ln_markov", "ln_alpha"] if self.markov else []
         names += ["ln_flicker"] if self.flicker else []
         names += ["color"] if self.color else []
-        for k in range(len(self.bands)):
-            names += [f"ln_band{k}", f"ln_width{k}", f"shift{k}"]
+        names += ["ln_band", "ln_width", "shift"] if self.trial is not None else []
         return tuple(names)
 
     def limits(self, dt: float) -> list[tuple[float, float]]:
@@ -54,9 +57,9 @@ class Terms:
                 found.append((math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])))
             elif name == "color":
                 found.append((-2.6, 2.6))
-            elif name.startswith("ln_width"):
+            elif name == "ln_width":
                 found.append((math.log(1e-4), math.log(0.3 / dt)))
-            elif name.startswith("shift"):
+            elif name == "shift":
                 found.append((-0.1, 0.1))
             else:
                 found.append(size)
@@ -75,9 +78,10 @@ class Matrices:
 
 
 def flicker_rates(duration_s: float, dt: float) -> Array:
-    """Correlation rates, 1/s, a decade apart, of the Gauss-Markov terms that together make 1/f noise over a record."""
-    low, high = math.log10(0.5 / duration_s), math.log10(1.0 / dt)
-    count = max(2, min(7, math.ceil(high - low)))
+    """Correlation rates, 1/s, of the Gauss-Markov terms that together make 1/f noise over a record: a decade apart or a
+    little less, from a third of a turn in the record to beyond half the sampling rate."""
+    low, high = math.log10(2.0 / duration_s), math.log10(4.0 / dt)
+    count = max(2, min(8, 1 + math.ceil(high - low)))
     return np.logspace(low, high, count)
 
 
@@ -131,9 +135,12 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         )
         h += [1.0, m]
         R = 1e-9
-    for k, frequency in enumerate(terms.bands):
-        variance, width = math.exp(2.0 * value[f"ln_band{k}"]), math.exp(value[f"ln_width{k}"])
-        turn = 2.0 * math.pi * frequency * math.exp(value[f"shift{k}"]) * dt
+    bands = list(terms.bands)
+    if terms.trial is not None:
+        bands.append((terms.trial * math.exp(value["shift"]), math.exp(value["ln_width"]), value["ln_band"]))
+    for frequency, width, ln_size in bands:
+        variance = math.exp(2.0 * ln_size)
+        turn = 2.0 * math.pi * frequency * dt
         f = math.exp(-2.0 * math.pi * width * dt)
         F = _joined(F, f * np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]))
         Q = _joined(Q, np.eye(2) * variance * (1.0 - f * f))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.state import State
@@ -19,6 +20,8 @@ from selfcal.diagnosis.statemodel import Array, matrices
 
 #: Simulated records a band rests on.
 ENSEMBLE = 48
+#: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
+LEAST_SPREAD = {"longest_repeat": 0.25}
 #: Lags of the correlation, roughly a factor 1.6 apart.
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 
@@ -34,8 +37,8 @@ class Statistic:
     p: float
 
 
-def all_statistics(w: Array, y: Array, lsb: float) -> dict[str, float]:
-    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]."""
+def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
+    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
@@ -94,6 +97,8 @@ def all_statistics(w: Array, y: Array, lsb: float) -> dict[str, float]:
         high = low
     if places:
         found["spectrum_worst_third_octave"] = worst
+    if y is None:
+        return found
     # Readings that repeat the one before, beyond what the lattice makes them.
     step = np.diff(y)
     both = np.isfinite(step)
@@ -190,7 +195,7 @@ def whitened_of(state: State, y: Array) -> Array:
 
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
     """Every statistic of the state against its band; the most striking first."""
-    measured = all_statistics(state.whitened, state.y, state.lsb)
+    measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb)
     random = np.random.default_rng(seed)
     rows: dict[str, list[float]] = {name: [] for name in measured}
     for _ in range(count):
@@ -203,12 +208,10 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic
         sample = np.array(rows[name])
         if sample.size < 8:
             continue
-        mean, sd = float(sample.mean()), float(max(sample.std(ddof=1), 0.05))
+        mean, sd = float(sample.mean()), float(max(sample.std(ddof=1), LEAST_SPREAD.get(name, 0.05)))
         # Student's t of a new value against the ensemble: its spread is known to 1/sqrt(2 count).
         z = (value - mean) / (sd * math.sqrt(1.0 + 1.0 / sample.size))
         freedom = sample.size - 1
-        from scipy.stats import t as student
-
         p = 2.0 * float(student.sf(abs(z), freedom)) if abs(z) < 8 else 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
         half = float(student.isf(0.005, freedom)) * sd
         found.append(Statistic(name, value, mean - half, mean + half, p))

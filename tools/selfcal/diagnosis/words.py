@@ -43,27 +43,31 @@ NEXT: Mapping[str, str] = {
 }
 
 
+#: How an estimate's key is read out.
+LABELS = {"time_s": "at", "frequency_hz": "frequency", "width_hz": "half width"}
+
+
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     """The cause with its size."""
     parts = []
     for key, value in estimate.items():
+        label = LABELS.get(key, key)
         if isinstance(value, Mapping):
             half = 0.5 * (value["q95"] - value["q05"])
             unit = "" if value["unit"] == "1" else f" {value['unit']}"
             spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
-            parts.append(f"{key.replace('_', ' ')} {value['median']:.4g}{spread}{unit}")
+            parts.append(f"{label} {value['median']:.6g}{spread}{unit}")
         else:
-            parts.append(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}")
-    return f"{WORDS[cause]} {', '.join(parts)}."
+            parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
+    text = ", ".join(parts)
+    return f"{WORDS[cause]} {text[:1].upper()}{text[1:]}."
 
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [
-        f"{name} {'by any factor' if not math.isfinite(factor) else f'{factor:.2f} times'}"
+        f"{name} {f'{factor:.2f} times' if math.isfinite(factor) else 'many times'} the value with it"
         for name, factor in inflation.items()
         if not 0.95 < factor < 1.05
     ]
-    if not told:
-        return ""
-    return f"Without it, plain white noise and random walk come out too large: {', '.join(told)}."
+    return f"Without it, plain white noise and random walk come out wrong: {', '.join(told)}." if told else ""

@@ -50,17 +50,21 @@ def diagnose(
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)
     record = of_recording(recording, loaded, decimate)
-    stuck = [name for name in names if name not in record.axes]
-    names = tuple(name for name in names if name in record.axes)
-    if not names:
-        raise UserError(f"{recording.path}: every reading of {', '.join(stuck)} is the same: choose others with --axis")
+    judged = [name for name in names if name in record.axes]
+    errors = {name: "every reading is the same" for name in names if name not in judged}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("diagnose", total=None)
-        found = diagnose_record(record, names, lambda text: progress.update(task, description=text))
+        found = diagnose_record(record, judged, lambda text: progress.update(task, description=text))
+        for name in judged:
+            if name not in found:
+                errors[name] = "its noise is below the lattice of its readings: record with a finer range"
+        if not found:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
+            raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
         progress.update(task, description="held-out gain")
         tree = extended(loaded, record, found)
-        document = to_document(recording, record, found, tree)
+        document = to_document(recording, record, found, errors, tree)
     if write_model is not None:
         write_text(write_model, as_text(tree, recording.path))
     if report is not None:
@@ -75,17 +79,17 @@ def diagnose(
 def failing(document: Mapping[str, Any], wanted: str) -> bool:
     """Whether `--fail-on` applies: `inadequate`, or the id of a cause that some axis shows."""
     for axis in document["axes"].values():
-        if wanted == "inadequate" and axis["verdict"] != "adequate":
+        if wanted == "inadequate" and axis.get("verdict") != "adequate":
             return True
-        if any(finding["cause"] == wanted for finding in axis["findings"]):
+        if any(finding["cause"] == wanted for finding in axis.get("findings", [])):
             return True
     return False
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
     recording = document["recording"]
-    console = Console()
+    console = Console(stderr=to_stderr)
     console.print(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s\n",
@@ -93,11 +97,15 @@ def show(document: Mapping[str, Any]) -> None:
         markup=False,
     )
     for name, axis in document["axes"].items():
+        if "error" in axis:
+            console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)
+            continue
         colour = "green" if axis["verdict"] == "adequate" else "bold red"
-        console.print(f"{name} [{axis['unit']}]: {axis['verdict']}", style=colour, highlight=False, markup=False)
+        heading = f"{name} [{axis['unit']}]: {axis['verdict']}"
+        console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):
-                console.print(f"  {line}", highlight=False, markup=False)
+                console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:

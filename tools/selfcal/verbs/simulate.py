@@ -92,9 +92,9 @@ def simulate(
     """Write the recording that a model file's `simulate` entry describes and return its metadata, the truth included.
 
     `model_path` None is the default model. What the entry leaves open is drawn from the priors, the hypothesis by its
-    prior probability. `effects`: texts ID[:key=value,...]; without `axis=` an effect is on every axis. The same
-    arguments give the same recording. Raises UserError for whatever is wrong with the arguments or the model file, or
-    if `output` cannot be written.
+    prior probability. `effects`, after those of the entry itself: texts ID[:key=value,...]; without `axis=` an effect
+    is on every axis. The same arguments give the same recording. Raises UserError for whatever is wrong with the
+    arguments or the model file, or if `output` cannot be written.
     """
     model = Model.load(model_path)
     check_place(output)
@@ -104,7 +104,7 @@ def simulate(
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = _truth(model, seed)
     axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
-    applied = [_apply(text, model, scene, axes) for text in effects]
+    applied = [_apply(text, model, scene, axes) for text in (*_own_effects(model), *effects)]
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
@@ -142,6 +142,14 @@ def show(meta: Mapping[str, Any], output: Path | str) -> None:
     for axis, truth in meta["truth"].items():
         values = (f"{key} {truth[key]:.4g} {truth['units'][key]}" for key in ("bias", *LAWS[truth["hypothesis"]]))
         print(f"  {axis}: {truth['hypothesis']}, {', '.join(values)}")
+
+
+def _own_effects(model: Model) -> list[str]:
+    """The effects that the model file's `simulate` entry states, as a diagnosis writes them."""
+    texts = model.simulate.get("effects") or []
+    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+        raise UserError(f"{model.path}: simulate.effects: must be a list of texts ID[:key=value,...]")
+    return texts
 
 
 def _scene(model: Model, seed: int) -> _reference.Scene:

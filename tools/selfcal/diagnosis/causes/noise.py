@@ -105,7 +105,7 @@ def variance_change(state: State, record: Record) -> list[Look]:
     edge = max(20, n // 200)
     if n < 4 * edge:
         return []
-    square = np.minimum(w * w, 12.0)  # one wild sample is no change of the noise
+    square = np.minimum(w * w, 12.0) + 1e-12  # one wild sample is no change of the noise
     total = np.cumsum(square)
     k = np.arange(1, n)
     first, second = total[:-1] / k, (total[-1] - total[:-1]) / (n - k)
@@ -163,7 +163,7 @@ def outliers(state: State, record: Record) -> list[Look]:
         weight = np.exp(b - both)
         share = min(0.3, max(0.3 / n, float(weight.mean())))
         wide = max(2.5 * core, math.sqrt(float(weight @ x**2 / max(weight.sum(), 1e-12))))
-        core = math.sqrt(float((1.0 - weight) @ x**2 / (1.0 - weight).sum()))
+        core = max(1e-6, math.sqrt(float((1.0 - weight) @ x**2 / max(1e-12, (1.0 - weight).sum()))))
         if value - before < 1e-4:
             break
         before = value

@@ -24,6 +24,8 @@ BAND_LEAST = 12.0
 BAND_DEARER = 6.0
 #: Bands that one model may have.
 BANDS_MOST = 3
+#: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
+NARROW = 4
 
 
 def looks(state: State, record: Record) -> list[Look]:
@@ -47,7 +49,7 @@ def _band(state: State, record: Record) -> list[Look]:
             break
         mean = uniform_filter1d(power, width, mode="reflect")
         gain = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
-        gain[: low + width] = 0.0
+        gain[: max(low + width, NARROW * width)] = 0.0
         at = int(np.argmax(gain))
         if best is None or gain[at] > best[0]:
             best = (float(gain[at]), at, width)
@@ -57,22 +59,20 @@ def _band(state: State, record: Record) -> list[Look]:
     if net(best[0], 2, ln_places) < BAND_LEAST or len(state.extras.bands) >= BANDS_MOST:
         return []
     f, width_hz = best[1] / (n * state.dt), best[2] / (n * state.dt)
-    extras = replace(state.extras, bands=(*state.extras.bands, f))
-    k = len(state.extras.bands)
-    terms = replace(state.best.terms, bands=extras.bands)
+    terms = replace(state.best.terms, trial=f)
     start = moved(state.best, terms)
-    start[terms.names.index(f"ln_band{k}")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
-    start[terms.names.index(f"ln_width{k}")] = math.log(max(1.1e-4, 0.3 * width_hz))
+    start[terms.names.index("ln_band")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
+    start[terms.names.index("ln_width")] = math.log(max(1.1e-4, 0.3 * width_hz))
     chosen = fit(state.series, terms, start, step=0.5)
     gain_of_fit = chosen.ln_likelihood - state.best.ln_likelihood
     worth = net(gain_of_fit, 3, ln_places)
-    if worth < 1.0:
+    centre = f * math.exp(chosen.value("shift"))
+    half_width = math.exp(chosen.value("ln_width"))
+    if worth < 1.0 or half_width * NARROW > centre:
         return []
-    centre = f * math.exp(chosen.value(f"shift{k}"))
-    half_width = math.exp(chosen.value(f"ln_width{k}"))
-    rms = chosen.sigma * math.exp(chosen.value(f"ln_band{k}"))
+    extras = replace(state.extras, bands=(*state.extras.bands, (centre, half_width, chosen.value("ln_band"))))
+    rms = chosen.sigma * math.exp(chosen.value("ln_band"))
     turns = max(1.0, half_width * n * state.dt)
-    fits = tuple(one for one in (*state.fits, chosen))
     return [
         Look(
             "periodic",
@@ -83,7 +83,7 @@ def _band(state: State, record: Record) -> list[Look]:
                 "amplitude": interval(rms * math.sqrt(2.0), rms / math.sqrt(turns), state.unit),
                 "width_hz": interval(half_width, half_width / math.sqrt(turns), "Hz"),
             },
-            {"extras": extras, "fits": fits},
+            {"extras": extras},
             shown_by="band",
         )
     ]

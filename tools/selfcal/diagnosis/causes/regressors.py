@@ -15,8 +15,9 @@ from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, i
 from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
-#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does.
-SMOOTHING_S = (1.0, 10.0, 60.0)
+#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
+#: file's window is as wide and trails: a module has no later values.
+SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
 #: Bands of equal information that must agree on another axis' coefficient.
 BANDS = 16
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
@@ -28,7 +29,7 @@ def looks(state: State, record: Record) -> list[Look]:
     found: list[Look] = []
     known = {one.name for one in state.regressors}
     t = record.time_s
-    middle = 0.5 * t[-1]
+    middle = float(0.5 * t[-1])
     if "time" not in known:
         found += _linear(
             state, "ramp", [Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})], "slope"
@@ -44,8 +45,9 @@ def looks(state: State, record: Record) -> list[Look]:
             smooth = smoothed(values, window)
             reference = float(np.round(smooth.mean(), 3))
             entry = {"kind": "column", "column": column, "unit": unit, "reference": reference}
+            entry |= {"window_s": width} if window > 1 else {}
             options.append(Regressor(cause, cause, smooth - reference, unit, entry))
-            if window >= 60.0 * record.rate_hz or window >= values.size // 10:
+            if window >= values.size // 10:
                 break
         found += _linear(state, cause, options, "coefficient", LN_SMOOTHINGS)
     others = record.other_axes(state.axis)
@@ -99,8 +101,10 @@ def _linear(state: State, cause: str, options: list[Regressor], key: str, ln_loo
     screen = state.scores(np.array([one.values for one in usable]))
     if screen.max() < SCREEN:
         return []
-    chosen = usable[int(np.argmax(screen))]
-    gain, fit = state.with_columns(chosen.values)
+    # At the null's own drift, which the cause inflates, the scores of two smoothings hardly differ: the refits do.
+    tried = [usable[k] for k in np.argsort(screen)[::-1][:3]]
+    refitted = [(*state.with_columns(one.values), one) for one in tried]
+    gain, fit, chosen = max(refitted, key=lambda one: one[0])
     worth = net(gain, 1, ln_looks)
     if worth < 1.0:
         return []

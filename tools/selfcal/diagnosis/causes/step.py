@@ -61,7 +61,7 @@ def looks(state: State, record: Record) -> list[Look]:
         if best is None or exact > best[0]:
             best = (exact, place)
     assert best is not None
-    place = _refined(state, best[1], gain)
+    place = _refined(best[1], gain)
     gain_exact, fit_with = state.with_columns(_column(n, place))
     worth = net(gain_exact, 1, LN_PLACES)
     if worth < 1.0:
@@ -111,7 +111,7 @@ def _peaks(gain: Array, count: int, apart: int) -> list[int]:
     return found
 
 
-def _refined(state: State, place: int, gain: Array) -> int:
+def _refined(place: int, gain: Array) -> int:
     """The likeliest of the nearby places of the scan."""
     low = max(0, place - 3)
     return low + int(np.argmax(gain[low : place + 4]))

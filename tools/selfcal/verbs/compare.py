@@ -1,0 +1,138 @@
+"""`selfcal compare`: what changed between recordings of one part, beyond what each leaves open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from selfcal.document import check_writable, write_json
+from selfcal.errors import UserError, printable
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify
+
+SCHEMA = "selfcal.compare/1"
+#: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
+LIMIT = 3.4
+#: Standard deviations in half the width of a 90 % interval.
+HALF_90 = 1.6448536269514722
+#: Estimates that are sizes of a cause; places in time belong to one recording alone.
+SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
+
+
+def compare(
+    logs: Sequence[Path | str],
+    *,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    decimate: float | None = None,
+    json: Path | str | None = None,
+) -> dict[str, Any]:
+    """Identify and diagnose each of `logs`, and set every one beside the one before it.
+
+    Returns the document `selfcal.compare/1`: by axis the `changes`, each with the quantity, its values and the distance
+    in standard deviations. Raises UserError for fewer than two recordings, and as `identify` and `diagnose` do.
+    """
+    if len(logs) < 2:
+        raise UserError("compare takes two recordings or more of one part: selfcal compare A B")
+    check_writable(json)
+    seen = []
+    for log in logs:
+        identified = identify(log, axes=axes, model=model)["axes"]
+        diagnosed = diagnose(log, axes=axes, model=model, decimate=decimate)["axes"]
+        seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
+    changes: dict[str, list[dict[str, Any]]] = {}
+    for (first, before), (second, after) in pairwise(zip(logs, seen, strict=True)):
+        for name in before.keys() & after.keys():
+            rows = _changes(before[name], after[name])
+            changes.setdefault(name, []).extend({"from": str(first), "to": str(second), **row} for row in rows)
+    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "axes": dict(sorted(changes.items()))}
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What can change: parameters of the likeliest law, the bias, the size of each cause found."""
+    found: dict[str, Mapping[str, Any]] = {}
+    if "hypotheses" in identified:
+        law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
+        for name, estimate in identified["parameters"][law].items():
+            if estimate["identified"]:
+                found[f"{name} ({law})" if name != "N" else "N"] = estimate
+        bias = identified["bias_now"]
+        half = HALF_90 * bias["sd"]
+        found["bias"] = {
+            "median": bias["mean"],
+            "q05": bias["mean"] - half,
+            "q95": bias["mean"] + half,
+            "unit": bias["unit"],
+        }
+    counted: dict[str, int] = {}
+    for finding in diagnosed.get("findings", []):
+        cause = str(finding["cause"])
+        counted[cause] = counted.get(cause, 0) + 1
+        label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
+        for key, estimate in finding["estimate"].items():
+            if key in SIZES and isinstance(estimate, Mapping):
+                found[f"{label}.{key}"] = estimate
+        found.setdefault(f"{label}", {"present": True})
+    return found
+
+
+def _changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for key in sorted(before.keys() | after.keys()):
+        a, b = before.get(key), after.get(key)
+        if a is None or b is None:
+            one = a or b
+            if one is not None and "present" in one:
+                rows.append({"quantity": key, "what": "appeared" if a is None else "gone"})
+            continue
+        if "present" in a:
+            continue
+        sd = math.hypot(*((one["q95"] - one["q05"]) / (2.0 * HALF_90) for one in (a, b)))
+        distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
+        if abs(distance) >= LIMIT:
+            rows.append(
+                {
+                    "quantity": key,
+                    "what": "changed",
+                    "before": a["median"],
+                    "after": b["median"],
+                    "unit": a["unit"],
+                    "distance_sd": distance,
+                }
+            )
+    return rows
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """One line a change."""
+    console = Console(stderr=to_stderr)
+    table = Table(box=box.SIMPLE_HEAD, title="changes beyond what the recordings leave open", title_justify="left")
+    for heading in ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings"):
+        table.add_column(heading, no_wrap=True)
+    for name, rows in document["axes"].items():
+        for row in rows:
+            changed = row["what"] == "changed"
+            table.add_row(
+                name,
+                row["quantity"],
+                f"{row['before']:.5g}" if changed else "-" if row["what"] == "appeared" else "found",
+                f"{row['after']:.5g}" if changed else "found" if row["what"] == "appeared" else "-",
+                row["unit"] if changed else "",
+                f"{row['distance_sd']:+.1f}" if changed else "",
+                printable(f"{Path(row['from']).name} -> {Path(row['to']).name}"),
+            )
+    if not console.is_terminal:
+        console.width = max(console.width, 140)
+    console.print(table)
+    if not any(document["axes"].values()):
+        console.print("nothing changed beyond what the recordings leave open")
