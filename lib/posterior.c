@@ -500,7 +500,7 @@ static void step_values(selfcal_work_t *work) {
 #define FAR_EVEN R(2e-4)
 
 /* Lines are so far apart in ln omega, as far as there are so many; up to LINES_APART they do. */
-#define LINE_STEP R(0.45)
+#define LINE_STEP R(0.5)
 #define LINES_APART R(0.55)
 
 /* Of ln omega from 1/n to 6, which stands for pi (set_lines() below). */
@@ -646,20 +646,40 @@ static void step_fit(selfcal_work_t *work) {
 
 /* A range has two thirds of the cells, which are 0.6 sd of a normal one wide if all are 24; more if it is wider than 6.4 nepers, since moments
  * of the parameters themselves need them narrower than 0.4. One row alone has twice as many: no other evens out what a limit cuts off in it. */
-#define CELLS_LEAST ((selfcal_real_t)(2 * SELFCAL_REPORT_CELLS / 3))
+#define CELLS_LEAST ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.0) / R(3.0)))
 #define CELLS_PER_NEPER ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.5) / R(24.0)))
+#define ROWS_MOST (SELFCAL_HISTOGRAM < 255U ? SELFCAL_HISTOGRAM : 255U) /* of alpha a bin is a row */
+
+/* Part of the depth, at 2.5 sd of a normal one, to which a peak is looked at. */
+#define PEAK R(0.25)
+/* Least cells of a range by the samples of its search that lie on the peak, three or more of a normal one. Where a limit cuts the likelihood
+ * the peak may be narrow in a wide range. */
+static uint8_t cells_for_peak(const selfcal_real_t height[], selfcal_real_t least) {
+    unsigned count = 0;
+    for (unsigned i = 0; i < SELFCAL_SEARCH_SAMPLES; i++) {
+        count += height[i] > least ? 1U : 0U;
+    }
+    if (count == 2U) {
+        return 24U;
+    }
+    return count > 2U ? 16U : 64U;
+}
 
 static uint16_t cells_in(const selfcal_work_t *work, unsigned dimension) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     if ((dimension == 0U ? hypothesis->rho : hypothesis->alpha) == NULL) {
         return 1U;
     }
-    if (hypothesis->alpha == NULL) {
-        return 2U * SELFCAL_REPORT_CELLS;
-    }
     const selfcal_range_t *range = &work->range[dimension];
     const selfcal_real_t wanted = r_fmax(CELLS_PER_NEPER * (range->hi - range->lo), CELLS_LEAST);
-    return wanted < (selfcal_real_t)SELFCAL_REPORT_CELLS ? (uint16_t)wanted : SELFCAL_REPORT_CELLS;
+    unsigned cells = wanted < (selfcal_real_t)SELFCAL_REPORT_CELLS ? (unsigned)wanted : SELFCAL_REPORT_CELLS;
+    if (hypothesis->alpha == NULL) {
+        cells = 2U * SELFCAL_REPORT_CELLS;
+    }
+    /* Splines that hold all of the likelihood are less even than what an expectation leaves. */
+    const unsigned least = (has_expectation(work) ? 1U : 2U) * work->least[dimension];
+    cells = cells < least ? least : cells;
+    return (uint16_t)(dimension == 1U && cells > ROWS_MOST ? ROWS_MOST : cells);
 }
 
 /* Weight of the cell i of `count`, alike from either end: the midpoint rule, which errs by h^2/24 times the slope at an end that the limits cut,
@@ -878,7 +898,7 @@ static selfcal_real_t height_at(selfcal_work_t *work, selfcal_real_t ln_rho) {
 static selfcal_real_t row_end(selfcal_work_t *work, selfcal_real_t in, selfcal_real_t in_height, selfcal_real_t out, selfcal_real_t out_height) {
     const selfcal_real_t best = work->row_best;
     unsigned turns = 0;
-    while (in_height > best - R(0.25) * work->depth || out_height < best - R(3.0) * work->depth) {
+    while (in_height > best - PEAK * work->depth || out_height < best - R(3.0) * work->depth) {
         if (turns++ == 4U) {
             return out;
         }
@@ -928,6 +948,7 @@ static bool find_row(selfcal_work_t *work) {
     if (last < SAMPLES - 1U) {
         next.hi = row_end(work, sample_at(range, last), height[last], sample_at(range, last + 1U), height[last + 1U]);
     }
+    work->least[0] = cells_for_peak(height, best - PEAK * work->depth);
     *range = next;
     return true;
 }
@@ -954,6 +975,7 @@ static void begin_search(selfcal_work_t *work) {
     work->range[1].hi = work->limit_hi[1];
     work->depth = DEPTH + DEPTH_OF_SHORT / work->n_eff;
     work->best = -INFINITY;
+    work->least[0] = 1;
     work->pass = 0;
     begin_pass(work);
 }
@@ -993,6 +1015,7 @@ static bool step_search(selfcal_work_t *work) {
     work->at = 0;
     work->scratch.grid.height[work->row] = work->row_best;
     work->scratch.grid.found[work->row] = work->range[0];
+    work->scratch.grid.least[work->row] = work->least[0];
     if (work->row_best > work->best - work->depth) {
         note_ranges(work);
     }
@@ -1010,6 +1033,7 @@ static bool step_search(selfcal_work_t *work) {
         begin_pass(work);
         return false;
     }
+    work->least[1] = rows ? cells_for_peak(work->scratch.grid.height, work->best - PEAK * work->depth) : 1U;
     return true;
 }
 
@@ -1056,7 +1080,6 @@ static void begin_sum(selfcal_work_t *work) {
     }
 }
 
-/* Of alpha a bin is a row. */
 static int bins_of(const selfcal_work_t *work, unsigned p) {
     return p == SELFCAL_ALPHA ? work->rows : SELFCAL_HISTOGRAM;
 }
@@ -1223,6 +1246,8 @@ static void begin_row(selfcal_work_t *work) {
     const unsigned i = z < (selfcal_real_t)(SAMPLES - 2U) ? (unsigned)z : SAMPLES - 2U;
     const selfcal_range_t *one = &work->scratch.grid.found[i], *other = &work->scratch.grid.found[i + 1U];
     const selfcal_real_t part = r_fmin(z - (selfcal_real_t)i, R(1.0));
+    const uint8_t *least = &work->scratch.grid.least[i];
+    work->least[0] = least[0] > least[1] ? least[0] : least[1];
     const selfcal_real_t lo = r_fma(part, other->lo - one->lo, one->lo), hi = r_fma(part, other->hi - one->hi, one->hi);
     const selfcal_real_t more = BEYOND * (hi - lo);
     work->range[0].lo = r_fmax(lo - more, work->limit_lo[0]);
