@@ -1099,7 +1099,8 @@ static spread_t spread_over(const selfcal_work_t *work, unsigned p, selfcal_real
     const selfcal_real_t step = histogram_step(work, p);
     const selfcal_real_t per_step = step > R(0.0) ? R(1.0) / step : R(0.0);
     const selfcal_real_t half = R(0.5) * width * per_step;
-    const spread_t spread = {bins, work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    spread_t spread = {NULL, work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    spread.bins = bins;
     return spread;
 }
 
