@@ -500,7 +500,7 @@ static void step_values(selfcal_work_t *work) {
 #define FAR_EVEN R(2e-4)
 
 /* Lines are so far apart in ln omega, as far as there are so many; up to LINES_APART they do. */
-#define LINE_STEP R(0.5)
+#define LINE_STEP R(0.45)
 #define LINES_APART R(0.55)
 
 /* Of ln omega from 1/n to 6, which stands for pi (set_lines() below). */
@@ -653,14 +653,14 @@ static void step_fit(selfcal_work_t *work) {
 /* Part of the depth, at 2.5 sd of a normal one, to which a peak is looked at. */
 #define PEAK R(0.25)
 /* Least cells of a range by the samples of its search that lie on the peak, three or more of a normal one. Where a limit cuts the likelihood
- * the peak may be narrow in a wide range. */
-static uint8_t cells_for_peak(const selfcal_real_t height[], selfcal_real_t least) {
+ * the peak may be narrow in a wide range. `on_two`: where there are two samples; more where nothing narrows the range after the search. */
+static uint8_t cells_for_peak(const selfcal_real_t height[], selfcal_real_t least, uint8_t on_two) {
     unsigned count = 0;
     for (unsigned i = 0; i < SELFCAL_SEARCH_SAMPLES; i++) {
         count += height[i] > least ? 1U : 0U;
     }
     if (count == 2U) {
-        return 24U;
+        return on_two;
     }
     return count > 2U ? 16U : 64U;
 }
@@ -948,7 +948,7 @@ static bool find_row(selfcal_work_t *work) {
     if (last < SAMPLES - 1U) {
         next.hi = row_end(work, sample_at(range, last), height[last], sample_at(range, last + 1U), height[last + 1U]);
     }
-    work->least[0] = cells_for_peak(height, best - PEAK * work->depth);
+    work->least[0] = cells_for_peak(height, best - PEAK * work->depth, 16);
     *range = next;
     return true;
 }
@@ -1033,7 +1033,7 @@ static bool step_search(selfcal_work_t *work) {
         begin_pass(work);
         return false;
     }
-    work->least[1] = rows ? cells_for_peak(work->scratch.grid.height, work->best - PEAK * work->depth) : 1U;
+    work->least[1] = rows ? cells_for_peak(work->scratch.grid.height, work->best - PEAK * work->depth, 32) : 1U;
     return true;
 }
 

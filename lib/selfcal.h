@@ -115,7 +115,7 @@ extern "C" {
 #endif
 
 /* Most frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even
- * in their logarithm, from 1/n to the highest, 0.5 nepers apart. Up to 0.55 they do for the reports' tolerances: 36 to 3 10^7 samples, 20 to
+ * in their logarithm, from 1/n to the highest, 0.45 nepers apart. Up to 0.55 they do for the reports' tolerances: 36 to 3 10^7 samples, 20 to
  * 5000. They take 6 LINES^2 bytes of a report's scratch. */
 #ifndef SELFCAL_LINES
 #define SELFCAL_LINES 36
