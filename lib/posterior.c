@@ -1077,6 +1077,10 @@ static void begin_sum(selfcal_work_t *work) {
         const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
         work->range_hi[p] = r_fmin(work->range_hi[p], (selfcal_real_t)prior->ln_max);
+        if (!(work->range_lo[p] <= work->range_hi[p])) { /* the last pass found no row as high as the best before: the priors cut nearly all */
+            work->range_lo[p] = (selfcal_real_t)prior->ln_min;
+            work->range_hi[p] = (selfcal_real_t)prior->ln_max;
+        }
     }
 }
 
