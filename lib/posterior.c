@@ -18,13 +18,18 @@
  * leave, so the interpolated thing is always the likelihood alone. */
 #include "internal.h"
 
-/* Stages of a report. One step of any takes below 61 000 instructions on a Cortex-M4F without regressors in use. */
+/* Stages of a report. One step of any takes below 61 000 instructions on a Cortex-M4F without regressors in use, and below a million on a
+ * Cortex-M0: 60 ms at 16 MHz. */
 enum { GATHER, TRUTH, FIT, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, SEARCH, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
 #define STEP_VALUES 16U
 #define STEP_LINES 8U
 /* Cells of a row that one step sums. One that a limit cuts counts as so many, and so do sigma_v's cells laid anew. */
+#ifdef SELFCAL_FIXED /* as a rule all floats are software there */
+#define STEP_CELLS 10U
+#else
 #define STEP_CELLS 16U
+#endif
 #define COST_OF_CUT 5U
 #define COST_OF_LAYING 8U
 
@@ -1041,16 +1046,17 @@ static bool step_search(selfcal_work_t *work) {
 
 /* Whether nodes or lines are too far apart for a record so long. What the data put into a node's sums looks, as a function of ln rho or ln
  * alpha, like white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at the nodes' Nyquist frequency pi/h that is
- * e^(-pi^2/2h). It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
+ * e^(-pi^2/2h), of alpha 3/8 of it. It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
  * of a random walk beside it, so that lines leave little of it; on such a grid no more comes after some 10^4 samples. Of a law without
  * an expectation all of the ln-likelihood is left to the splines, which grows as n. The limits are measured, on records over the
- * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances. What uneven noise or time adds to the
+ * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances (the
+ * Cortex-M0's 14 x 7: 388 of 390 of 4100 and 4400, then 8 of 120 of 6000 did not). What uneven noise or time adds to the
  * ln-likelihood is as smooth and left to the splines whole, with lines that are forced to explain it besides: a nat of it weighs as 100. */
 static bool too_coarse(const selfcal_work_t *work) {
     /* 0, so that e^-inf is the rest, where there is none. */
     const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]};
     const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t rest = r_exp(R(-4.9348022) / step[0]) + R(0.5) * r_exp(R(-4.9348022) / step[1]);
+    const selfcal_real_t rest = r_exp(R(-4.9348022) / step[0]) + R(0.375) * r_exp(R(-4.9348022) / step[1]);
     if (!has_expectation(work)) {
         return rest * weight > R(0.08);
     }
