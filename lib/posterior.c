@@ -1030,8 +1030,12 @@ static bool step_search(selfcal_work_t *work) {
     }
     const selfcal_range_t limit = {work->limit_lo[1], work->limit_hi[1]};
     const selfcal_range_t before = *range;
-    if (rows && next_range(range, work->scratch.grid.height, work->best - work->depth, &limit) && work->pass < PASSES_MAX) {
+    /* After the last pass the range stays what the rows found belong to. */
+    if (rows && work->pass < PASSES_MAX && next_range(range, work->scratch.grid.height, work->best - work->depth, &limit)) {
         work->pass++;
+        /* It does not grow again beyond a row that did not count. */
+        work->limit_lo[1] = range->lo > before.lo ? range->lo : work->limit_lo[1];
+        work->limit_hi[1] = range->hi < before.hi ? range->hi : work->limit_hi[1];
         /* Huge samples shrink the range to a few roundings at the prior's end: there at may be all samples. */
         const selfcal_real_t at = (range->lo - before.lo) / (before.hi - before.lo) * (selfcal_real_t)SAMPLES;
         work->range[0] = work->scratch.grid.found[at > R(0.0) ? (unsigned)r_fmin(at, (selfcal_real_t)(SAMPLES - 1U)) : 0U];
