@@ -497,6 +497,8 @@ static void step_values(selfcal_work_t *work) {
 #define FIT_MOST R(1e6)
 /* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
 #define UNSETTLED R(200.0)
+/* Of more nodes those that hardly settle at all are left out; fewer tell too little without. */
+#define UNSETTLED_NODES 150U
 /* Less, by nats below the best node, where intervals or samples are missing, the rate has changed, or regressors are in use: what a node makes
  * of the level on both sides of a gap, of noise that varies, or of what the coefficients take up, depends on more than psi, and by some
  * part in a hundred of those nats. */
@@ -588,7 +590,7 @@ static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t
     const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->ln_noise == R(0.0);
     const selfcal_real_t far = (even ? FAR_EVEN : FAR) * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
-    if (even && UNSETTLED > R(20.0) * e->p_sq * n * n) {
+    if (even && UNSETTLED > R(20.0) * e->p_sq * n * n && work->bank->model->nodes > UNSETTLED_NODES) {
         return;
     }
     selfcal_real_t row[SELFCAL_FITTED + 1];
