@@ -443,8 +443,8 @@ def test_a_grid_too_coarse_for_the_record_says_so() -> None:
 
 
 def test_the_flag_of_a_cortex_m0_tells_what_its_nodes_bear() -> None:
-    """The shipped hour: all six axes, on nodes that they share, are within the tolerances and none is flagged. A walk of
-    10^4 samples on which the same nodes, one axis alone, are 0.2 nat off: flagged."""
+    """The shipped hour: all six axes, on nodes that they share, are within the tolerances and none is flagged. A walk
+    of 10^4 samples on which the same nodes, one axis alone, are 0.2 nat off: flagged."""
     recording = load(ROOT / "tests" / "data" / "simulated_adis16405.npz")
     y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
     block = round(recording.rate_hz)
