@@ -16,6 +16,8 @@
  */
 #include "kernel.h"
 
+#include <float.h>
+
 /* A node counts as converged when d falls to this part of p_inf: what is left of the gain's error moves a ln-likelihood by
  * less than that many nats. */
 #define CONVERGED R(1e-6)
@@ -113,7 +115,7 @@ static bool valid_model(const selfcal_model_t *model) {
         nodes += hypothesis_nodes(hypothesis);
     }
     const selfcal_regressors_t *regressors = model->regressors;
-    return nodes == model->nodes && (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
+    return nodes == model->nodes && nodes <= SELFCAL_NODES_MAX && (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
 }
 
 /* A node at the instant of its first sample. */
@@ -586,43 +588,97 @@ selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
     return selfcal_offset(self, axis) - (selfcal_wide_t)self->shifted[axis];
 }
 
-void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
-    const selfcal_place_t place = selfcal_bank_place(self, index);
+void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_node_t *node = &self->node[index];
-    const selfcal_moving_t now = moving_of(node);
     const size_t k = (size_t)index * self->model->axes + axis;
-    const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
-    const selfcal_wide_t phi = 1.0 - beta;
-    const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)now.d;
-    view->law = self->model->hypothesis[place.hypothesis].law;
-    view->ln_rho = (selfcal_wide_t)place.ln_rho;
-    view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
 #if SELFCAL_TERMS_MAX > 1
-    if (is_sum(view->law)) {
+    if (selfcal_is_term_node(node)) {
         selfcal_terms_view(self, axis, index, view);
         return;
     }
 #endif
     view->a = sum_value(node->a) + level_a(node);
-    selfcal_wide_t x;
 #ifdef SELFCAL_FIXED
     void (*const see)(const selfcal_t *, size_t, selfcal_wide_t *, selfcal_wide_t *, selfcal_wide_t *) =
         self->columns != NULL ? self->model->regressors->code->view : selfcal_kernel_view;
-    see(self, k, &view->b, &view->c, &x);
+    see(self, k, &view->b, &view->c, &view->drift);
 #else
-    selfcal_kernel_view(self, k, &view->b, &view->c, &x);
+    selfcal_kernel_view(self, k, &view->b, &view->c, &view->drift);
 #endif
-    view->ln_s = sum_value(node->ln_s) + (selfcal_wide_t)node->steady * log1p((selfcal_wide_t)node->p_inf);
+}
+
+/* ln x to 1e-11, in a third of the time that log() takes in software: x = 2^k m, and m q/64 is so near 1 that its ln needs few digits. */
+selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x) {
+    static const selfcal_wide_t ln_q[] = { /* ln(q/64) from q = 43 on */
+        -0.39768296766610944, -0.3746934494414107, -0.3522205935893521, -0.33024168687057687, -0.3087354816496133,
+        -0.2876820724517809, -0.26706278524904525, -0.24686007793152578, -0.22705745063534608, -0.2076393647782445,
+        -0.18859116980755003, -0.16989903679539747, -0.15154989812720093, -0.13353139262452263, -0.1158318155251217,
+        -0.09844007281325252, -0.0813456394539524, -0.06453852113757118, -0.048009219186360606, -0.0317486983145803,
+        -0.015748356968139168, 0.0, 0.015504186535965254, 0.030771658666753687, 0.0458095360312942, 0.06062462181643484,
+        0.07522342123758753, 0.08961215868968714, 0.10379679368164356, 0.11778303565638346, 0.13157635778871926,
+        0.1451820098444979, 0.15860503017663857, 0.17185025692665923, 0.184922338494012, 0.19782574332991987,
+        0.21056476910734964, 0.22314355131420976, 0.2355660713127669, 0.24783616390458127, 0.25995752443692605,
+        0.27193371548364176, 0.2837681731306446, 0.2954642128938359};
+    if (!(x > 0.0 && x <= DBL_MAX)) {
+        return log(x);
+    }
+    int k;
+    selfcal_wide_t m = frexp(x, &k);
+    if (m < 0.75) {
+        m += m;
+        k--;
+    }
+    const int q = (int)(R(64.0) / (selfcal_real_t)m + R(0.5)); /* m is 0.75 to 1.5 */
+    const selfcal_wide_t wide = m * (selfcal_wide_t)q * 0.015625 - 1.0;
+    const selfcal_real_t t = (selfcal_real_t)wide; /* 0.012 at most */
+    const selfcal_real_t rest = t * t * r_fma(t, r_fma(t, r_fma(t, R(0.2), R(-0.25)), R(1.0) / R(3.0)), R(-0.5));
+    return (selfcal_wide_t)k * SELFCAL_LN_2 - ln_q[q - 43] + (wide + (selfcal_wide_t)rest);
+}
+
+void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
+    const selfcal_node_t *node = &self->node[index];
+#if SELFCAL_TERMS_MAX > 1
+    if (selfcal_is_term_node(node)) {
+        return;
+    }
+#endif
+    view->ln_s = sum_value(node->ln_s);
+    if (node->steady != 0U) {
+        view->ln_s += (selfcal_wide_t)node->steady * selfcal_bank_ln(1.0 + (selfcal_wide_t)node->p_inf);
+    }
+}
+
+void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
+    const selfcal_place_t place = selfcal_bank_place(self, index);
+    const selfcal_node_t *node = &self->node[index];
+    view->law = self->model->hypothesis[place.hypothesis].law;
+    view->ln_rho = (selfcal_wide_t)place.ln_rho;
+    view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
+#if SELFCAL_TERMS_MAX > 1
+    if (selfcal_is_term_node(node)) {
+        return;
+    }
+#endif
+    const selfcal_moving_t now = moving_of(node);
+    const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
+    const selfcal_wide_t phi = 1.0 - beta, per_phi = beta > 0.0 ? 1.0 / phi : 1.0;
+    const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)now.d;
     /* The filter holds the prediction for the next interval, phi times the drift now. */
-    view->drift = x / phi;
-    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)now.e - beta) / phi;
+    view->drift *= per_phi;
+    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)now.e - beta) * per_phi;
     if (phi > 0.03) {
-        view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) / (phi * phi);
+        view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) * per_phi * per_phi;
     } else {
         /* P' = phi^2 P(now) + q has lost P(now): it is that after a sample, unless a gap has just let it grow. */
         const bool gap = (selfcal_wide_t)now.d > 1e-3 * (selfcal_wide_t)node->p_inf;
         view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
     }
+}
+
+void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
+    selfcal_bank_sums(self, axis, index, view);
+    selfcal_bank_ln_s(self, index, view);
+    selfcal_bank_now(self, index, view);
 }
 
 selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {

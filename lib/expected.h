@@ -1,26 +1,31 @@
 /* Expected variance of a filter's innovations: see posterior.c, which includes this once for each of its two types T. */
 
 typedef struct {
-    T ln_v; /* ln of the innovations' variance over sigma_v^2 of the data */
-    T ln_s; /* ln of what the filter itself takes it to be, over its own sigma_v^2 */
+    T v_less_1; /* the innovations' variance over sigma_v^2 of the data, less 1 */
+    T s_less_1; /* what the filter itself takes it to be, over its own sigma_v^2, less 1 */
     T gain, p; /* phi K; 1 - psi */
 } NAME(expected_t);
 
-/* The converged filter of (rho, 1 - phi = beta), a random walk with a beta of 0, over white noise and a first-order drift of deviation
- * sqrt(truth->variance) and pole 1 - truth->rate. Its innovations are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the
- * delay; their variance is that of an ARMA(2,1) process, here written so that nothing cancels when the poles are close to 1. */
-static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *truth) {
+/* The predicted drift variance that the filter of (rho, 1 - phi = beta), a random walk with a beta of 0, converges to, over its sigma_v^2. */
+static T NAME(settled)(T ln_rho, T beta) {
     const T one_less_phi_sq = beta * (T_(2.0) - beta);
     const T q = T_exp(T_(2.0) * ln_rho) * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));
     const T b = one_less_phi_sq - q;
     const T root = T_sqrt(b * b + T_(4.0) * q);
-    const T p_inf = b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
+    return b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
+}
+
+/* That filter over white noise and a first-order drift of deviation sqrt(truth->variance) and pole 1 - truth->rate. Its innovations
+ * are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the delay; their variance is that of an ARMA(2,1) process, here written so
+ * that nothing cancels when the poles are close to 1. */
+static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *truth) {
+    const T p_inf = NAME(settled)(ln_rho, beta);
     const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf);
     const T p = gain + beta;
     const T c = (T)truth->rate;
     const T white_less_1 = gain * gain / (p * (T_(2.0) - p));
     const T drift = (beta * beta * (T_(1.0) + (T_(1.0) - p) * (T_(1.0) - c)) + T_(2.0) * (T_(1.0) - beta) * p * c) /
                     (p * (T_(2.0) - p) * (p + c - p * c));
-    const NAME(expected_t) e = {T_log1p((T)truth->variance * drift + white_less_1), T_log1p(p_inf), gain, p};
+    const NAME(expected_t) e = {(T)truth->variance * drift + white_less_1, p_inf, gain, p};
     return e;
 }

@@ -84,6 +84,7 @@ static inline int32_t to_fixed(float value, int shift) {
 #endif
 
 #define SELFCAL_LN_2PI 1.8378770664093454836
+#define SELFCAL_LN_2 0.69314718055994530942
 
 /* C99 has no _Static_assert. `name` says what holds. */
 #define SELFCAL_STATIC_ASSERT(name, condition) typedef char selfcal_assert_##name[(condition) ? 1 : -1]
@@ -187,6 +188,12 @@ typedef struct {
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index);
 /* selfcal_node() of the sums as they are, without what has only been gathered. */
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
+/* Parts of that: A, B, C and, as its drift, the prediction; D; then from the first all but D. Of a sum's nodes the first is the whole. */
+void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
+/* ln x of a positive, finite x; else log(). */
+selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x);
+void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
+void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
 
 /* Forgetting leaves so much of a column's sum of squares: in a filter that has let go of the column nothing comes after, and neither a
  * float nor an integer could hold what B and A are then far below their sizes. */
@@ -203,13 +210,13 @@ typedef struct {
 /* sigma_v's mode at a node is found by turns, to this part of its square. */
 #define SELFCAL_MODE_TURNS 20U
 #define SELFCAL_MODE_LEFT R(1e-5)
-/* What a report takes of one node: its view; ln of sigma_v's mode, profile ln-likelihood; what half the curvature in ln sigma_v lacks of n: a
- * sample for the bias and each coefficient that the data tell, none for those that their priors tell; and the mode of sigma_v^2 over what the
- * readings scatter by. */
+/* What a report takes of one node: its view; variance of the residuals; the mode of sigma_v^2 over that; what half the curvature in
+ * ln sigma_v lacks of n: a sample for the bias and each coefficient that the data tell, none for those that their priors tell; and what these
+ * priors add to -2 ln p. */
 typedef struct {
     selfcal_node_view_t node;
-    selfcal_wide_t ln_sigma, profile;
-    selfcal_real_t share, ratio;
+    selfcal_wide_t var;
+    selfcal_real_t ratio, share, extra;
 } selfcal_field_t;
 
 /* forgetting.c, for a model that forgets. */

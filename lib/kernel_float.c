@@ -197,9 +197,9 @@ void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, sel
     *b = sum_value(self->b[k]);
     *c = sum_value(self->c[k]);
     if (node->level) {
-        const selfcal_wide_t s = 1.0 + (selfcal_wide_t)node->p_inf, u = (selfcal_wide_t)node->u_inf;
-        *c /= s;
-        *b *= u > 0.0 ? u / s : 1.0;
+        const selfcal_wide_t per_s = 1.0 / (1.0 + (selfcal_wide_t)node->p_inf), u = (selfcal_wide_t)node->u_inf;
+        *c *= per_s;
+        *b *= u > 0.0 ? u * per_s : 1.0;
     }
     *x = (selfcal_wide_t)self->x[k];
 }

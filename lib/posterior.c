@@ -12,27 +12,37 @@
  * w being the share of one sample that the bias takes, 1 under a wide prior. n_eff is half the curvature there, of the best node; the shape
  * is exact for w = 0 or 1, else to the second order in delta. With regressors in use each coefficient takes such a share as well.
  *
- * The integral runs over cells (midpoint rule: for a smooth peak it converges faster than any power of the cell). First
- * passes find the box that holds the posterior, the last one sums. Priors enter per cell, limits by the part of the cell
- * they leave, so the interpolated thing is always the likelihood alone. */
+ * A report looks at every node once and keeps two numbers of each. A search finds the rows of alpha that count, and for each where in ln rho
+ * it counts. The integral then runs over cells of these rows (midpoint rule: for a smooth peak it converges faster than any power of the cell).
+ * sigma_v is integrated in closed form, but in cells that the priors' limits cut. Priors enter per cell, limits by the part of the cell they
+ * leave, so the interpolated thing is always the likelihood alone. */
 #include "internal.h"
 
-/* Stages of a report, and what one step of it takes at most: below 61 000 instructions on a Cortex-M4F, wherever limits cut the cells; of
- * sums under uniform priors, which cost an exponential in each cell, below 72 000. */
-enum { GATHER, TRUTH, FIT, PEAK, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, BOX, SCAN, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
+/* Stages of a report. One step of any takes below 61 000 instructions on a Cortex-M4F without regressors in use, and below a million on a
+ * Cortex-M0: 60 ms at 16 MHz. */
+enum { GATHER, TRUTH, FIT, SIGMA, VALUES, SPLINE_PROFILE, SPLINE_SIGMA, SEARCH, SUM, WEIGHTS, WEIGHTS_SQ, BIAS, ESTIMATES, EVIDENCE, WHOLE };
 #define STEP_NODES 3U
-#define STEP_SCANNED_CELLS 24U
-#define STEP_SUMMED_CELLS 3U
+#define STEP_VALUES 16U
 #define STEP_LINES 8U
+/* Cells of a row that one step sums. One that a limit cuts counts as so many, and so do sigma_v's cells laid anew. */
+#ifdef SELFCAL_FIXED /* as a rule all floats are software there */
+#define STEP_CELLS 10U
+#else
+#define STEP_CELLS 16U
+#endif
+#define COST_OF_CUT 5U
+#define COST_OF_LAYING 8U
 
-/* ln-likelihood below the peak at which a cell no longer counts: e^-20 of the peak's density. */
-#define DEPTH R(20.0)
-/* The sums' cells, narrower than the search's, may find so much more than its peak, which moments are counted from; or they begin anew. */
-#define HIGHER R(3.0)
-/* The search ends when a pass shrinks the box by less than this in both dimensions, and no cell at its border counts. Else it grows there. */
+/* ln-likelihood below a row's peak, or a row's peak below the best, at which a cell or row no longer counts: 4.9 sd of a normal one;
+ * more of a short record, whose tails are long. */
+#define DEPTH R(12.0)
+#define DEPTH_OF_SHORT R(80.0) /* over n_eff */
+/* The search of a row, or of the rows, ends when a pass shrinks it by less than this, and nothing at its ends counts. Else it grows there. */
 #define SHRINK R(0.7)
-#define GROWTH R(0.25)
-#define PASSES_MAX 8U
+#define GROWTH R(0.5)
+#define PASSES_MAX 12U
+/* A row of the sums is taken so much wider, either way, than the rows of the search beside it say. */
+#define BEYOND R(0.04)
 /* n_eff (delta + e^(-2 delta)/2 - 1/2) at the ends of the sigma_v cells. */
 #define SIGMA_DEPTH R(13.0)
 /* ln(sigma_v/mode): more than any cell has that counts beside a sound best, and e^(2 of it) is still a float. */
@@ -73,31 +83,39 @@ static selfcal_real_t drift_shift(const selfcal_work_t *work) {
 /* ------------------------------------------------------------------------------------------------------------ spline */
 
 /* Knot k of the spline through `nodes` points one apart: six at either end, none at the two points next to them. */
-static selfcal_real_t knot(uint16_t nodes, uint16_t k) {
-    return k <= 5U ? R(0.0) : (k >= nodes ? (selfcal_real_t)(nodes - 1U) : (selfcal_real_t)(k - 3U));
+static int knot(int nodes, int k) {
+    return k <= 5 ? 0 : (k >= nodes ? nodes - 1 : k - 3);
 }
 
 /* Values of the six quintic B-splines that are not zero at z (in steps from the first node), by the Cox-de Boor recursion;
  * the index of the first. Beyond the ends the position is held at the end. */
 static uint8_t basis_at(uint16_t nodes, selfcal_real_t z, selfcal_real_t out[6]) {
+    /* No more lies between six knots: 7 or, of 9 or 10 nodes, all. */
+    static const selfcal_real_t inverse[10] = {R(0.0), R(1.0), R(1.0) / R(2.0), R(1.0) / R(3.0), R(1.0) / R(4.0),
+                                               R(1.0) / R(5.0), R(1.0) / R(6.0), R(1.0) / R(7.0), R(1.0) / R(8.0), R(1.0) / R(9.0)};
     z = r_fmin(r_fmax(z, R(0.0)), (selfcal_real_t)(nodes - 1U));
-    uint16_t span = 5U;
-    while (span + 1U < nodes && z >= knot(nodes, (uint16_t)(span + 1U))) {
-        span++;
+    int span = (int)z + 3; /* unless a knot is missing there */
+    span = span < 6 ? 5 : (span >= nodes - 1 ? nodes - 1 : span);
+    while (span > 5 && z < (selfcal_real_t)knot(nodes, span)) {
+        span--;
+    }
+    int at[10]; /* the knots that count, five either side */
+    selfcal_real_t to[10];
+    for (int k = 0; k < 10; k++) {
+        at[k] = knot(nodes, span - 4 + k);
+        to[k] = (selfcal_real_t)at[k] - z;
     }
     out[0] = R(1.0);
-    for (uint16_t k = 1; k <= 5U; k++) {
+    for (int k = 1; k <= 5; k++) {
         selfcal_real_t carry = R(0.0);
-        for (uint16_t i = 0; i < k; i++) {
-            const selfcal_real_t right = knot(nodes, (uint16_t)(span + 1U + i));
-            const selfcal_real_t left = knot(nodes, (uint16_t)(span + 1U + i - k));
-            const selfcal_real_t part = out[i] / (right - left);
-            out[i] = r_fma(right - z, part, carry);
-            carry = (z - left) * part;
+        for (int i = 0; i < k; i++) {
+            const selfcal_real_t part = out[i] * inverse[at[5 + i] - at[5 + i - k]];
+            out[i] = r_fma(to[5 + i], part, carry);
+            carry = -to[5 + i - k] * part;
         }
         out[k] = carry;
     }
-    return (uint8_t)(span - 5U);
+    return (uint8_t)(span - 5);
 }
 
 /* One line of values, `stride` apart, by the grid's matrix or its transpose; as it is without a grid. */
@@ -159,68 +177,66 @@ static bool has_expectation(const selfcal_work_t *work) {
 
 /* What the expectation says of the two fields, the splines hold the rest; and of which filter. */
 typedef struct {
-    selfcal_wide_t profile, ln_sigma;
+    selfcal_wide_t profile, ln_sigma, ln_v;
     selfcal_real_t beta_sq, phi, p_sq, psi; /* |1 - phi e^(i omega)|^2 = beta_sq + phi distance, |1 - psi e^(i omega)|^2 = p_sq + psi distance */
     selfcal_real_t edge, level;             /* see lines and edges below */
-    selfcal_real_t ln_v, per_v;             /* of the innovations' variance without lines and edges, ln and inverse */
+    selfcal_real_t per_v; /* inverse of the innovations' variance without lines and edges */
 } expectation_t;
 
-/* The edge that goes with line m; the level is behind it. */
-static unsigned end_of(unsigned m) {
-    return SELFCAL_LINES + (m & ~1U);
-}
-
-/* What lines and edges add to the variance. */
+/* What lines, and behind them an edge and a level for each three, add to the variance. */
 static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e) {
     selfcal_real_t more = R(0.0), ends = R(0.0);
-    for (unsigned m = 0; m < SELFCAL_LINES; m++) {
+    const selfcal_real_t *end = &truth->power[truth->lines];
+    for (unsigned m = 0; m < truth->lines; m++) {
         const selfcal_real_t distance = truth->distance[m];
         const selfcal_real_t passed = r_fma(e->phi, distance, e->beta_sq), held_back = r_fma(e->psi, distance, e->p_sq);
-        if (m % 2U == 0U) {
-            ends = r_fma(e->edge, truth->power[end_of(m)], e->level * truth->power[end_of(m) + 1U]);
+        if (m % 3U == 0U) {
+            ends = r_fma(e->edge, end[0], e->level * end[1]);
+            end += 2;
         }
         more += r_fma(passed, truth->power[m], ends) / held_back;
     }
     return more;
 }
 
-static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, expectation_t *e) {
+/* `beta`: beta_at() the alpha. */
+static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta, expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
-    memset(e, 0, sizeof *e);
+    e->profile = e->ln_sigma = e->ln_v = 0.0;
     if (!has_expectation(work)) {
         return;
     }
-    const selfcal_real_t beta = beta_at(work, ln_alpha), n = (selfcal_real_t)work->bank->weight;
-    selfcal_real_t gain, p;
-    selfcal_wide_t ln_v, ln_s;
+    const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
+    expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
+    expected_t real;
     ln_rho -= truth->ln_noise;
     if (truth->wide) {
-        const expected_t_wide wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
-        gain = (selfcal_real_t)wide.gain;
-        p = (selfcal_real_t)wide.p;
-        ln_v = wide.ln_v;
-        ln_s = wide.ln_s;
+        wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
+        real.v_less_1 = (selfcal_real_t)wide.v_less_1;
+        real.gain = (selfcal_real_t)wide.gain;
+        real.p = (selfcal_real_t)wide.p;
     } else {
-        const expected_t real = expected(ln_rho, beta, truth);
-        gain = real.gain;
-        p = real.p;
-        ln_v = (selfcal_wide_t)real.ln_v;
-        ln_s = (selfcal_wide_t)real.ln_s;
+        real = expected(ln_rho, beta, truth);
     }
-    const selfcal_real_t h = gain / p;
+    const selfcal_real_t h = real.gain / real.p;
     e->beta_sq = beta * beta;
     e->phi = R(1.0) - beta;
-    e->p_sq = p * p;
-    e->psi = R(1.0) - p;
-    e->edge = gain * h / (R(2.0) - p);
+    e->p_sq = real.p * real.p;
+    e->psi = R(1.0) - real.p;
+    e->edge = real.gain * h / (R(2.0) - real.p);
     e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
-    e->ln_v = (selfcal_real_t)ln_v;
-    e->per_v = r_exp(-e->ln_v);
-    if (truth->fitted) {
-        ln_v += (selfcal_wide_t)r_log1p(r_fmax(fitted(truth, e) * e->per_v, R(-0.99)));
+    e->per_v = R(1.0) / (R(1.0) + real.v_less_1);
+    const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
+    if (truth->wide) {
+        e->ln_v = log1p(wide.v_less_1 + (selfcal_wide_t)more);
+        e->ln_sigma = 0.5 * (e->ln_v - log1p(wide.s_less_1));
+        e->profile = -0.5 * work->bank->weight * (e->ln_v - truth->ln_v);
+    } else {
+        const selfcal_real_t ln_v = r_log1p(real.v_less_1 + more);
+        e->ln_v = (selfcal_wide_t)ln_v;
+        e->ln_sigma = (selfcal_wide_t)(R(0.5) * (ln_v - r_log1p(real.s_less_1)));
+        e->profile = (selfcal_wide_t)(R(-0.5) * n * (ln_v - (selfcal_real_t)truth->ln_v));
     }
-    e->profile = -0.5 * work->bank->weight * (ln_v - (selfcal_wide_t)truth->ln_v);
-    e->ln_sigma = 0.5 * (ln_v - ln_s);
 }
 
 /* ------------------------------------------------------------------------------------------------------------ fields */
@@ -238,11 +254,13 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
         return;
     }
     const selfcal_node_view_t *v = &field->node;
-    selfcal_bank_view(bank, work->axis, index, &field->node);
-    const selfcal_wide_t var = fmax((v->c - v->b * v->b / v->a) / n, least); /* of the residual; the rest is in units of it */
-    const selfcal_wide_t miss = v->b / v->a + selfcal_bank_from_prior(bank, work->axis), known = v->a / var;
+    selfcal_bank_sums(bank, work->axis, index, &field->node);
+    const selfcal_wide_t mean = v->b / v->a;
+    field->var = fmax((v->c - v->b * mean) * work->per_n, least); /* of the residual; the rest is in units of it */
+    const selfcal_real_t miss = (selfcal_real_t)((mean + selfcal_bank_from_prior(bank, work->axis)) * work->per_bias_sd);
     const selfcal_real_t beginning = (selfcal_real_t)bank->beginning, size = (selfcal_real_t)n;
-    const selfcal_real_t width = (selfcal_real_t)(p0 * known), missed = beginning * (selfcal_real_t)(miss * miss * known);
+    const selfcal_real_t width = (selfcal_real_t)v->a / (selfcal_real_t)(field->var * work->per_bias_sd * work->per_bias_sd);
+    const selfcal_real_t missed = beginning * miss * miss * width;
     /* The mode: the bias takes a share of one sample; of how far it missed its prior, what that leaves is noise. (Beyond 10 sd of the prior
      * there is another, where all of that is noise; this one says what the readings scatter by.) */
     selfcal_real_t ratio = R(1.0), before, rest, share, noise;
@@ -255,12 +273,44 @@ static void node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *
         ratio = (size + noise) / r_fma(-beginning, share, size);
     } while (r_fabs(ratio - before) > SELFCAL_MODE_LEFT * ratio && --turns > 0U);
     noise /= ratio;
-    const selfcal_wide_t ln_var = log(var * (selfcal_wide_t)ratio);
-    field->ln_sigma = 0.5 * ln_var;
     field->ratio = ratio;
-    field->profile = -0.5 * (n * (SELFCAL_LN_2PI + ln_var + 1.0 / (selfcal_wide_t)ratio) + v->ln_s +
-                             (selfcal_wide_t)(missed / (width + ratio) - beginning * r_log(rest)));
+    field->extra = missed / (width + ratio) - beginning * r_log(rest);
     field->share = share * r_fma(beginning, share, noise + noise);
+}
+
+/* ln of sigma_v^2's mode over the variance, and that mode's cost, nats a sample: 0 where both agree. */
+static selfcal_real_t ln_ratio(const selfcal_field_t *field) {
+    return r_log1p(field->ratio - R(1.0));
+}
+static selfcal_real_t ratio_cost(const selfcal_field_t *field) {
+    return ln_ratio(field) - (field->ratio - R(1.0)) / field->ratio;
+}
+
+/* One node into what the report keeps of all: from the best so far, so that what counts in the end was counted from near by. */
+static void keep_node(selfcal_work_t *work, uint16_t k, const selfcal_field_t *field) {
+    selfcal_top_t *top = &work->top;
+    selfcal_top_t mine = {field->var, 0.0, field->node.ln_s, ratio_cost(field), field->extra};
+    selfcal_real_t profile = R(0.0), scatter = R(0.0);
+    if (k > 0U) {
+        /* Where the drift hides the white noise, the first two terms are far larger than their sum. */
+        const selfcal_wide_t ln_var = selfcal_bank_ln(mine.var * top->per_var);
+        profile = (selfcal_real_t)(-0.5 * (work->bank->weight * ln_var + (mine.ln_s - top->ln_s))) -
+                  R(0.5) * r_fma((selfcal_real_t)work->bank->weight, mine.cost - top->cost, mine.extra - top->extra);
+        scatter = R(0.5) * (selfcal_real_t)ln_var;
+    }
+    if (k == 0U || profile > R(0.0)) {
+        for (uint16_t i = 0; i < k; i++) {
+            work->field[0][i] -= profile;
+            work->field[1][i] -= scatter;
+            work->scratch.fit.scatter[i] -= scatter;
+        }
+        profile = scatter = R(0.0);
+        mine.per_var = 1.0 / mine.var;
+        *top = mine;
+    }
+    work->field[0][k] = profile;
+    work->field[1][k] = r_fma(R(0.5), ln_ratio(field), scatter);
+    work->scratch.fit.scatter[k] = scatter;
 }
 
 /* delta + e^(-2 delta)/2 - 1/2: two terms of delta's order leave one of delta^2; n_eff times what that costs in float is 2e-3 where n_eff
@@ -284,19 +334,35 @@ static selfcal_real_t sigma_end(selfcal_real_t n_eff, selfcal_real_t sign) {
 }
 
 /* What the sigma_v cells make of [from, to], with weights that are 1 where the ln-likelihood lies `drop` below the mode. */
-static void sigma_cells(selfcal_work_t *work, selfcal_real_t from, selfcal_real_t to, selfcal_real_t drop) {
+static bool sigma_cells(selfcal_work_t *work, selfcal_real_t from, selfcal_real_t to, selfcal_real_t drop) {
     const selfcal_real_t width = (to - from) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
     if (from == work->delta_from && width == work->delta_width) {
-        return;
+        return false;
     }
     work->delta_from = from;
     work->delta_width = width;
     const selfcal_real_t n_eff = work->n_eff;
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
         const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width;
-        work->delta_expm1[k] = r_expm1(r_fmin(delta, DELTA_MOST));
-        work->delta_weight[k] = r_exp(r_fma(-n_eff, sigma_shape(delta), drop)) * width;
+        work->scratch.grid.delta_expm1[k] = r_expm1(r_fmin(delta, DELTA_MOST));
+        work->scratch.grid.delta_weight[k] = r_exp(r_fma(-n_eff, sigma_shape(delta), drop)) * width;
     }
+    return true;
+}
+
+/* Moments of sigma_v where nothing cuts it: its mass, and means of e^delta - 1 and of its square. */
+static void sigma_moments(selfcal_work_t *work) {
+    (void)sigma_cells(work, work->delta_lo, work->delta_hi, R(0.0));
+    selfcal_real_t mass = R(0.0), first = R(0.0), second = R(0.0);
+    for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
+        const selfcal_real_t e = work->scratch.grid.delta_expm1[k], weighed = work->scratch.grid.delta_weight[k] * e;
+        mass += work->scratch.grid.delta_weight[k];
+        first += weighed;
+        second = r_fma(weighed, e, second);
+    }
+    work->sigma_mass = mass;
+    work->sigma_first = first / mass;
+    work->sigma_second = second / mass;
 }
 
 static uint16_t nodes_of(const selfcal_work_t *work) {
@@ -319,7 +385,7 @@ static uint16_t part(selfcal_work_t *work, unsigned step, uint16_t whole) {
  * become weights of the node values; the mean of anything the spline interpolates is the sum of its node values under them.
  * Some lines of one of the two; true after the last. */
 static bool step_transform(selfcal_work_t *work, bool transposed, int which) {
-    const selfcal_real_t *in = work->scratch.grid.field[which];
+    const selfcal_real_t *in = &work->field[which][work->first_node];
     selfcal_real_t *out = work->scratch.grid.spline[which];
     const selfcal_grid_t *rho = hypothesis_of(work)->rho, *alpha = hypothesis_of(work)->alpha;
     const uint16_t rows = grid_nodes(rho), columns = grid_nodes(alpha), lines = (uint16_t)(rows + columns);
@@ -334,43 +400,82 @@ static bool step_transform(selfcal_work_t *work, bool transposed, int which) {
     return work->at == lines;
 }
 
-/* The best node of the hypothesis settles n_eff, by the share of the bias there; that of all with an expectation is the first guess of
- * what made the data. */
-static void step_peak(selfcal_work_t *work, uint16_t nodes) {
-    const selfcal_wide_t n = work->bank->weight;
-    if (work->at == 0U) {
-        work->peak = (selfcal_wide_t)-INFINITY;
-    }
-    for (uint16_t k = part(work, step_nodes(work), nodes); k < work->at; k++) {
+/* Looks at all nodes. The best of those with an expectation is the first guess of what made the data. */
+static void step_truth(selfcal_work_t *work) {
+    const selfcal_model_t *model = work->bank->model;
+    selfcal_truth_t *truth = &work->truth;
+    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
+    selfcal_field_t field;
+    for (uint16_t k = 0; work->at == 0U && k < model->nodes; k++) {
         work->hypothesis = place_of(work, k).hypothesis;
-        selfcal_field_t field;
-        node_field(work, k, &field);
         if (hypothesis_of(work)->rho == NULL) {
-            work->truth.ln_noise = (selfcal_real_t)(0.5 * field.node.ln_s / n);
-        }
-        if (has_expectation(work)) {
-            work->truth.pair = work->truth.pair || hypothesis_of(work)->alpha != NULL;
-        } else if (work->stage == TRUTH) {
-            continue;
-        }
-        if (field.profile > work->peak) {
-            work->peak = field.profile;
-            work->n_eff = (selfcal_real_t)n - field.share;
-            work->best_node = k;
+            selfcal_bank_ln_s(work->bank, k, &field.node);
+            truth->ln_noise = R(0.5) * (selfcal_real_t)field.node.ln_s / weight;
         }
     }
+    if (work->at == 0U) {
+        work->per_n = 1.0 / work->bank->weight;
+        work->per_bias_sd = 1.0 / (selfcal_wide_t)axis_of(work)->bias_sd;
+    }
+    for (uint16_t k = part(work, step_nodes(work), model->nodes); k < work->at; k++) {
+        const selfcal_place_t place = place_of(work, k);
+        work->hypothesis = place.hypothesis;
+        node_field(work, k, &field);
+        selfcal_bank_ln_s(work->bank, k, &field.node);
+        keep_node(work, k, &field);
+        if (has_expectation(work)) { /* as its filters settle an even record comes to 8 nats, and to 16 with some gaps: no more counts as missed */
+            const selfcal_real_t s_less_1 = truth->ln_noise == R(0.0) ? work->bank->node[k].p_inf
+                                                                      : settled(place.ln_rho - truth->ln_noise, beta_at(work, place.ln_alpha));
+            const selfcal_real_t ln_s = weight * r_fma(R(2.0), truth->ln_noise, r_log1p(s_less_1));
+            truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.node.ln_s - ln_s) - R(16.0));
+        }
+    }
+    if (work->at < model->nodes) {
+        return;
+    }
+    work->ln_top = log(work->top.var);
+    work->top_profile = -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + work->ln_top + 1.0 + (selfcal_wide_t)work->top.cost) + work->top.ln_s +
+                                (selfcal_wide_t)work->top.extra);
+    work->best_node = model->nodes;
+    for (uint16_t k = 0; k < model->nodes; k++) {
+        work->hypothesis = place_of(work, k).hypothesis;
+        if (has_expectation(work)) {
+            truth->pair = truth->pair || hypothesis_of(work)->alpha != NULL;
+            if (work->best_node == model->nodes || work->field[0][k] > work->field[0][work->best_node]) {
+                work->best_node = k;
+            }
+        }
+    }
+    work->hypothesis = 0;
+}
+
+/* The best node of the hypothesis settles n_eff, by the share of the bias there, and with it how sigma_v is spread. */
+static void step_sigma(selfcal_work_t *work, uint16_t nodes) {
+    const selfcal_real_t *profile = &work->field[0][work->first_node];
+    uint16_t best = 0;
+    for (uint16_t k = 1; k < nodes; k++) {
+        best = profile[k] > profile[best] ? k : best;
+    }
+    selfcal_field_t field;
+    node_field(work, best, &field);
+    work->n_eff = (selfcal_real_t)work->bank->weight - field.share;
+    work->peak = profile[best];
+    work->delta_lo = sigma_end(work->n_eff, R(-1.0));
+    work->delta_hi = sigma_end(work->n_eff, R(1.0));
+    work->delta_from = work->delta_hi; /* no cells yet */
+    sigma_moments(work);
 }
 
 /* What the splines have to carry at the nodes. */
 static void step_values(selfcal_work_t *work) {
-    for (uint16_t k = part(work, step_nodes(work), nodes_of(work)); k < work->at; k++) {
+    const uint16_t nodes = nodes_of(work);
+    for (uint16_t k = part(work, STEP_VALUES, nodes); k < work->at; k++) {
         const selfcal_place_t place = place_of(work, k);
+        selfcal_real_t *profile = &work->field[0][work->first_node + k], *ln_sigma = &work->field[1][work->first_node + k];
         expectation_t e;
-        selfcal_field_t exact;
-        node_field(work, k, &exact);
-        expectation(work, place.ln_rho, place.ln_alpha, &e);
-        work->scratch.grid.field[0][k] = (selfcal_real_t)(exact.profile - work->peak - e.profile);
-        work->scratch.grid.field[1][k] = (selfcal_real_t)(exact.ln_sigma - e.ln_sigma);
+        expectation(work, place.ln_rho, place.ln_alpha, beta_at(work, place.ln_alpha), &e);
+        *profile = (selfcal_real_t)((selfcal_wide_t)(*profile - work->peak) - e.profile);
+        *ln_sigma = (selfcal_real_t)((selfcal_wide_t)*ln_sigma + 0.5 * work->ln_top - e.ln_sigma);
     }
 }
 
@@ -392,50 +497,76 @@ static void step_values(selfcal_work_t *work) {
 #define FIT_MOST R(1e6)
 /* Less of a node whose filter takes 1/p steps to settle in a record hardly longer, for which the ends are not as above. */
 #define UNSETTLED R(200.0)
+/* Of more nodes those that hardly settle at all are left out; fewer tell too little without. */
+#define UNSETTLED_NODES 150U
 /* Less, by nats below the best node, where intervals or samples are missing, the rate has changed, or regressors are in use: what a node makes
  * of the level on both sides of a gap, of noise that varies, or of what the coefficients take up, depends on more than psi, and by some
  * part in a hundred of those nats. */
 #define FAR R(0.033)
+/* What a float holds of those nats, over the 0.01. */
+#define FAR_EVEN R(2e-4)
 
-/* Of ln omega, from 1/n to 6, which stands for pi (set_lines() below). */
-static selfcal_real_t line_step(selfcal_real_t weight) {
-    return (R(1.7917595) + r_log(weight)) / (selfcal_real_t)(SELFCAL_LINES - 1);
+/* Lines are so far apart in ln omega, as far as there are so many; up to LINES_APART they do. */
+#define LINE_STEP R(0.45)
+#define LINES_APART R(0.55)
+
+/* Of ln omega from 1/n to 6, which stands for pi (set_lines() below). */
+static selfcal_real_t lines_range(selfcal_real_t weight) {
+    return R(1.7917595) + r_log(weight);
+}
+
+static unsigned unknowns(const selfcal_truth_t *truth) {
+    return truth->lines + (truth->lines + 2U) / 3U * 2U;
 }
 
 static void set_lines(selfcal_work_t *work) {
     selfcal_fit_t *fit = &work->scratch.fit;
     selfcal_truth_t *truth = &work->truth;
-    memset(fit, 0, sizeof *fit);
-    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight, step = line_step(weight), ratio = r_exp(step);
-    selfcal_real_t omega = R(1.0) / weight;
-    selfcal_real_t *diagonal = fit->triangle;
-    for (unsigned m = 0; m < SELFCAL_LINES; m++) {
+    memset(fit->triangle, 0, sizeof fit->triangle);
+    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight, range = lines_range(weight);
+    truth->lines = 8;
+    while (truth->lines < SELFCAL_LINES && range > LINE_STEP * (selfcal_real_t)(truth->lines - 1U)) {
+        truth->lines = (uint8_t)(truth->lines + 2U);
+    }
+    const selfcal_real_t step = range / (selfcal_real_t)(truth->lines - 1U), ratio = r_exp(step);
+    selfcal_real_t omega = R(1.0) / weight, *end = &truth->power[truth->lines];
+    for (unsigned m = 0; m < truth->lines; m++) {
         const selfcal_real_t omega_sq = omega * omega;
         truth->distance[m] = omega_sq / r_fma(R(0.22222222), omega_sq, R(1.0)); /* 4 where omega is 6: where a line lies is free */
         const selfcal_real_t spectrum =
             R(1.0) + R(2.0) * truth->variance * truth->rate / r_fma(truth->rate, truth->rate, truth->distance[m]);
         const selfcal_real_t share = omega * step / (R(3.1415927) * weight); /* of its band in the record's frequencies */
         truth->power[m] = spectrum * r_sqrt(share); /* until the fit is solved, a prior deviation */
-        selfcal_real_t *ends = &truth->power[end_of(m)]; /* of both lines as of the second */
-        ends[0] = ends[1] = R(4.0) * spectrum * share; /* two ends, a band of two lines */
+        if (m % 3U < 2U) { /* as of the line in the middle */
+            end[0] = end[1] = R(6.0) * spectrum * share; /* two ends, a band of three lines */
+        }
+        end += m % 3U == 2U ? 2U : 0U;
         omega *= ratio;
     }
-    for (unsigned m = 0; m < SELFCAL_FITTED; m++) {
-        *diagonal = R(1.0) / (FIT_PRECISION * weight); /* prior deviations of 1, over the nodes' */
-        diagonal += SELFCAL_FITTED + 1U - m;
+    selfcal_real_t *diagonal = fit->triangle;
+    fit->least = R(1.0) / (FIT_PRECISION * weight); /* prior deviations of 1, over the nodes' */
+    for (unsigned m = 0; m < unknowns(truth); m++) {
+        *diagonal = fit->least * fit->least;
+        diagonal += unknowns(truth) + 1U - m;
     }
 }
 
-/* Rotates a row of the least squares, its right side behind it, into the triangle (Golub & Van Loan, Matrix Computations, 5.2). */
-static void rotate_in(selfcal_fit_t *fit, selfcal_real_t row[SELFCAL_FITTED + 1]) {
-    selfcal_real_t *mine = fit->triangle;
-    for (unsigned m = 0; m < SELFCAL_FITTED; m++) {
-        const selfcal_real_t length = r_sqrt(mine[0] * mine[0] + row[m] * row[m]);
-        const selfcal_real_t c = mine[0] / length, s = row[m] / length;
-        for (unsigned i = m; i <= SELFCAL_FITTED; i++, mine++) {
-            const selfcal_real_t before = *mine;
-            *mine = c * before + s * row[i];
-            row[i] = c * row[i] - s * before;
+/* Rotates a row of the least squares, its right side behind it, into the triangle, without square roots: each row of that is what
+ * stands in it times the root of its diagonal (Gentleman, J. Inst. Maths Applics 12, 1973). */
+static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SELFCAL_FITTED + 1]) {
+    selfcal_real_t *mine = fit->triangle, weight = R(1.0);
+    for (unsigned m = 0; m < count; m++) {
+        const selfcal_real_t x = row[m], diagonal = *mine++;
+        if (r_fabs(x) < R(0.01) * fit->least) {
+            mine += count - m; /* less than the rows are good for */
+            continue;
+        }
+        const selfcal_real_t weighed = weight * x, now = r_fma(weighed, x, diagonal), s = weighed / now;
+        mine[-1] = now;
+        weight *= diagonal / now;
+        for (unsigned i = m + 1U; i <= count; i++, mine++) {
+            row[i] = r_fma(-x, *mine, row[i]);
+            *mine = r_fma(s, row[i], *mine);
         }
     }
 }
@@ -457,30 +588,35 @@ static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t
     const selfcal_truth_t *truth = &work->truth;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->ln_noise == R(0.0);
-    const selfcal_real_t far = even ? R(0.0) : FAR * deficit;
+    const selfcal_real_t far = (even ? FAR_EVEN : FAR) * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
+    if (even && UNSETTLED > R(20.0) * e->p_sq * n * n && work->bank->model->nodes > UNSETTLED_NODES) {
+        return;
+    }
     selfcal_real_t row[SELFCAL_FITTED + 1];
     memset(row, 0, sizeof row);
-    for (unsigned m = 0; m < SELFCAL_LINES; m++) {
-        const unsigned ends = end_of(m);
+    unsigned end = truth->lines;
+    for (unsigned m = 0; m < truth->lines; m++) {
         const selfcal_real_t share = per_v / r_fma(e->psi, truth->distance[m], e->p_sq);
         row[m] = share * r_fma(e->phi, truth->distance[m], e->beta_sq) * truth->power[m];
-        row[ends] += share * e->edge * truth->power[ends];
-        row[ends + 1U] += share * e->level * truth->power[ends + 1U];
+        row[end] += share * e->edge * truth->power[end];
+        row[end + 1U] += share * e->level * truth->power[end + 1U];
+        end += m % 3U == 2U ? 2U : 0U;
     }
-    row[SELFCAL_FITTED] = weight * r_fmin(r_expm1(R(2.0) * off), FIT_MOST);
-    rotate_in(&work->scratch.fit, row);
+    row[unknowns(truth)] = weight * r_fmin(r_expm1(R(2.0) * off), FIT_MOST);
+    rotate_in(&work->scratch.fit, unknowns(truth), row);
 }
 
 static void solve(selfcal_work_t *work) {
     selfcal_truth_t *truth = &work->truth;
-    selfcal_real_t *mine = work->scratch.fit.triangle + SELFCAL_TRIANGLE, found[SELFCAL_FITTED];
-    for (unsigned m = SELFCAL_FITTED; m-- > 0U;) {
-        selfcal_real_t rest = *--mine;
-        for (unsigned i = SELFCAL_FITTED - 1U; i > m; i--) {
-            rest -= *--mine * found[i];
+    const unsigned count = unknowns(truth);
+    const selfcal_real_t *mine = work->scratch.fit.triangle + count * (count + 3U) / 2U;
+    selfcal_real_t found[SELFCAL_FITTED];
+    for (unsigned m = count; m-- > 0U; mine--) {
+        found[m] = *--mine;
+        for (unsigned i = count - 1U; i > m; i--) {
+            found[m] -= *--mine * found[i];
         }
-        found[m] = rest / *--mine;
         truth->power[m] *= found[m];
     }
     truth->fitted = true;
@@ -500,52 +636,69 @@ static void step_fit(selfcal_work_t *work) {
         set_truth(work, place);
     }
     expectation_t e;
-    selfcal_field_t field;
-    expectation(work, place.ln_rho, place.ln_alpha, &e);
-    node_field(work, k, &field);
-    /* As its filters settle an even record comes to 8 nats, and to 16 with some gaps; that much does not count as missed. */
-    const selfcal_real_t ln_s = R(2.0) * (truth->ln_noise - (selfcal_real_t)e.ln_sigma) + e.ln_v;
+    expectation(work, place.ln_rho, place.ln_alpha, beta_at(work, place.ln_alpha), &e);
     /* What the priors of bias and coefficients add is no function of psi. */
-    const selfcal_wide_t off = field.ln_sigma - (selfcal_wide_t)(R(0.5) * r_log(field.ratio)) - e.ln_sigma;
-    truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.node.ln_s - (selfcal_real_t)work->bank->weight * ln_s) - R(16.0));
+    const selfcal_wide_t off = (selfcal_wide_t)work->scratch.fit.scatter[k] - e.ln_sigma;
     if (at == 0U) {
         work->ln_sigma_off = off;
         truth->ln_v = e.ln_v; /* any that is near will do */
-        truth->wide = (selfcal_real_t)work->bank->weight * e.ln_v > WIDE_BEYOND;
+        truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)e.ln_v > WIDE_BEYOND;
         set_lines(work);
     } else {
-        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), (selfcal_real_t)(work->peak - field.profile));
+        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), work->field[0][work->best_node] - work->field[0][k]);
     }
 }
 
 /* ------------------------------------------------------------------------------------------------------------- cells */
 
-/* The search makes do with half as many a dimension. */
-#define SEARCH_CELLS (SELFCAL_REPORT_CELLS / 2U)
+/* A range has two thirds of the cells, which are 0.6 sd of a normal one wide if all are 24; more if it is wider than 6.4 nepers, since moments
+ * of the parameters themselves need them narrower than 0.4. One row alone has twice as many: no other evens out what a limit cuts off in it. */
+#define CELLS_LEAST ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.0) / R(3.0)))
+#define CELLS_PER_NEPER ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.5) / R(24.0)))
+#define ROWS_MOST (SELFCAL_HISTOGRAM < 255U ? SELFCAL_HISTOGRAM : 255U) /* of alpha a bin is a row */
 
-static uint8_t cells(const selfcal_work_t *work, const selfcal_grid_t *grid) {
-    return grid != NULL ? work->cells : 1U;
+/* Part of the depth, at 2.5 sd of a normal one, to which a peak is looked at. */
+#define PEAK R(0.25)
+/* Least cells of a range by the samples of its search that lie on the peak, three or more of a normal one. Where a limit cuts the likelihood
+ * the peak may be narrow in a wide range. `on_two`: where there are two samples; more where nothing narrows the range after the search. */
+static uint8_t cells_for_peak(const selfcal_real_t height[], selfcal_real_t least, uint8_t on_two) {
+    unsigned count = 0;
+    for (unsigned i = 0; i < SELFCAL_SEARCH_SAMPLES; i++) {
+        count += height[i] > least ? 1U : 0U;
+    }
+    if (count == 2U) {
+        return on_two;
+    }
+    return count > 2U ? 16U : 64U;
 }
 
-static selfcal_real_t cell_middle(const selfcal_work_t *work, int dimension, uint16_t cell) {
-    return work->lo[dimension] + ((selfcal_real_t)cell + R(0.5)) * work->width[dimension];
-}
-
-static void set_box(selfcal_work_t *work, const selfcal_real_t lo[2], const selfcal_real_t hi[2]) {
-    const selfcal_t *bank = work->bank;
+static uint16_t cells_in(const selfcal_work_t *work, unsigned dimension) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    for (int d = 0; d < 2; d++) {
-        work->lo[d] = lo[d];
-        work->width[d] = (hi[d] - lo[d]) / (selfcal_real_t)cells(work, d == 0 ? hypothesis->rho : hypothesis->alpha);
+    if ((dimension == 0U ? hypothesis->rho : hypothesis->alpha) == NULL) {
+        return 1U;
     }
-    for (uint16_t i = 0; hypothesis->rho != NULL && i < work->cells; i++) {
-        const selfcal_real_t z = (cell_middle(work, 0, i) - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
-        work->basis_first[i] = basis_at(hypothesis->rho->nodes, z, work->scratch.grid.basis[i]);
+    const selfcal_range_t *range = &work->range[dimension];
+    const selfcal_real_t wanted = r_fmax(CELLS_PER_NEPER * (range->hi - range->lo), CELLS_LEAST);
+    unsigned cells = wanted < (selfcal_real_t)SELFCAL_REPORT_CELLS ? (unsigned)wanted : SELFCAL_REPORT_CELLS;
+    if (hypothesis->alpha == NULL) {
+        cells = 2U * SELFCAL_REPORT_CELLS;
     }
+    /* Splines that hold all of the likelihood are less even than what an expectation leaves. */
+    const unsigned least = (has_expectation(work) ? 1U : 2U) * work->least[dimension];
+    cells = cells < least ? least : cells;
+    return (uint16_t)(dimension == 1U && cells > ROWS_MOST ? ROWS_MOST : cells);
 }
 
-/* The widest box that the priors permit. */
-static void first_box(selfcal_work_t *work) {
+/* Weight of the cell i of `count`, alike from either end: the midpoint rule, which errs by h^2/24 times the slope at an end that the limits cut,
+ * less that (Press et al., Numerical Recipes, 4.1.4). */
+static selfcal_real_t cell_weight(unsigned count, unsigned i) {
+    static const selfcal_real_t of_end[3] = {R(13.0) / R(12.0), R(7.0) / R(8.0), R(25.0) / R(24.0)};
+    const unsigned from_end = i < count - 1U - i ? i : count - 1U - i;
+    return count > 1U && from_end < 3U ? of_end[from_end] : R(1.0);
+}
+
+/* The widest ranges of ln rho and ln alpha that the priors permit. */
+static void first_limits(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = prior_of(work);
     for (int d = 0; d < 2; d++) {
@@ -562,14 +715,15 @@ static void first_box(selfcal_work_t *work) {
         work->limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + shift;
         work->limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + shift;
     }
-    set_box(work, work->limit_lo, work->limit_hi);
 }
 
-static void make_row(selfcal_work_t *work) {
+/* The row of cells at an alpha. */
+static void make_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    row->ln_alpha = cell_middle(work, 1, work->row);
+    row->ln_alpha = ln_alpha;
+    row->beta = beta_at(work, ln_alpha);
     row->half_ln_dt = half_ln_dt(work);
     row->shift = drift_shift(work);
     uint16_t taps = 1;
@@ -594,10 +748,12 @@ static void make_row(selfcal_work_t *work) {
 
 typedef struct {
     selfcal_real_t ln_rho, profile, ln_sigma;
+    selfcal_real_t basis[6]; /* of rho */
+    uint8_t basis_first;
     bool off_grid;
 } cell_t;
 
-static void make_cell(const selfcal_work_t *work, uint16_t i, cell_t *cell) {
+static void make_cell(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_t *cell) {
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     cell->off_grid = false;
@@ -605,26 +761,28 @@ static void make_cell(const selfcal_work_t *work, uint16_t i, cell_t *cell) {
     if (hypothesis->rho == NULL) {
         cell->profile = row->profile[0];
         cell->ln_sigma = row->ln_sigma[0];
+        cell->basis_first = 0;
+        cell->basis[0] = R(1.0);
         return;
     }
-    cell->ln_rho = cell_middle(work, 0, i);
+    cell->ln_rho = ln_rho;
     cell->profile = R(0.0);
     cell->ln_sigma = R(0.0);
-    const uint8_t first = work->basis_first[i];
-    for (uint16_t k = 0; k < 6U; k++) {
-        cell->profile = r_fma(work->scratch.grid.basis[i][k], row->profile[first + k], cell->profile);
-        cell->ln_sigma = r_fma(work->scratch.grid.basis[i][k], row->ln_sigma[first + k], cell->ln_sigma);
-    }
-    /* Beyond the nodes the spline's part is held and the expectation carries on. */
     const selfcal_t *bank = work->bank;
     const selfcal_real_t z = (cell->ln_rho - bank->rho_lo[work->hypothesis]) / bank->rho_step[work->hypothesis];
+    cell->basis_first = basis_at(hypothesis->rho->nodes, z, cell->basis);
+    for (uint16_t k = 0; k < 6U; k++) {
+        cell->profile = r_fma(cell->basis[k], row->profile[cell->basis_first + k], cell->profile);
+        cell->ln_sigma = r_fma(cell->basis[k], row->ln_sigma[cell->basis_first + k], cell->ln_sigma);
+    }
+    /* Beyond the nodes the spline's part is held and the expectation carries on. */
     cell->off_grid = z < R(0.0) || z > (selfcal_real_t)(hypothesis->rho->nodes - 1U);
     if (is_sum(hypothesis->law)) { /* without an expectation: up there the drift hides the white noise, sigma_v rho stays */
         const selfcal_real_t beyond = z - (selfcal_real_t)(hypothesis->rho->nodes - 1U);
         cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
     }
     expectation_t e;
-    expectation(work, cell->ln_rho, row->ln_alpha, &e);
+    expectation(work, cell->ln_rho, row->ln_alpha, row->beta, &e);
     cell->profile += (selfcal_real_t)e.profile;
     cell->ln_sigma += (selfcal_real_t)e.ln_sigma;
 }
@@ -693,154 +851,257 @@ static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_valu
     return reach;
 }
 
-/* ---------------------------------------------------------------------------------------------------- search of the box */
+/* -------------------------------------------------------------------------------------------------------------- search */
+
+/* A row's cells reach from where the likelihood begins to count to where it ends, and so do the rows. Either range is found by
+ * passes of few samples: each shrinks it to those that count and one more, or lets it grow where the last one counts. */
+#define SAMPLES SELFCAL_SEARCH_SAMPLES
+
+static selfcal_real_t sample_at(const selfcal_range_t *range, unsigned i) {
+    return r_fma((range->hi - range->lo) / (selfcal_real_t)SAMPLES, (selfcal_real_t)i + R(0.5), range->lo);
+}
+
+/* The next range after a pass; false: it stays. */
+static bool next_range(selfcal_range_t *range, const selfcal_real_t height[SAMPLES], selfcal_real_t least, const selfcal_range_t *limit) {
+    unsigned first = 0, last = SAMPLES - 1U;
+    while (first < last && !(height[first] > least)) {
+        first++;
+    }
+    while (last > first && !(height[last] > least)) {
+        last--;
+    }
+    const selfcal_real_t whole = range->hi - range->lo, step = whole / (selfcal_real_t)SAMPLES;
+    const selfcal_real_t lo = r_fmax(first == 0U ? range->lo - GROWTH * whole : sample_at(range, first) - step, limit->lo);
+    const selfcal_real_t hi = r_fmin(last == SAMPLES - 1U ? range->hi + GROWTH * whole : sample_at(range, last) + step, limit->hi);
+    if (!(lo < range->lo || hi > range->hi || hi - lo < SHRINK * whole)) {
+        return false;
+    }
+    range->lo = lo;
+    range->hi = hi;
+    return true;
+}
+
+/* Height of a cell's middle at the sigma_v that the limits leave. The search keeps the best of all, which the sums are counted from. */
+static selfcal_real_t height_at(selfcal_work_t *work, selfcal_real_t ln_rho) {
+    cell_t cell;
+    selfcal_real_t ln_value[SELFCAL_PARAMETERS], half[2] = {R(0.0), R(0.0)};
+    make_cell(work, ln_rho, &cell);
+    cell_parameters(work, &cell, ln_value);
+    const reach_t reach = reach_of(work, ln_value, half);
+    const selfcal_real_t height = cell.profile - reach.drop;
+    if (work->stage == SEARCH && height > work->best) {
+        work->best = height;
+        work->drop[work->hypothesis] = reach.drop;
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            work->best_ln[p] = ln_value[p] + reach.peak;
+        }
+        work->best_ln[SELFCAL_ALPHA] = ln_value[SELFCAL_ALPHA];
+    }
+    return height > (selfcal_real_t)-INFINITY ? height : (selfcal_real_t)-INFINITY; /* nor NaN */
+}
+
+/* Where a row ends between a sample that counts and one that does not: the root of the depth is nearly linear, but where a limit cuts,
+ * by halves. */
+static selfcal_real_t row_end(selfcal_work_t *work, selfcal_real_t in, selfcal_real_t in_height, selfcal_real_t out, selfcal_real_t out_height) {
+    const selfcal_real_t best = work->row_best;
+    unsigned turns = 0;
+    while (in_height > best - PEAK * work->depth || out_height < best - R(3.0) * work->depth) {
+        if (turns++ == 4U) {
+            return out;
+        }
+        const selfcal_real_t middle = R(0.5) * (in + out), height = height_at(work, middle);
+        if (height > best - work->depth) {
+            in = middle;
+            in_height = height;
+        } else {
+            out = middle;
+            out_height = height;
+        }
+    }
+    const selfcal_real_t inside = r_sqrt(best - in_height), outside = r_sqrt(best - out_height);
+    return r_fma((r_sqrt(work->depth) - inside) / (outside - inside), out - in, in);
+}
+
+/* One pass over the row in hand; true after the last, when work->range[0] is where it counts. */
+static bool find_row(selfcal_work_t *work) {
+    selfcal_range_t *range = &work->range[0];
+    const selfcal_range_t limit = {work->limit_lo[0], work->limit_hi[0]};
+    if (hypothesis_of(work)->rho == NULL) {
+        *range = limit;
+        work->row_best = height_at(work, R(0.0));
+        return true;
+    }
+    selfcal_real_t height[SAMPLES], best = (selfcal_real_t)-INFINITY;
+    for (unsigned i = 0; i < SAMPLES; i++) {
+        height[i] = height_at(work, sample_at(range, i));
+        best = r_fmax(best, height[i]);
+    }
+    work->row_best = best;
+    selfcal_range_t next = *range;
+    if (next_range(&next, height, best - work->depth, &limit) && work->at < PASSES_MAX) {
+        *range = next;
+        return false;
+    }
+    unsigned first = 0, last = SAMPLES - 1U;
+    while (first < last && !(height[first] > best - work->depth)) {
+        first++;
+    }
+    while (last > first && !(height[last] > best - work->depth)) {
+        last--;
+    }
+    if (first > 0U) {
+        next.lo = row_end(work, sample_at(range, first), height[first], sample_at(range, first - 1U), height[first - 1U]);
+    }
+    if (last < SAMPLES - 1U) {
+        next.hi = row_end(work, sample_at(range, last), height[last], sample_at(range, last + 1U), height[last + 1U]);
+    }
+    work->least[0] = cells_for_peak(height, best - PEAK * work->depth, 16);
+    *range = next;
+    return true;
+}
+
+/* A row near the one in hand is looked for where that one is, and half as far beyond. */
+static void widen_row(selfcal_work_t *work) {
+    selfcal_range_t *range = &work->range[0];
+    const selfcal_real_t more = R(0.5) * (range->hi - range->lo);
+    range->lo = r_fmax(range->lo - more, work->limit_lo[0]);
+    range->hi = r_fmin(range->hi + more, work->limit_hi[0]);
+}
 
 static void begin_pass(selfcal_work_t *work) {
     work->row = 0;
-    work->at = 0;
-    for (int d = 0; d < 2; d++) {
-        work->found_lo[d] = INFINITY;
-        work->found_hi[d] = -INFINITY;
-    }
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         work->range_lo[p] = INFINITY;
         work->range_hi[p] = -INFINITY;
     }
 }
 
-/* Whether what the limits leave of a cell counts beside the best. One that lies more than `by` higher becomes the best; the sums begin anew
- * then. In the search by its middle alone: where the likelihood is steep a wide cell's part within the limits does not keep what the
- * middle beyond them promises. */
-static bool counts(selfcal_work_t *work, const selfcal_real_t ln_value[], const reach_t *reach, selfcal_real_t profile, selfcal_real_t by) {
-    selfcal_real_t height = profile - reach->drop;
-    if (!(reach->from < reach->to) || !(height > work->best - DEPTH)) { /* nor NaN */
-        return false;
-    }
-    if (height > work->best + by) {
-        selfcal_real_t drop = reach->drop, peak = reach->peak;
-        if (work->stage == SUM) {
-            work->stage = BOX;
-            work->at = 0;
-        } else {
-            selfcal_real_t half[2] = {R(0.0), R(0.0)};
-            const reach_t middle = reach_of(work, ln_value, half);
-            drop = middle.drop;
-            peak = middle.peak;
-            height = profile - drop;
-            if (!(height > work->best)) {
-                return true;
-            }
-        }
-        work->best = height;
-        work->drop[work->hypothesis] = drop;
-        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            work->best_ln[p] = ln_value[p] + peak;
-        }
-        work->best_ln[SELFCAL_ALPHA] = ln_value[SELFCAL_ALPHA];
-    }
-    return work->stage != BOX;
+static void begin_search(selfcal_work_t *work) {
+    first_limits(work);
+    work->range[1].lo = work->limit_lo[1];
+    work->range[1].hi = work->limit_hi[1];
+    work->depth = DEPTH + DEPTH_OF_SHORT / work->n_eff;
+    work->best = -INFINITY;
+    work->least[0] = 1;
+    work->pass = 0;
+    begin_pass(work);
 }
 
-static void step_scan(selfcal_work_t *work) {
-    if (work->at == 0U) {
-        make_row(work);
-    }
-    const selfcal_cell_row_t *row = &work->scratch.grid.row;
-    for (uint16_t i = part(work, STEP_SCANNED_CELLS, cells(work, hypothesis_of(work)->rho)); i < work->at; i++) {
+/* What N and the drift parameter run through in a row: both are monotonic in rho. */
+static void note_ranges(selfcal_work_t *work) {
+    for (int end = 0; end < 2; end++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
-        make_cell(work, i, &cell);
+        make_cell(work, end == 0 ? work->range[0].lo : work->range[0].hi, &cell);
         cell_parameters(work, &cell, ln_value);
-        selfcal_real_t half[2] = {R(0.0), R(0.5) * work->width[0]};
-        const reach_t reach = reach_of(work, ln_value, half);
-        if (!counts(work, ln_value, &reach, cell.profile, R(0.0))) {
-            continue;
-        }
-        const selfcal_real_t middle[2] = {cell.ln_rho, row->ln_alpha};
-        for (int d = 0; d < 2; d++) {
-            work->found_lo[d] = r_fmin(work->found_lo[d], middle[d] - R(1.5) * work->width[d]);
-            work->found_hi[d] = r_fmax(work->found_hi[d], middle[d] + R(1.5) * work->width[d]);
-        }
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            const selfcal_real_t share = p == SELFCAL_ALPHA ? R(0.0) : R(1.0);
-            const selfcal_real_t side = p == SELFCAL_ALPHA ? work->width[1] : (p == SELFCAL_N ? R(0.0) : work->width[0]);
-            work->range_lo[p] = r_fmin(work->range_lo[p], ln_value[p] + share * reach.from - side);
-            work->range_hi[p] = r_fmax(work->range_hi[p], ln_value[p] + share * reach.to + side);
+            work->range_lo[p] = r_fmin(work->range_lo[p], ln_value[p] + work->delta_lo);
+            work->range_hi[p] = r_fmax(work->range_hi[p], ln_value[p] + work->delta_hi);
         }
     }
 }
 
-/* Ends a pass: true when the search is over; work->moved if found_lo and found_hi now are the next box, else it stays. The first
- * pass only finds the peak, so that the next ones need not keep what lay near an earlier, lower best. */
-static bool end_scan(selfcal_work_t *work) {
-    work->moved = false;
-    if (!(work->found_lo[0] < work->found_hi[0])) {
-        /* Against a limit where the likelihood is steep, a wide cell reaches in from where no narrow one does, and all that is left
-         * lies far below what it promised: once more in this box, for the best that is in it. */
-        const bool again = work->best > (selfcal_real_t)-INFINITY && work->pass < PASSES_MAX;
-        work->best = -INFINITY;
-        return !again;
+/* One pass over one of the rows. True when all ranges are found. */
+static bool step_search(selfcal_work_t *work) {
+    const bool rows = hypothesis_of(work)->alpha != NULL;
+    selfcal_range_t *range = &work->range[1];
+    if (work->at == 0U) {
+        const selfcal_real_t ln_alpha = rows ? sample_at(range, work->row) : R(0.0);
+        if (work->pass == 0U) {
+            work->range[0].lo = work->limit_lo[0]; /* nothing is known yet: a row may have two peaks */
+            work->range[0].hi = work->limit_hi[0];
+        } else {
+            widen_row(work);
+        }
+        make_row(work, ln_alpha);
     }
-    if (work->pass == 0U) {
-        return hypothesis_of(work)->rho == NULL;
+    work->at++;
+    if (!find_row(work)) {
+        return false;
     }
-    bool changed = false;
-    work->moved = true;
-    for (int d = 0; d < 2; d++) {
-        const bool present = d == 0 ? hypothesis_of(work)->rho != NULL : hypothesis_of(work)->alpha != NULL;
-        const selfcal_real_t whole = work->width[d] * (selfcal_real_t)work->cells;
-        /* Wide cells see a slanting ridge in pieces, and lose its ends: a box whose border cells count grows again. */
-        const bool below = work->found_lo[d] < work->lo[d], above = work->found_hi[d] > work->lo[d] + whole;
-        work->found_lo[d] = present ? r_fmax(work->found_lo[d] - (below ? GROWTH * whole : R(0.0)), work->limit_lo[d])
-                                    : work->limit_lo[d];
-        work->found_hi[d] = present ? r_fmin(work->found_hi[d] + (above ? GROWTH * whole : R(0.0)), work->limit_hi[d])
-                                    : work->limit_hi[d];
-        changed = changed || (present && (work->found_hi[d] - work->found_lo[d] < SHRINK * whole || work->found_lo[d] < work->lo[d] ||
-                                          work->found_hi[d] > work->lo[d] + whole));
+    work->at = 0;
+    work->scratch.grid.height[work->row] = work->row_best;
+    work->scratch.grid.found[work->row] = work->range[0];
+    work->scratch.grid.least[work->row] = work->least[0];
+    if (work->row_best > work->best - work->depth) {
+        note_ranges(work);
     }
-    return !changed || work->pass >= PASSES_MAX;
+    work->row++;
+    if (rows && work->row < SAMPLES) {
+        return false;
+    }
+    const selfcal_range_t limit = {work->limit_lo[1], work->limit_hi[1]};
+    const selfcal_range_t before = *range;
+    /* After the last pass the range stays what the rows found belong to. */
+    if (rows && work->pass < PASSES_MAX && next_range(range, work->scratch.grid.height, work->best - work->depth, &limit)) {
+        work->pass++;
+        /* It does not grow again beyond a row that did not count. */
+        work->limit_lo[1] = range->lo > before.lo ? range->lo : work->limit_lo[1];
+        work->limit_hi[1] = range->hi < before.hi ? range->hi : work->limit_hi[1];
+        /* Huge samples shrink the range to a few roundings at the prior's end: there at may be all samples. */
+        const selfcal_real_t at = (range->lo - before.lo) / (before.hi - before.lo) * (selfcal_real_t)SAMPLES;
+        work->range[0] = work->scratch.grid.found[at > R(0.0) ? (unsigned)r_fmin(at, (selfcal_real_t)(SAMPLES - 1U)) : 0U];
+        begin_pass(work);
+        return false;
+    }
+    work->least[1] = rows ? cells_for_peak(work->scratch.grid.height, work->best - PEAK * work->depth, 32) : 1U;
+    return true;
 }
 
 /* --------------------------------------------------------------------------------------------------------------- sums */
 
 /* Whether nodes or lines are too far apart for a record so long. What the data put into a node's sums looks, as a function of ln rho or ln
  * alpha, like white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at the nodes' Nyquist frequency pi/h that is
- * e^(-pi^2/2h). It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
+ * e^(-pi^2/2h), of alpha 3/8 of it. It grows as sqrt(n); the nodes of a grid of two dimensions show what lies between its rows and columns, and between the nodes
  * of a random walk beside it, so that lines leave little of it; on such a grid no more comes after some 10^4 samples. Of a law without
  * an expectation all of the ln-likelihood is left to the splines, which grows as n. The limits are measured, on records over the
- * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances. What uneven noise or time adds to the
+ * whole prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances (the
+ * Cortex-M0's 14 x 7: 388 of 390 of 4100 and 4400, then 8 of 120 of 6000 did not). What uneven noise or time adds to the
  * ln-likelihood is as smooth and left to the splines whole, with lines that are forced to explain it besides: a nat of it weighs as 100. */
 static bool too_coarse(const selfcal_work_t *work) {
     /* 0, so that e^-inf is the rest, where there is none. */
     const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]};
     const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t rest = r_exp(R(-4.9348022) / step[0]) + R(0.5) * r_exp(R(-4.9348022) / step[1]);
+    const selfcal_real_t rest = r_exp(R(-4.9348022) / step[0]) + R(0.375) * r_exp(R(-4.9348022) / step[1]);
     if (!has_expectation(work)) {
         return rest * weight > R(0.08);
     }
     const bool pair = hypothesis_of(work)->alpha != NULL;
     return rest * (r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) + R(100.0) * work->truth.missed) > (work->truth.pair ? R(0.4) : R(0.02)) ||
-           line_step(weight) > R(0.5);
+           lines_range(weight) > LINES_APART * (selfcal_real_t)(SELFCAL_LINES - 1);
 }
 
 static void begin_sum(selfcal_work_t *work) {
     work->row = 0;
-    work->at = 0;
+    work->rows = (uint8_t)cells_in(work, 1);
     work->mass = work->mass_sq = 0.0;
     work->off_grid = too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0; /* then all of the mass counts as off the grid */
     memset(work->first, 0, sizeof work->first);
     memset(work->second, 0, sizeof work->second);
-    memset(work->scratch.grid.field, 0, sizeof work->scratch.grid.field);
+    for (int which = 0; which < 2; which++) {
+        memset(&work->field[which][work->first_node], 0, nodes_of(work) * sizeof work->field[which][0]);
+    }
     memset(work->scratch.grid.histogram, 0, sizeof work->scratch.grid.histogram);
+    memset(work->scratch.grid.modes, 0, sizeof work->scratch.grid.modes);
+    work->range_lo[SELFCAL_ALPHA] = work->range[1].lo;
+    work->range_hi[SELFCAL_ALPHA] = work->range[1].hi;
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         const selfcal_prior_t *prior = &prior_of(work)[p];
         work->range_lo[p] = r_fmax(work->range_lo[p], (selfcal_real_t)prior->ln_min);
         work->range_hi[p] = r_fmin(work->range_hi[p], (selfcal_real_t)prior->ln_max);
+        if (!(work->range_lo[p] <= work->range_hi[p])) { /* the last pass found no row as high as the best before: the priors cut nearly all */
+            work->range_lo[p] = (selfcal_real_t)prior->ln_min;
+            work->range_hi[p] = (selfcal_real_t)prior->ln_max;
+        }
     }
 }
 
+static int bins_of(const selfcal_work_t *work, unsigned p) {
+    return p == SELFCAL_ALPHA ? work->rows : SELFCAL_HISTOGRAM;
+}
+
 static selfcal_real_t histogram_step(const selfcal_work_t *work, unsigned p) {
-    return (work->range_hi[p] - work->range_lo[p]) / (selfcal_real_t)SELFCAL_HISTOGRAM;
+    return (work->range_hi[p] - work->range_lo[p]) / (selfcal_real_t)bins_of(work, p);
 }
 
 /* How masses of one width go into a parameter's histogram. */
@@ -850,11 +1111,12 @@ typedef struct {
     selfcal_real_t half, per_width; /* bins */
 } spread_t;
 
-static spread_t spread_over(selfcal_work_t *work, unsigned p, selfcal_real_t width) {
+static spread_t spread_over(const selfcal_work_t *work, unsigned p, selfcal_real_t bins[], selfcal_real_t width) {
     const selfcal_real_t step = histogram_step(work, p);
     const selfcal_real_t per_step = step > R(0.0) ? R(1.0) / step : R(0.0);
     const selfcal_real_t half = R(0.5) * width * per_step;
-    const spread_t spread = {work->scratch.grid.histogram[p], work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    spread_t spread = {NULL, work->range_lo[p], per_step, half, half > R(0.0) ? R(0.5) / half : R(0.0)};
+    spread.bins = bins;
     return spread;
 }
 
@@ -897,37 +1159,68 @@ typedef struct {
     spread_t spread;
 } side_t;
 
-/* `fall`: change of ln sigma_v's mode from one side of the cell to the other; `profile`: ln height at that mode. */
-static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t profile, selfcal_real_t density, selfcal_real_t fall) {
+/* Where nothing cuts sigma_v: its moments are those of all such cells, and their histograms receive it at the end (add_modes() below). */
+static moments_t sum_whole(selfcal_work_t *work, const side_t side[2], unsigned sides, selfcal_real_t height) {
+    const selfcal_real_t e = work->sigma_first, e_sq = work->sigma_second;
+    moments_t sum = {height * work->sigma_mass, R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
+    sum.mass_sq = sum.mass * (R(1.0) + e + e + e_sq);
+    for (unsigned j = 0; j < sides; j++) {
+        const selfcal_real_t off = side[j].off, per = R(1.0) + off;
+        sum.first[j] = sum.mass * r_fma(per, e, off);
+        sum.second[j] = sum.mass * r_fma(off, r_fma(R(2.0) * per, e, off), per * per * e_sq);
+        deposit(&side[j].spread, side[j].ln_value, sum.mass);
+    }
+    return sum;
+}
+
+/* `fall`: change of ln sigma_v's mode from one side of the cell to the other, of width `wide` in ln rho; `profile`: ln height at that mode.
+ * `cost`: in cells that nothing cuts. */
+static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t profile, selfcal_real_t density,
+                          selfcal_real_t wide, selfcal_real_t fall, unsigned *cost) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
     /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the white
      * noise, sigma_v falls as rho rises and their product stands still. */
-    selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(work->width[0] + fall)};
+    selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(wide + fall)};
     const reach_t reach = reach_of(work, ln_value, half);
     moments_t sum = {R(0.0), R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
-    if (!counts(work, ln_value, &reach, profile, HIGHER)) {
+    if (!(reach.from < reach.to) || !(profile - reach.drop > work->best - R(3.0) * work->depth)) { /* nor NaN */
         return sum;
     }
     const selfcal_real_t height = r_exp(profile - work->best - reach.base) * density;
-    sigma_cells(work, reach.from, reach.to, reach.base);
-    const selfcal_real_t width = work->delta_width;
     side_t side[2];
+    bool whole = reach.from == work->delta_lo && reach.to == work->delta_hi;
     for (unsigned j = 0; j < sides; j++) {
         const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
         side_t *s = &side[j];
         s->prior = &prior_of(work)[p];
         s->ln_value = ln_value[p];
-        s->width = r_fmax(width, R(2.0) * half[j]);
         s->off = r_expm1(ln_value[p] - work->best_ln[p]);
-        s->spread = spread_over(work, p, s->width);
+        s->cut = s->ln_value + reach.from - half[j] < (selfcal_real_t)s->prior->ln_min ||
+                 s->ln_value + reach.to + half[j] > (selfcal_real_t)s->prior->ln_max;
+        whole = whole && !s->cut && !s->prior->uniform;
+    }
+    for (unsigned j = 0; j < sides && whole; j++) {
+        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        side[j].spread = spread_over(work, p, work->scratch.grid.modes[j], r_fmax(R(2.0) * half[j], histogram_step(work, p)));
+    }
+    if (whole) {
+        return sum_whole(work, side, sides, height);
+    }
+    *cost = COST_OF_CUT + (sigma_cells(work, reach.from, reach.to, reach.base) ? COST_OF_LAYING : 0U);
+    const selfcal_real_t width = work->delta_width;
+    for (unsigned j = 0; j < sides; j++) {
+        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        side_t *s = &side[j];
+        s->width = r_fmax(width, R(2.0) * half[j]);
+        s->spread = spread_over(work, p, work->scratch.grid.histogram[p], s->width);
         const selfcal_real_t side_half = R(0.5) * s->width;
         s->cut = s->ln_value + reach.from - side_half < (selfcal_real_t)s->prior->ln_min ||
                  s->ln_value + reach.to + side_half > (selfcal_real_t)s->prior->ln_max;
     }
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        const selfcal_real_t delta = reach.from + ((selfcal_real_t)k + R(0.5)) * width, e = work->delta_expm1[k];
-        selfcal_real_t w = height * work->delta_weight[k], ln[2], dev[2];
+        const selfcal_real_t delta = reach.from + ((selfcal_real_t)k + R(0.5)) * width, e = work->scratch.grid.delta_expm1[k];
+        selfcal_real_t w = height * work->scratch.grid.delta_weight[k], ln[2], dev[2];
         for (unsigned j = 0; j < sides; j++) {
             const side_t *s = &side[j];
             ln[j] = s->ln_value + delta;
@@ -958,90 +1251,126 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     return sum;
 }
 
+/* The next row of the sums, which counts where those of the search beside it do, and a little beyond. */
+static void begin_row(selfcal_work_t *work) {
+    const selfcal_range_t *range = &work->range[1];
+    if (hypothesis_of(work)->alpha == NULL) {
+        make_row(work, R(0.0));
+        return;
+    }
+    const selfcal_real_t at = ((selfcal_real_t)work->row + R(0.5)) / (selfcal_real_t)work->rows;
+    const selfcal_real_t z = r_fmax(at * (selfcal_real_t)SAMPLES - R(0.5), R(0.0));
+    const unsigned i = z < (selfcal_real_t)(SAMPLES - 2U) ? (unsigned)z : SAMPLES - 2U;
+    const selfcal_range_t *one = &work->scratch.grid.found[i], *other = &work->scratch.grid.found[i + 1U];
+    const selfcal_real_t part = r_fmin(z - (selfcal_real_t)i, R(1.0));
+    const uint8_t *least = &work->scratch.grid.least[i];
+    work->least[0] = least[0] > least[1] ? least[0] : least[1];
+    const selfcal_real_t lo = r_fma(part, other->lo - one->lo, one->lo), hi = r_fma(part, other->hi - one->hi, one->hi);
+    const selfcal_real_t more = BEYOND * (hi - lo);
+    work->range[0].lo = r_fmax(lo - more, work->limit_lo[0]);
+    work->range[0].hi = r_fmin(hi + more, work->limit_hi[0]);
+    make_row(work, r_fma(range->hi - range->lo, at, range->lo));
+}
+
 /* Some cells of a row. */
 static void step_sum(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = prior_of(work);
     const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
-    const bool has_drift = hypothesis->rho != NULL;
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    const uint16_t last = (uint16_t)(cells(work, hypothesis->rho) - 1U);
+    const unsigned taps = hypothesis->rho != NULL ? 6U : 1U;
+    if (work->at == 0U) {
+        begin_row(work);
+    }
+    const uint16_t count = cells_in(work, 0);
     selfcal_real_t weight[SELFCAL_GRID_MAX], weight_sq[SELFCAL_GRID_MAX]; /* of the rho basis functions */
     memset(weight, 0, sizeof weight);
     memset(weight_sq, 0, sizeof weight_sq);
-    if (work->at == 0U) {
-        make_row(work);
-    }
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
-    const selfcal_real_t alpha_density = prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL ? r_exp(row->ln_alpha) : R(1.0);
-    selfcal_real_t part_mass = R(0.0), part_mass_sq = R(0.0);
-    uint16_t i = part(work, STEP_SUMMED_CELLS, (uint16_t)(last + 1U));
+    const selfcal_range_t range = work->range[0];
+    const selfcal_real_t wide = (range.hi - range.lo) / (selfcal_real_t)count;
+    const selfcal_real_t high = (work->range[1].hi - work->range[1].lo) / (selfcal_real_t)work->rows;
+    selfcal_real_t density = wide * high * cell_weight(work->rows, work->row);
+    if (prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL) {
+        density *= r_exp(row->ln_alpha);
+    }
+    selfcal_real_t part_mass = R(0.0), part_mass_sq = R(0.0), part_off_grid = R(0.0), first[2] = {R(0.0), R(0.0)}, second[2] = {R(0.0), R(0.0)};
     cell_t before, cell, after;
-    make_cell(work, i, &after);
+    uint16_t i = work->at;
+    make_cell(work, r_fma(wide, (selfcal_real_t)i + R(0.5), range.lo), &after);
     cell = after;
     if (i > 0U) {
-        make_cell(work, (uint16_t)(i - 1U), &cell);
+        make_cell(work, r_fma(wide, (selfcal_real_t)i - R(0.5), range.lo), &cell);
     }
-    for (; i < work->at; i++) {
+    for (unsigned spent = 0; i < count && spent < STEP_CELLS; i++) {
+        const bool last = i + 1U == count;
         before = cell;
         cell = after;
-        if (i < last) {
-            make_cell(work, (uint16_t)(i + 1U), &after);
+        if (!last) {
+            make_cell(work, r_fma(wide, (selfcal_real_t)i + R(1.5), range.lo), &after);
         }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         cell_parameters(work, &cell, ln_value);
-        const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || i == last ? R(1.0) : R(2.0));
-        const selfcal_real_t width = work->delta_width;
-        const moments_t sum = sum_cell(work, ln_value, cell.profile, alpha_density, fall);
-        if (work->delta_width != width) { /* sigma_v's cells were laid anew, for more than a cell's sums */
-            work->at = (uint16_t)(i + 1U);
-        }
+        const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || last ? R(1.0) : R(2.0));
+        unsigned cost = 1;
+        const moments_t sum = sum_cell(work, ln_value, cell.profile, density, wide, fall, &cost);
+        spent += cost;
         part_mass += sum.mass;
         part_mass_sq += sum.mass_sq;
-        work->off_grid += cell.off_grid ? (selfcal_wide_t)sum.mass : 0.0;
+        part_off_grid += cell.off_grid ? sum.mass : R(0.0);
         for (unsigned j = 0; j < 2U; j++) { /* zero without a drift */
-            work->first[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.first[j];
-            work->second[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)sum.second[j];
+            first[j] += sum.first[j];
+            second[j] += sum.second[j];
         }
-        for (unsigned k = 0; k < (has_drift ? 6U : 1U); k++) {
-            const selfcal_real_t basis = has_drift ? work->scratch.grid.basis[i][k] : R(1.0);
-            const unsigned at = has_drift ? work->basis_first[i] + k : 0U;
-            weight[at] += sum.mass * basis;
-            weight_sq[at] += sum.mass_sq * basis;
+        for (unsigned k = 0; k < taps; k++) {
+            weight[cell.basis_first + k] += sum.mass * cell.basis[k];
+            weight_sq[cell.basis_first + k] += sum.mass_sq * cell.basis[k];
         }
     }
+    work->at = i;
     if (!(part_mass > R(0.0))) {
         return;
     }
     work->mass += (selfcal_wide_t)part_mass;
     work->mass_sq += (selfcal_wide_t)part_mass_sq;
+    work->off_grid += (selfcal_wide_t)part_off_grid;
+    for (unsigned j = 0; j < 2U; j++) {
+        work->first[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)first[j];
+        work->second[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)second[j];
+    }
     if (hypothesis->alpha != NULL) {
         const selfcal_wide_t dev = expm1((selfcal_wide_t)row->ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);
-        const spread_t spread = spread_over(work, SELFCAL_ALPHA, work->width[1]);
         const selfcal_wide_t weighed = (selfcal_wide_t)part_mass * dev;
         work->first[SELFCAL_ALPHA] += weighed;
         work->second[SELFCAL_ALPHA] += weighed * dev;
-        deposit(&spread, row->ln_alpha, part_mass);
+        work->scratch.grid.histogram[SELFCAL_ALPHA][work->row] += part_mass / cell_weight(work->rows, work->row);
     }
+    selfcal_real_t *mean = &work->field[0][work->first_node], *mean_sq = &work->field[1][work->first_node];
     for (uint16_t j = 0; j < rows; j++) {
         for (unsigned k = 0; k < (hypothesis->alpha != NULL ? 6U : 1U); k++) {
             const size_t at = (size_t)j * columns + row->basis_first + k;
-            work->scratch.grid.field[0][at] = r_fma(weight[j], row->basis[k], work->scratch.grid.field[0][at]);
-            work->scratch.grid.field[1][at] = r_fma(weight_sq[j], row->basis[k], work->scratch.grid.field[1][at]);
+            mean[at] = r_fma(weight[j], row->basis[k], mean[at]);
+            mean_sq[at] = r_fma(weight_sq[j], row->basis[k], mean_sq[at]);
         }
     }
 }
 
 /* ------------------------------------------------------------------------------------------------------------- results */
 
+/* Within a bin the density is taken as linear, its slope from the bins beside it. */
 static selfcal_real_t quantile(const selfcal_work_t *work, unsigned p, selfcal_real_t total, selfcal_real_t share) {
-    const selfcal_real_t step = histogram_step(work, p);
+    const selfcal_real_t step = histogram_step(work, p), *bins = work->scratch.grid.histogram[p];
+    const int last = bins_of(work, p) - 1;
     selfcal_real_t below = R(0.0);
     const selfcal_real_t wanted = share * total;
-    for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
-        const selfcal_real_t mass = work->scratch.grid.histogram[p][bin];
-        if (below + mass >= wanted && mass > R(0.0)) {
-            return work->range_lo[p] + ((selfcal_real_t)bin + (wanted - below) / mass) * step;
+    for (int bin = 0; bin <= last; bin++) {
+        const selfcal_real_t mass = bins[bin], more = wanted - below;
+        if (mass >= more && mass > R(0.0)) {
+            const selfcal_real_t before = bins[bin > 0 ? bin - 1 : 0], after = bins[bin < last ? bin + 1 : last];
+            const selfcal_real_t slope = r_fmin(r_fmax(R(0.5) * (after - before), R(-2.0) * mass), R(2.0) * mass);
+            const selfcal_real_t first = mass - R(0.5) * slope; /* density where the bin begins */
+            const selfcal_real_t root = first + r_sqrt(r_fmax(r_fma(first, first, R(2.0) * slope * more), R(0.0)));
+            return work->range_lo[p] + ((selfcal_real_t)bin + (root > R(0.0) ? r_fmin(R(2.0) * more / root, R(1.0)) : R(1.0))) * step;
         }
         below += mass;
     }
@@ -1052,7 +1381,7 @@ static selfcal_real_t quantile(const selfcal_work_t *work, unsigned p, selfcal_r
 static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfcal_real_t lo, selfcal_real_t hi) {
     const selfcal_real_t step = histogram_step(work, p);
     selfcal_real_t mass = R(0.0);
-    for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
+    for (int bin = 0; bin < bins_of(work, p); bin++) {
         const selfcal_real_t from = work->range_lo[p] + (selfcal_real_t)bin * step;
         const selfcal_real_t part = r_fmin(hi, from + step) - r_fmax(lo, from);
         if (part > R(0.0)) { /* step is not 0 then */
@@ -1062,16 +1391,50 @@ static selfcal_real_t mass_between(const selfcal_work_t *work, unsigned p, selfc
     return mass;
 }
 
+/* The masses of cells that nothing cuts, so far at sigma_v's modes, go where sigma_v spreads them. */
+static void add_modes(selfcal_work_t *work, unsigned p) {
+    const selfcal_real_t *modes = work->scratch.grid.modes[p == SELFCAL_N ? 0 : 1];
+    selfcal_real_t *bins = work->scratch.grid.histogram[p], kernel[SELFCAL_HISTOGRAM + 2] = {R(0.0)};
+    const selfcal_real_t step = histogram_step(work, p), width = (work->delta_hi - work->delta_lo) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
+    const int zero = (int)(-work->delta_lo / step) + 1; /* the bin of a delta of 0 */
+    spread_t spread = spread_over(work, p, kernel, width);
+    spread.lo = -((selfcal_real_t)zero + R(0.5)) * step;
+    (void)sigma_cells(work, work->delta_lo, work->delta_hi, R(0.0));
+    for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
+        deposit(&spread, work->delta_lo + ((selfcal_real_t)k + R(0.5)) * width, work->scratch.grid.delta_weight[k] / work->sigma_mass);
+    }
+    for (int k = 1; k < SELFCAL_HISTOGRAM; k++) {
+        kernel[k] += kernel[k - 1];
+    }
+    const int wide = (int)((work->delta_hi - work->delta_lo) / step) + 3, most = wide < SELFCAL_HISTOGRAM ? wide : SELFCAL_HISTOGRAM;
+    selfcal_real_t mass = R(0.0);
+    for (int i = 0; i < SELFCAL_HISTOGRAM; i++) {
+        mass += modes[i];
+        if (mass > R(0.0)) {
+            const int first = i < zero ? zero - i : 0, room = SELFCAL_HISTOGRAM + zero - i, last = most < room ? most : room;
+            for (int k = first; k < last; k++) { /* no whole cell reaches beyond the limits */
+                bins[i + k - zero] = r_fma(mass, kernel[k], bins[i + k - zero]);
+            }
+        }
+    }
+}
+
 static void finish_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_real_t centre = r_exp(work->best_ln[p]), mean = (selfcal_real_t)(work->first[p] / work->mass);
     const selfcal_real_t variance = r_fmax(r_fma(-mean, mean, (selfcal_real_t)(work->second[p] / work->mass)), R(0.0));
     const selfcal_real_t step = histogram_step(work, p);
     selfcal_real_t mass = R(0.0), total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
-    for (int bin = 0; bin < SELFCAL_HISTOGRAM; bin++) {
-        const selfcal_real_t at = ((selfcal_real_t)bin + R(0.5)) * step;
+    for (int bin = 0; bin < SELFCAL_HISTOGRAM && p != SELFCAL_ALPHA; bin++) {
         mass += work->scratch.grid.histogram[p][bin]; /* where there is none, rounding leaves some of either sign */
         work->scratch.grid.histogram[p][bin] = mass;
+    }
+    if (p != SELFCAL_ALPHA && step > R(0.0)) {
+        add_modes(work, p);
+    }
+    for (int bin = 0; bin < bins_of(work, p); bin++) {
+        const selfcal_real_t at = ((selfcal_real_t)bin + R(0.5)) * step;
+        mass = work->scratch.grid.histogram[p][bin];
         total += mass;
         ln_first = r_fma(mass, at, ln_first);
         ln_second = r_fma(mass * at, at, ln_second);
@@ -1124,20 +1487,25 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
  * That goes with sigma_v^2, and so does how far the bias prior pulls, by a node's conditional mode: where the drift may hide the white
  * noise one sigma_v for all nodes would be off by decades, and rho^2 alone change too much from node to node. */
 static void step_bias(selfcal_work_t *work) {
-    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, mean_sq = work->mass_sq / work->mass;
     const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
     const uint16_t k = work->at++;
+    if (k == 0U) {
+        work->mean_sq = work->mass_sq / work->mass;
+    }
     selfcal_now_t now;
     selfcal_field_t field;
     node_field(work, k, &field);
     const selfcal_node_view_t *v = &field.node;
-    const selfcal_wide_t mode_sq = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)field.ln_sigma), sigma_sq = mode_sq * mean_sq;
+    if (work->mask == 0U) {
+        selfcal_bank_now(work->bank, (uint16_t)(work->first_node + k), &field.node);
+    }
+    const selfcal_wide_t mode_sq = field.var * (selfcal_wide_t)field.ratio, sigma_sq = mode_sq * work->mean_sq;
     const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * mode_sq;
     if (work->mask != 0U) {
         work->bank->model->regressors->code->now(work, k, sigma_sq, &now);
     } else {
-        const selfcal_wide_t prior_precision = sigma_sq / (sd * sd);
-        const selfcal_wide_t variance = 1.0 / (v->a + prior_precision), lost = 1.0 - v->bias_left;
+        const selfcal_wide_t prior_precision = sigma_sq * work->per_bias_sd * work->per_bias_sd;
+        const selfcal_wide_t variance = (selfcal_wide_t)(R(1.0) / (selfcal_real_t)(v->a + prior_precision)), lost = 1.0 - v->bias_left;
         const selfcal_wide_t x0 = (v->b - offset * prior_precision) * variance;
         now.mean = v->drift + x0 * v->bias_left;
         now.drift[0] = now.mean - x0;
@@ -1233,8 +1601,8 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
     if (!(work->mass > 0.0)) {
         return; /* the priors leave nothing of the likelihood */
     }
-    posterior->ln_evidence = work->peak + (selfcal_wide_t)work->best +
-                             log(work->mass * (selfcal_wide_t)work->width[0] * (selfcal_wide_t)work->width[1]);
+    posterior->ln_evidence = work->top_profile + (selfcal_wide_t)work->peak + (selfcal_wide_t)work->best +
+                             log(work->mass);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         if (has_parameter(hypothesis_of(work)->law, p)) {
             posterior->ln_evidence += (selfcal_wide_t)ln_prior_density(&prior_of(work)[p]);
@@ -1350,44 +1718,9 @@ static bool step_gather(selfcal_work_t *work) {
     return true;
 }
 
-/* The box of the next pass, or of the sums. */
-static void step_box(selfcal_work_t *work) {
-    if (work->pass == 0U) {
-        first_box(work);
-        work->best = -INFINITY;
-    } else if (work->moved) {
-        set_box(work, work->found_lo, work->found_hi);
-    }
-    if (work->cells == SELFCAL_REPORT_CELLS) {
-        begin_sum(work);
-        work->stage = SUM;
-    } else {
-        begin_pass(work);
-        work->stage = SCAN;
-    }
-}
-
 static void go_to(selfcal_work_t *work, int stage) {
     work->stage = (uint8_t)stage;
     work->at = 0;
-}
-
-/* After a row of a pass: the next one, the next pass, or what follows the search. */
-static void next_scan(selfcal_work_t *work) {
-    work->at = 0;
-    work->row++;
-    if (work->row < cells(work, hypothesis_of(work)->alpha)) {
-        return;
-    }
-    const bool over = end_scan(work), found = work->best > (selfcal_real_t)-INFINITY;
-    work->pass++;
-    if (over && !found) {
-        work->mass = 0.0;
-        go_to(work, EVIDENCE); /* nothing within the priors' limits */
-    } else {
-        work->cells = over ? SELFCAL_REPORT_CELLS : SEARCH_CELLS;
-        work->stage = BOX;
-    }
 }
 
 selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *report) {
@@ -1404,7 +1737,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         return SELFCAL_OK;
     }
     selfcal_posterior_t *posterior = &report->hypothesis[work->hypothesis];
-    const uint16_t nodes = nodes_of(work), row = cells(work, hypothesis_of(work)->rho);
+    const uint16_t nodes = nodes_of(work);
     switch (work->stage) {
     case GATHER:
         if (step_gather(work)) {
@@ -1417,30 +1750,21 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         }
         break;
     case TRUTH:
-        step_peak(work, work->bank->model->nodes);
+        step_truth(work);
         if (work->at == work->bank->model->nodes) {
-            go_to(work, work->peak > (selfcal_wide_t)-INFINITY ? FIT : PEAK);
-            work->hypothesis = 0;
+            go_to(work, work->best_node < work->bank->model->nodes ? FIT : SIGMA);
         }
         break;
     case FIT:
         step_fit(work);
         if (work->at > work->bank->model->nodes || !work->truth.pair) {
             solve(work); /* all 0 without a pair: the nodes of a random walk alone tell too little */
-            go_to(work, PEAK);
+            go_to(work, SIGMA);
             work->hypothesis = 0;
         }
         break;
-    case PEAK:
-        step_peak(work, nodes);
-        if (work->at == nodes) {
-            work->stage = SIGMA;
-        }
-        break;
     case SIGMA:
-        work->delta_lo = sigma_end(work->n_eff, R(-1.0));
-        work->delta_hi = sigma_end(work->n_eff, R(1.0));
-        work->delta_from = work->delta_hi; /* no cells yet */
+        step_sigma(work, nodes);
         go_to(work, VALUES);
         break;
     case VALUES:
@@ -1452,28 +1776,28 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     case SPLINE_PROFILE:
     case SPLINE_SIGMA:
         if (step_transform(work, false, work->stage - SPLINE_PROFILE)) {
-            work->pass = 0;
-            work->cells = SEARCH_CELLS;
+            if (work->stage == SPLINE_SIGMA) {
+                begin_search(work);
+            }
             go_to(work, work->stage + 1);
         }
         break;
-    case BOX:
-        step_box(work);
-        break;
-    case SCAN:
-        step_scan(work);
-        if (work->at == row) {
-            next_scan(work);
+    case SEARCH:
+        if (step_search(work)) {
+            if (work->best > (selfcal_real_t)-INFINITY) {
+                begin_sum(work);
+                go_to(work, SUM);
+            } else {
+                work->mass = 0.0;
+                go_to(work, EVIDENCE);
+            }
         }
         break;
     case SUM:
         step_sum(work);
-        if (work->at == row) {
-            work->at = 0;
+        if (work->at == cells_in(work, 0)) {
             work->row++;
-            if (work->row == cells(work, hypothesis_of(work)->alpha)) {
-                go_to(work, work->mass > 0.0 ? WEIGHTS : EVIDENCE);
-            }
+            go_to(work, work->row < work->rows ? SUM : work->mass > 0.0 ? WEIGHTS : EVIDENCE);
         }
         break;
     case WEIGHTS:
@@ -1500,7 +1824,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
         finish_hypothesis(work, posterior);
         work->first_node = (uint16_t)(work->first_node + nodes);
         work->hypothesis++;
-        go_to(work, work->hypothesis < work->bank->model->hypotheses ? PEAK : WHOLE);
+        go_to(work, work->hypothesis < work->bank->model->hypotheses ? SIGMA : WHOLE);
         break;
     default: SELFCAL_ASSERT(false); break;
     }

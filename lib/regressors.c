@@ -515,11 +515,10 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t lea
         make_fit(&normal, variance, &fit);
         variance = (residual + beginning * fit.noise * variance) / (n - beginning * fit.share);
     } while (fabs(variance - before) > (selfcal_wide_t)SELFCAL_MODE_LEFT * variance && --turns > 0U);
-    result->ln_sigma = 0.5 * log(variance);
-    result->ratio = (selfcal_real_t)(variance * n / residual);
     result->node = normal.node;
-    result->profile = -0.5 * (n * (SELFCAL_LN_2PI + 2.0 * result->ln_sigma) + normal.node.ln_s + residual / variance +
-                              beginning * (fit.ln_det + fit.miss));
+    result->var = residual / n;
+    result->ratio = (selfcal_real_t)(variance / result->var);
+    result->extra = (selfcal_real_t)(beginning * (fit.ln_det + fit.miss));
     result->share = (selfcal_real_t)(beginning * fit.bent);
 }
 

@@ -93,16 +93,17 @@ extern "C" {
 #error "SELFCAL_PUSH_EVERY must be a power of two up to 256"
 #endif
 
-/* Cells a dimension that a report integrates over. Half of these and of the following: a quarter of the time; where two parameters hang
- * together closely, one record in thirty is then off by up to 0.07 nat, 0.05 sd and 6 % of an sd. */
+/* Cells a dimension that a report integrates over, about where the likelihood counts. More of them where its peak is narrow in a wide range,
+ * and under a law that is a sum. With 24, nine records in ten have evidence, mean and sd to 0.01 nat, 0.02 sd and 2 %, and quantiles to
+ * 0.05 sd. Twice as many: up to four times the sums' part of the time. */
 #ifndef SELFCAL_REPORT_CELLS
-#define SELFCAL_REPORT_CELLS 96
+#define SELFCAL_REPORT_CELLS 80
 #endif
 #if SELFCAL_REPORT_CELLS < 16 || SELFCAL_REPORT_CELLS > 255
 #error "SELFCAL_REPORT_CELLS must be 16 to 255"
 #endif
 
-/* Cells of sigma_v in each of those, and bins of a parameter's histogram, which its quantiles are read from. */
+/* Cells of sigma_v in those that a limit cuts, and bins of a parameter's histogram, which its quantiles are read from. */
 #ifndef SELFCAL_SIGMA_CELLS
 #define SELFCAL_SIGMA_CELLS 48
 #endif
@@ -113,9 +114,9 @@ extern "C" {
 #error "SELFCAL_SIGMA_CELLS must be 8 and SELFCAL_HISTOGRAM 32 at least"
 #endif
 
-/* Frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even in
- * their logarithm, from 1/n to the highest. Up to 0.5 nepers apart they do for the reports' tolerances; fewer: less time.
- * 8 LINES^2 bytes of a report's scratch, which has 16 SELFCAL_HYPOTHESIS_NODES_MAX + 16 SELFCAL_HISTOGRAM + 24 SELFCAL_REPORT_CELLS anyway. */
+/* Most frequencies by which a report describes what the data's spectrum has beyond the likeliest filter's, to interpolate between nodes: even
+ * in their logarithm, from 1/n to the highest, 0.45 nepers apart. Up to 0.55 they do for the reports' tolerances: 36 to 3 10^7 samples, 20 to
+ * 5000. They take 6 LINES^2 bytes of a report's scratch. */
 #ifndef SELFCAL_LINES
 #define SELFCAL_LINES 36
 #endif
@@ -145,6 +146,14 @@ extern "C" {
 #endif
 #if SELFCAL_HYPOTHESIS_NODES_MAX < SELFCAL_GRID_MAX || SELFCAL_HYPOTHESIS_NODES_MAX > 65535
 #error "SELFCAL_HYPOTHESIS_NODES_MAX must be SELFCAL_GRID_MAX to 65535"
+#endif
+
+/* Nodes of all hypotheses together at most: 12 bytes each in a report's scratch. */
+#ifndef SELFCAL_NODES_MAX
+#define SELFCAL_NODES_MAX (SELFCAL_HYPOTHESES_MAX * SELFCAL_HYPOTHESIS_NODES_MAX)
+#endif
+#if SELFCAL_NODES_MAX < SELFCAL_HYPOTHESIS_NODES_MAX || SELFCAL_NODES_MAX > 65535
+#error "SELFCAL_NODES_MAX must be SELFCAL_HYPOTHESIS_NODES_MAX to 65535"
 #endif
 
 /* Bank intervals in a row that an axis may spoil before it is retired, see selfcal_push(); 0: no axis is ever retired. */
@@ -753,14 +762,15 @@ typedef struct {
     selfcal_wide_t first[SELFCAL_REGRESSORS_MAX], second[SELFCAL_REGRESSORS_MAX], own[SELFCAL_REGRESSORS_MAX]; /* private */
 } selfcal_coefficients_t;
 
-#define SELFCAL_FITTED (SELFCAL_LINES + SELFCAL_LINES)
+#define SELFCAL_FITTED (SELFCAL_LINES + (SELFCAL_LINES + 2) / 3 * 2)
 /* What a report supposes to have made the data, when it takes the expected likelihood off the one it interpolates. Private. */
 typedef struct {
     selfcal_real_t ln_noise;       /* ln of the samples' noise, their geometric mean, over that of whole blocks at the model's rate */
     selfcal_real_t missed;         /* nats of a node's ln-likelihood, the most of all, that come of what is uneven in noise or time */
     selfcal_real_t variance, rate; /* of a first-order drift over that noise's variance; 1 - its pole */
-    selfcal_real_t ln_v;           /* expected variance of its own filter's innovations */
+    selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
+    uint8_t lines;
     bool fitted, pair;             /* what the nodes show besides is known; there are nodes in two dimensions */
     /* That, of either sign: lines at frequencies omega, and behind them two of each two lines' band, edges and
      * level (see posterior.c). */
@@ -771,21 +781,34 @@ typedef struct {
 /* Least squares for them by rotations: a triangle, row by row, its right side behind each. Private. */
 #define SELFCAL_TRIANGLE (SELFCAL_FITTED * (SELFCAL_FITTED + 3) / 2)
 typedef struct {
-    selfcal_real_t triangle[SELFCAL_TRIANGLE];
+    selfcal_real_t triangle[SELFCAL_TRIANGLE], least;
+    selfcal_real_t scatter[SELFCAL_NODES_MAX]; /* of every node, ln of the readings' scatter from the best node's */
 } selfcal_fit_t;
+
+/* Of the best node: variance of its residuals, the inverse, D; what the priors of the bias and the coefficients add. Private. */
+typedef struct {
+    selfcal_wide_t var, per_var, ln_s;
+    selfcal_real_t cost, extra;
+} selfcal_top_t;
 
 /* One row of a report's cells: coefficients of the two splines in rho, alpha taken out. Private. */
 typedef struct {
     selfcal_real_t profile[SELFCAL_GRID_MAX], ln_sigma[SELFCAL_GRID_MAX];
     selfcal_real_t basis[6]; /* of alpha */
     uint8_t basis_first;
-    selfcal_real_t ln_alpha, shift, half_ln_dt;
+    selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
 } selfcal_cell_row_t;
+
+/* Where in ln rho or ln alpha the likelihood counts, and samples of one search pass. Private. */
+#define SELFCAL_SEARCH_SAMPLES 8
+typedef struct {
+    selfcal_real_t lo, hi;
+} selfcal_range_t;
 
 /* Scratch of a report under way. Private but for reading `gathered`; may be shared by all axes and reused. */
 typedef struct {
     selfcal_t *bank;
-    uint8_t axis, hypothesis, stage, pass;
+    uint8_t axis, hypothesis, stage, pass, rows;
     uint16_t first_node;
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     uint32_t batches; /* of the bank, when the sums came to rest */
@@ -793,23 +816,27 @@ typedef struct {
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     uint16_t best_node;      /* of all: the likeliest */
+    selfcal_top_t top; /* ... whatever its law, and its ln var and ln-likelihood */
+    selfcal_wide_t per_n, per_bias_sd, ln_top, top_profile;
+    /* Of every node, of the profile ln-likelihood and of ln of sigma_v's conditional mode, from those of the best; then of the hypothesis in
+     * hand less their expectation; then posterior means of the basis functions. */
+    selfcal_real_t field[2][SELFCAL_NODES_MAX];
     selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
     selfcal_truth_t truth;
     /* of the hypothesis in hand */
-    selfcal_wide_t peak;     /* of the nodes' profile ln-likelihood; taken off before going to selfcal_real_t */
+    selfcal_real_t peak;     /* of the nodes' profile ln-likelihood */
     selfcal_real_t n_eff;    /* bank samples less those that bias and coefficients took */
-    bool moved;              /* the box is to change after a pass */
-    uint8_t cells;           /* a dimension: fewer in the search than in the sums */
-    /* the box of cells in (ln rho, ln alpha), and what the last pass over it found */
-    selfcal_real_t lo[2], width[2];
+    /* what the priors permit of (ln rho, ln alpha); of these the row in hand, and the rows; what the last pass found */
     selfcal_real_t limit_lo[2], limit_hi[2];
-    selfcal_real_t found_lo[2], found_hi[2];
+    selfcal_range_t range[2];
+    uint8_t least[2]; /* cells that its peak needs */
+    selfcal_real_t row_best; /* ln-likelihood of the row in hand */
+    selfcal_real_t depth; /* below the best at which no more counts */
     selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
     selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
-    uint8_t basis_first[SELFCAL_REPORT_CELLS]; /* first node of each row of scratch.grid.basis */
-    /* sigma_v's offset in ln from its conditional mode: where it ends if no limit does; the first of the cells in hand, their width, and of
-     * each the offset's exponential, less 1, and the weight */
-    selfcal_real_t delta_lo, delta_hi, delta_from, delta_width, delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS];
+    selfcal_real_t sigma_mass, sigma_first, sigma_second; /* moments of sigma_v about its mode where no limit cuts it */
+    /* sigma_v's offset in ln from its conditional mode: where it ends if no limit does; the first of the cells in hand, their width */
+    selfcal_real_t delta_lo, delta_hi, delta_from, delta_width;
     selfcal_real_t drop[SELFCAL_HYPOTHESES_MAX]; /* of the ln-likelihood from that mode to the priors' limits, in each law's best cell */
     /* posterior sums */
     selfcal_wide_t mass, off_grid;
@@ -817,16 +844,20 @@ typedef struct {
     union {
         selfcal_fit_t fit; /* before the first hypothesis */
         struct {
-            /* Of the profile ln-likelihood and of ln of sigma_v's conditional mode, both less their expectation. */
-            selfcal_real_t field[2][SELFCAL_HYPOTHESIS_NODES_MAX];  /* at the nodes; later posterior means of the basis functions */
             selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX]; /* B-spline coefficients; later weights of the nodes ... */
             /* ... as they are, and with sigma_v^2 over that of its conditional mode */
-            selfcal_real_t basis[SELFCAL_REPORT_CELLS][6]; /* of the rho cells */
             selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM + 2]; /* a mass that ends at the last bin's end reaches beyond it */
+            /* of each sigma_v cell: the offset's exponential, less 1; the weight */
+            selfcal_real_t delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS];
+            selfcal_range_t found[SELFCAL_SEARCH_SAMPLES]; /* the rows of the search, and how high they are, ln */
+            selfcal_real_t height[SELFCAL_SEARCH_SAMPLES];
+            uint8_t least[SELFCAL_SEARCH_SAMPLES];
+            selfcal_real_t modes[2][SELFCAL_HISTOGRAM + 2]; /* of N and the drift parameter, sigma_v at its mode, where no limit cuts it */
             selfcal_cell_row_t row;
         } grid;
     } scratch;
     selfcal_wide_t bias_about, bias_weight, bias_first, bias_second; /* x0 + drift now, about the first node's */
+    selfcal_wide_t mean_sq; /* of sigma_v^2 over that of the mode */
     selfcal_wide_t bias_own, mass_sq;                                /* its variance at the nodes; mass with sigma_v^2 over that of the mode */
     /* sums of selfcal_decay_t over the nodes of each alpha */
     selfcal_wide_t bias_decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
@@ -843,7 +874,7 @@ selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uin
 selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *self, uint8_t axis, uint8_t mask,
                                              selfcal_coefficients_t coefficients[], selfcal_report_t *report);
 
-/* One slice of it, below 61 000 instructions on a Cortex-M4F (72 000 under uniform priors) without regressors in use, else one
+/* One slice of it, below 61 000 instructions on a Cortex-M4F without regressors in use, else one
  * node's least squares. SELFCAL_BUSY while there is more to do, SELFCAL_OK when `report` is whole. It first runs the nodes over
  * what was gathered, then the sums must rest: after SELFCAL_BATCH further bank samples, or fewer and a call that looks at the sums,
  * it is SELFCAL_OVERTAKEN; begin anew. After SELFCAL_OK or that, SELFCAL_BAD_ARGUMENT: no report is under way. */

@@ -1,12 +1,11 @@
 # How the library and the application are compiled for the cores; included by whatever builds for one.
-# SELFCAL_GRID_MAX, SELFCAL_ALPHA_MAX, SELFCAL_HYPOTHESIS_NODES_MAX: the largest of the core's nodes in the default model. Half of the
-# host's cells a dimension: a quarter of the time.
-CONFIG_cells := -DSELFCAL_REPORT_CELLS=48 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_LINES=32
-CONFIG_cortex-m4f := $(CONFIG_cells) -DSELFCAL_GRID_MAX=16 -DSELFCAL_ALPHA_MAX=12 -DSELFCAL_HYPOTHESIS_NODES_MAX=192
-# Integers; a node's batch takes 4 sample periods at 819.2 Hz and 48 MHz. Lines and cells so few that an axis's report ends within the 16 s
-# for which its bank has room.
-CONFIG_cortex-m0 := -DSELFCAL_REPORT_CELLS=40 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_HISTOGRAM=64 -DSELFCAL_LINES=20 -DSELFCAL_GRID_MAX=16 \
-                    -DSELFCAL_ALPHA_MAX=7 -DSELFCAL_HYPOTHESIS_NODES_MAX=98 -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_FIXED=16 -DSELFCAL_PUSH_EVERY=16
+# SELFCAL_GRID_MAX, SELFCAL_ALPHA_MAX, SELFCAL_HYPOTHESIS_NODES_MAX, SELFCAL_NODES_MAX: the largest of the core's nodes in the default model.
+CONFIG_cells := -DSELFCAL_REPORT_CELLS=24 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_HISTOGRAM=64 -DSELFCAL_LINES=32
+CONFIG_cortex-m4f := $(CONFIG_cells) -DSELFCAL_GRID_MAX=16 -DSELFCAL_ALPHA_MAX=12 -DSELFCAL_HYPOTHESIS_NODES_MAX=192 -DSELFCAL_NODES_MAX=209
+# Integers; a node's batch takes 4 sample periods at 819.2 Hz and 48 MHz. As many lines as the RAM has room for: they do for 5000 bank samples.
+CONFIG_cortex-m0 := -DSELFCAL_REPORT_CELLS=24 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_HISTOGRAM=64 -DSELFCAL_LINES=20 \
+	-DSELFCAL_GRID_MAX=16 -DSELFCAL_ALPHA_MAX=7 -DSELFCAL_HYPOTHESIS_NODES_MAX=98 -DSELFCAL_NODES_MAX=115 \
+                    -DSELFCAL_HYPOTHESES_MAX=3 -DSELFCAL_FIXED=16 -DSELFCAL_PUSH_EVERY=16
 ARM_cortex-m4f-portable := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard $(CONFIG_cortex-m4f)
 ARM_cortex-m4f := $(ARM_cortex-m4f-portable) -DSELFCAL_KERNEL_M4F
 ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb -fconserve-stack $(CONFIG_cortex-m0)

@@ -290,15 +290,13 @@ def table(bench: Bench) -> str:
     per("report of one axis", "report")
     for stage, title in (
         ("gather", "nodes over the last samples"),
-        ("truth", "best node of all"),
+        ("truth", "every node, and the best"),
         ("fit", "lines and edges, a row a node"),
-        ("peak", "best node"),
         ("sigma", "cells of σv"),
-        ("values", "node values"),
+        ("values", "node values less what is expected"),
         ("spline_profile", "spline fit of the profile"),
         ("spline_sigma", "spline fit of σv's mode"),
-        ("box", "first box"),
-        ("scan", "search for the box"),
+        ("search", "search for where the likelihood counts"),
         ("sum", "integral"),
         ("weights", "node weights"),
         ("bias", "bias"),

@@ -77,6 +77,23 @@ static void a_record_outside_the_priors_has_no_bias(void) {
     TEST_ASSERT_TRUE(isnan(sd));
 }
 
+/* Short records up to 200 times louder than the priors allow: the last pass of a search may find no row as high as one before it. */
+static void a_loud_record_has_a_finite_bias_or_none(void) {
+    static const unsigned samples[] = {5, 30, 60};
+    static const float loud[] = {5.0F, 10.0F, 15.0F, 50.0F, 100.0F};
+    for (size_t i = 0; i < sizeof samples / sizeof *samples * 5U; i++) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&bank, &model, memory, sizeof memory));
+        for (unsigned k = 0; k < samples[i / 5U]; k++) {
+            push(0.0F, loud[i % 5U]);
+        }
+        for (uint8_t axis = 0; axis < AXES; axis++) {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, axis, &report));
+            TEST_ASSERT_FALSE(isinf(report.bias_mean));
+            TEST_ASSERT_EQUAL(isnan(report.bias_mean), isnan(report.bias_sd));
+        }
+    }
+}
+
 static void models_that_contradict_themselves_are_refused(void) {
     selfcal_t other;
     selfcal_model_t bad = model;
@@ -356,6 +373,7 @@ int main(void) {
     UNITY_BEGIN();
     RUN_TEST(bad_arguments_change_nothing);
     RUN_TEST(a_record_outside_the_priors_has_no_bias);
+    RUN_TEST(a_loud_record_has_a_finite_bias_or_none);
     RUN_TEST(models_that_contradict_themselves_are_refused);
     RUN_TEST(the_widest_priors_keep_every_sum_finite);
     RUN_TEST(the_constant_law_sums_the_data);

@@ -1,4 +1,4 @@
-"""The report on the default grid (16 nodes of rho, 12 of alpha, 96 cells) against a dense one, over the whole prior.
+"""The report on the default grid (16 nodes of rho, 12 of alpha, 48 cells) against a dense one, over the whole prior.
 
 The judge is the same code in double on 48 and 40 x 40 nodes with 192 cells, where neither counts any more: 64 and
 56 x 56 nodes give the same to 1e-4. That its sums are right is test_bank.py's business, that its posterior is,
@@ -19,6 +19,7 @@ from scipy.interpolate import BSpline
 
 from selfcal import _library32
 from selfcal.engines.library import Bank
+from selfcal.engines.reference import identify_axis
 from selfcal.errors import UserError
 from selfcal.model import PLACES
 from selfcal.recording import load
@@ -78,6 +79,33 @@ def test_report_over_the_whole_prior(n: int) -> None:
         f"worst {we:.3f}, {wm:.3f} sd, {100 * ws:.1f} %"
     )
     assert (found <= REPORT_LIMIT).all()
+
+
+@pytest.mark.parametrize(("law", "n", "seed"), [("gauss_markov", 300, 35), ("random_walk", 300, 12)])
+def test_report_by_the_cells_of_a_module(law: str, n: int, seed: int) -> None:
+    """Against dense nodes and cells, within the design's bound. In the first record alpha's upper limit cuts the
+    posterior: with 16 rows, of which one held it, a mean was 0.32 sd and an sd 31 % off."""
+    y = a_record(law, n, seed)[0]
+    bank = Bank(tables_of(MODEL), coarse=True)
+    push(bank, y)
+    evidence, _, mean, sd = worst_difference(bank.report(0), exact_report(y, tables_of(MODEL)))
+    print(f"\n{law} n={n}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
+    assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
+
+
+@pytest.mark.parametrize(("n", "seed"), [(1000, 19), (3600, 14)])
+def test_rows_are_summed_where_the_search_found_them(n: int, seed: int) -> None:
+    """Against the textbook bank over the whole prior; the library's dense nodes shared the fault. The range of alpha
+    swung between two widths until the passes of the search ran out, and its rows were summed at other alphas: the
+    evidence of Gauss-Markov was 0.6 and 8.7 nat off."""
+    y = a_record("gauss_markov", n, seed)[0]
+    bank = Bank(tables_of(MODEL))
+    push(bank, y)
+    evidence, _, mean, sd = worst_difference(
+        bank.report(0), identify_axis(y, 1.0, MODEL.group_of("gx"), MODEL.hypotheses)
+    )
+    print(f"\nn={n}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
+    assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
 
 
 def walk_by_integration(y: Floats, axis: AxisTable) -> tuple[float, dict[str, tuple[float, float]]]:
@@ -399,27 +427,40 @@ def test_report_of_noise_that_varies(what: str) -> None:
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
-    """As measured in lib/posterior.c: 14 x 7 nodes hold to some 1000 samples and not to 10^4, 9 x 6 are too few from
+    """As measured in lib/posterior.c: 14 x 7 nodes hold for an hour's samples and not for 10^4, 9 x 6 are too few from
     the start, the others hold to 1e5. Parameters in the middle of the priors, none off the grid."""
     truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 100_000, 5)[0][:, None]
     found = {}
     for target in MODEL.nodes:
         bank = Bank(make_tables(MODEL, 1.0, ("gx",), target))
-        for n, part in ((1000, y[:1000]), (100_000, y[1000:])):
+        for n, part in ((3600, y[:3600]), (10_000, y[3600:10_000]), (100_000, y[10_000:])):
             bank.push(part)
             estimates = bank.raw.report(0)["hypotheses"][list(MODEL.hypotheses).index("gauss_markov")]["parameters"]
             found[target, n] = {bool(flags & _library32.OFF_GRID) for *_, flags in estimates[:1]}
-    assert found == {
-        ("host", 1000): {False},
-        ("host", 100_000): {False},
-        ("cortex-m4f", 1000): {False},
-        ("cortex-m4f", 100_000): {False},
-        ("cortex-m0", 1000): {False},
-        ("cortex-m0", 100_000): {True},
-        (SMALL, 1000): {True},
-        (SMALL, 100_000): {True},
-    }
+    too_coarse = {("cortex-m0", 10_000), ("cortex-m0", 100_000), (SMALL, 3600), (SMALL, 10_000), (SMALL, 100_000)}
+    assert found == {key: {key in too_coarse} for key in found}
+
+
+def test_the_flag_of_a_cortex_m0_tells_what_its_nodes_bear() -> None:
+    """The shipped hour: all six axes, on nodes that they share, are within the tolerances and none is flagged. A walk
+    of 10^4 samples on which the same nodes, one axis alone, are 0.2 nat off: flagged."""
+    recording = load(ROOT / "tests" / "data" / "simulated_adis16405.npz")
+    y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
+    block = round(recording.rate_hz)
+    bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=16)
+    bank.push(y[: len(y) // block * block].reshape(-1, block, len(MODEL.axes)).mean(axis=1))
+    for index, axis in enumerate(MODEL.axes):
+        judge = Bank(dense(tables_of(MODEL, axis=axis)), dense=True)
+        push(judge, y[: len(y) // block * block, index].reshape(-1, block).mean(axis=1))
+        exact = judge.report(0)
+        evidence, _, mean, sd = worst_difference(bank.report(index), exact)
+        print(f"{axis}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
+        assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()
+        assert not off_grid(bank, index, exact)
+    values, flagged = report_differences(a_record("random_walk", 10_000, 29)[0], tables_of(MODEL, "cortex-m0"))
+    assert (values > REPORT_LIMIT).any()
+    assert flagged
 
 
 def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstring>
@@ -29,11 +30,14 @@ constexpr int columns_max = 40;
 // The covariance counts as settled after this many samples in a row that change s by less than `settled` of itself.
 constexpr int settled_samples = 8;
 constexpr double settled = 1e-12;
-// Below this change a sample the gain stays for `stretch` samples, and the covariance goes over them in one jump. s is
-// off by 6e-6 of itself at most. Such errors have no sign: over 10^6 samples they sum to some 0.005 nats.
-constexpr double slow = 1e-7;
-constexpr int doublings = 6;
-constexpr std::size_t stretch = std::size_t{1} << doublings;
+// Below a change a sample the gain stays for so many samples, and the covariance goes over them in one jump. s is off
+// by 6e-6 of itself at most. Such errors have no sign: over 10^6 samples they sum to some 0.005 nats.
+struct Stretch {
+    double slow;
+    int doublings;
+};
+constexpr Stretch stretches[] = {{1e-9, 10}, {1e-7, 6}};
+constexpr int stretch_count = 2;
 
 // Columns go through the filter side by side, so many at a time.
 constexpr int lanes = 4;
@@ -119,13 +123,13 @@ template <int D> void congruent(const Square<D> &a, const Square<D> &x, const Sq
         }
 }
 
-// The Riccati map of `stretch` samples with one noise: P := B + A P (1 + C P)^-1 A' (doubling: Anderson & Moore 1979,
+// The Riccati map of 2^doublings samples with one noise: P := B + A P (1 + C P)^-1 A' (doubling: Anderson & Moore 1979,
 // section 6.7).
 template <int D> struct Jump {
     Square<D> A, B, C;
     double r = -1.0;
 
-    void prepare(const Input &in, double noise) {
+    void prepare(const Input &in, double noise, int doublings) {
         r = noise;
         for (int a = 0; a < D; a++)
             for (int b = 0; b < D; b++) {
@@ -170,12 +174,13 @@ template <int D> struct Filter {
     const Input &in;
     const Sums &out;
     const int groups;
-    double below[D + 1] = {}, on[D] = {}, above[D + 1] = {}; // F[a][a-1], F[a][a], F[a][a+1]
+    double h[D] = {}, below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
     double P[D][D], FK[D] = {};
     double s = 0.0, s_before = -1.0, r = -1.0, scale = 0.0, ln_now = 0.0;
-    int quiet = 0, slowly = 0;
-    double since = 1.0; // samples since s_before
-    Jump<D> jump;
+    int quiet = 0, slowly[stretch_count] = {};
+    double since = 1.0;   // samples since s_before
+    std::size_t held = 0; // the gain stays until this sample
+    Jump<D> jumps[stretch_count];
     Lanes x[groups_max][D] = {};
     Lanes nu[groups_max][fold] = {}; // whitened innovations of the samples since `start`
     std::size_t start = 0;
@@ -185,6 +190,7 @@ template <int D> struct Filter {
     Filter(const Input &input, const Sums &output)
         : in(input), out(output), groups((input.columns + lanes - 1) / lanes) {
         for (int i = 0; i < D; i++) {
+            h[i] = in.h[i];
             on[i] = in.F[i * D + i];
             below[i] = i > 0 ? in.F[i * D + i - 1] : 0.0;
             above[i] = i < D - 1 ? in.F[i * D + i + 1] : 0.0;
@@ -232,55 +238,66 @@ template <int D> struct Filter {
         ln_now = std::log(s);
         const double change = alike(i) ? std::fabs(s - s_before) : 2.0 * s;
         quiet = change <= settled * since * s ? quiet + 1 : 0;
-        slowly = change <= slow * since * s ? slowly + 1 : 0;
+        for (int k = 0; k < stretch_count; k++)
+            slowly[k] = change <= stretches[k].slow * since * s ? slowly[k] + 1 : 0;
         since = 1.0;
         s_before = present ? s : -1.0;
         r = in.r[i];
     }
 
-    // Whether the next `stretch` samples, `end` excluded, are alike.
+    // Whether the samples from i to `end` are alike.
     bool even(std::size_t i, std::size_t end) const {
-        if (end - i < stretch)
-            return false;
-        for (std::size_t j = i; j < i + stretch; j++)
+        for (std::size_t j = i; j < end; j++)
             if (!alike(j))
                 return false;
         return true;
     }
 
-    // The gain of sample i for `stretch` samples; the covariance goes beyond them.
-    void leap(std::size_t i) {
-        Square<D> before;
-        std::memcpy(before, P, sizeof before);
+    // Gain of sample i, for a stretch of alike samples where it moves slowly enough; the covariance goes beyond them.
+    void gain(std::size_t i, std::size_t stop) {
+        for (int k = 0; k < stretch_count; k++) {
+            const std::size_t length = std::size_t{1} << stretches[k].doublings;
+            if (slowly[k] < settled_samples || stop - i < length || !even(i, i + length))
+                continue;
+            Square<D> before;
+            std::memcpy(before, P, sizeof before);
+            covariance(i);
+            if (jumps[k].r != r)
+                jumps[k].prepare(in, r, stretches[k].doublings);
+            std::memcpy(P, before, sizeof P);
+            jumps[k].over(P);
+            since = static_cast<double>(length);
+            held = i + length;
+            return;
+        }
         covariance(i);
-        if (jump.r != r)
-            jump.prepare(in, r);
-        std::memcpy(P, before, sizeof P);
-        jump.over(P);
-        since = static_cast<double>(stretch);
+        held = i + 1;
     }
 
-    // Value of every column of a group at sample i; a missing reading is 0 and moves nothing, since its gain is.
-    Lanes values(int group, std::size_t i) const {
-        Lanes v = {};
+    // The values of every column of a group, put where their innovations go. A missing reading is 0 and moves nothing,
+    // since its gain is 0.
+    void gather(int group, std::size_t from, std::size_t to) {
         for (int k = 0; k < lanes && group * lanes + k < in.columns; k++) {
             const int column = group * lanes + k;
-            const double value = column == 0 ? in.y[i] : in.z[static_cast<std::size_t>(column - 1) * in.n + i];
-            v[k] = column == 0 && !std::isfinite(value) ? 0.0 : value;
+            const double *value = column == 0 ? in.y : in.z + static_cast<std::size_t>(column - 1) * in.n;
+            for (std::size_t i = from; i < to; i++)
+                nu[group][i - start][k] = value[i];
         }
-        return v;
+        if (group == 0 && !std::isfinite(in.y[from])) // alone: a stretch has none
+            nu[0][from - start][0] = 0.0;
     }
 
     // Innovations of a group over the samples from `from` to `to`, all with one gain.
     void advance(int group, std::size_t from, std::size_t to) {
+        gather(group, from, to);
         Lanes X[D + 2] = {}; // a zero on either side: no edges in the loop
         for (int a = 0; a < D; a++)
             X[a + 1] = x[group][a];
         for (std::size_t i = from; i < to; i++) {
-            Lanes sum[2] = {};
+            Lanes sum[4] = {};
             for (int a = 0; a < D; a++)
-                sum[a & 1] += in.h[a] * X[a + 1];
-            const Lanes e = values(group, i) - (sum[0] + sum[1]);
+                sum[a % 4] += h[a] * X[a + 1];
+            const Lanes e = nu[group][i - start] - ((sum[0] + sum[1]) + (sum[2] + sum[3]));
             nu[group][i - start] = e * scale;
             Lanes left = {};
             for (int a = 0; a < D; a++) {
@@ -324,22 +341,18 @@ template <int D> struct Filter {
             }
             if (i == in.n)
                 return;
-            std::size_t end = i + 1;
             const bool present = std::isfinite(in.y[i]);
-            const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
-            if (quiet >= settled_samples && alike(i)) {
-                while (end < stop && end < start + fold && alike(end))
-                    end++;
-            } else if (slowly >= settled_samples && even(i, stop)) {
-                end = i + stretch;
-                if (end > start + fold)
-                    flush(i);
-                leap(i);
-            } else {
-                covariance(i);
+            if (i >= held) {
+                const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
+                if (quiet >= settled_samples && alike(i))
+                    for (held = i + 1; held < stop && held < start + fold && alike(held); held++)
+                        ;
+                else
+                    gain(i, stop);
+                if (in.driver >= 0 && held < in.n)
+                    P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[held] - in.r[i]);
             }
-            if (in.driver >= 0 && end < in.n)
-                P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[end] - in.r[i]);
+            const std::size_t end = std::min(held, start + fold);
             for (int group = 0; group < groups; group++)
                 advance(group, i, end);
             if (out.white != nullptr)

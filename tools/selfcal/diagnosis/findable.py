@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.causes.noise import LN_CHANGES
-from selfcal.diagnosis.causes.step import LN_PLACES
+from selfcal.diagnosis.causes.step import ln_places, response_of
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import NET_LEAST, State
@@ -43,7 +43,8 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         columns[f"axis_{name}"] = values
     least = {cause: _least(state, values, NET_LEAST) for cause, values in columns.items()}
     add("ramp", slope=(least["ramp"], f"{state.unit}/s"))
-    add("step", amplitude=(least["step"] * math.sqrt(1.0 + LN_PLACES / NET_LEAST), state.unit))
+    places = ln_places(state.y.size, response_of(state), 2.0 * NET_LEAST)
+    add("step", amplitude=(least["step"] * math.sqrt(1.0 + places / NET_LEAST), state.unit))
     add(
         "periodic",
         amplitude=(least["periodic"] * math.sqrt(1.0 + line / NET_LEAST), state.unit),

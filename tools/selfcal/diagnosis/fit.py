@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -14,6 +14,8 @@ from selfcal.diagnosis.statemodel import Array, Terms, matrices
 
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
+#: A slope is taken over this much of a parameter's standard deviation.
+NEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class Sums:
 @dataclass(frozen=True)
 class Fit:
     """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
-    standard deviations `sd`, and `ln_likelihood` at its maximum."""
+    standard deviations `sd`, and `ln_likelihood` at its maximum. `spread` [k, k], where it was asked for: a root of the
+    covariance of `theta`."""
 
     terms: Terms
     theta: Array
@@ -72,6 +75,7 @@ class Fit:
     n: float
     dt: float
     duration_s: float
+    spread: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def value(self, name: str) -> float:
         """One parameter of the vector."""
@@ -96,8 +100,8 @@ def ln_likelihood(sums: Sums) -> float:
     return -0.5 * (sums.n * (math.log(2.0 * math.pi * rss / sums.n) + 1.0) + sums.D)
 
 
-def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 0.7) -> Fit:
-    """Best `theta` by the simplex method from `start`, or from the best of a few starts."""
+def _cost(series: Series, terms: Terms) -> tuple[Callable[[Array], float], Array]:
+    """-ln likelihood as a function of theta, steep beyond the limits [k, 2]; and those."""
     limits = np.array(terms.limits(series.dt)).reshape(-1, 2)
 
     def cost(theta: Array) -> float:
@@ -105,6 +109,51 @@ def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 
         inside = np.clip(theta, limits[:, 0], limits[:, 1])
         return -ln_likelihood(run(series, terms, inside)[0][0]) + float((outside**2).sum()) * 1e3
 
+    return cost, limits
+
+
+def refit(series: Series, known: Fit) -> Fit:
+    """The same model on much the same record: Newton steps with the curvature of the fit that is known.
+
+    Each step takes one pass a parameter and one more. Where they do not settle the simplex method takes over."""
+    cost, limits = _cost(series, known.terms)
+    theta, here = known.theta, cost(known.theta)
+    for _ in range(8):
+        slope = np.array([(cost(theta + NEAR * root) - here) / NEAR - 0.5 * NEAR for root in known.spread.T])
+        length = float(np.linalg.norm(slope))
+        if 0.5 * length**2 < FTOL:
+            return finish(series, known.terms, np.clip(theta, limits[:, 0], limits[:, 1]))
+        ahead = theta - known.spread @ slope * min(1.0, 3.0 / length)
+        there = cost(ahead)
+        if there >= here:
+            break
+        theta, here = ahead, there
+    return fit(series, known.terms, theta, step=0.25)
+
+
+def _spread(series: Series, found: Fit) -> Array:
+    """A root of the covariance of theta, by second differences; 4 at most for what the record hardly knows."""
+    cost, limits = _cost(series, found.terms)
+    k = found.theta.size
+    h = np.where(found.theta + 0.2 <= limits[:, 1], 0.2, -0.2) * np.where(limits[:, 1] - limits[:, 0] < 1.0, 0.05, 1.0)
+    middle = cost(found.theta)
+    moves = np.diag(h)
+    ahead = [cost(found.theta + move) for move in moves]
+    back = [cost(found.theta - move) for move in moves]
+    H = np.empty((k, k))
+    for i in range(k):
+        H[i, i] = (ahead[i] - 2.0 * middle + back[i]) / h[i] ** 2
+        for j in range(i):
+            both = cost(found.theta + moves[i] + moves[j])
+            H[i, j] = H[j, i] = (both - ahead[i] - ahead[j] + middle) / (h[i] * h[j])
+    values, vectors = np.linalg.eigh(H)
+    spread: Array = vectors / np.sqrt(np.maximum(values, 1.0 / 16.0))
+    return spread
+
+
+def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 0.7) -> Fit:
+    """Best `theta` by the simplex method from `start`, or from the best of a few starts."""
+    cost, limits = _cost(series, terms)
     if not terms.names:
         return finish(series, terms, np.empty(0))
     starts = [start] if start is not None else _starts(terms, limits)
@@ -118,6 +167,11 @@ def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 
         options={"initial_simplex": simplex, "fatol": FTOL, "xatol": 0.05, "maxfev": 60 * theta.size + 40},
     )
     return finish(series, terms, np.clip(found.x, limits[:, 0], limits[:, 1]))
+
+
+def curved(series: Series, found: Fit) -> Fit:
+    """The fit with its spread, for `refit`."""
+    return replace(found, spread=_spread(series, found)) if found.terms.names else found
 
 
 def finish(series: Series, terms: Terms, theta: Array) -> Fit:

@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import median_filter
 from scipy.special import ndtr
-from scipy.stats import chi2, poisson, truncnorm
+from scipy.stats import poisson, truncnorm
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
@@ -20,14 +20,16 @@ MISSING_LEAST = 1e-3
 CLOCK_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
-#: Lengths of motion looked for, s, and the price of the search, ln of looks a window.
-MOTION_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-#: A burst counts from this worth on, net of the search; several that each could be chance are none together.
-BURST_LEAST = 2.5
-#: All bursts together, nats net: more than for another cause, since lattices and drifts of several axes join in.
-MOTION_LEAST = 11.0
-#: What the axes beside the strongest must show, nats: an event of one axis meets chance on the others.
-REST_PRICE = 4.0
+#: Motion: the piece of time that rests or moves, s; variances over the resting one's; mean lengths, s, and the shares
+#: of pieces in which a motion begins.
+PIECE_S = 0.5
+MOTION_RATIOS = (1.25, 1.6, 2.2, 3.5, 6.0, 12.0)
+MOTION_S = (1.0, 4.0, 16.0)
+MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
+#: ln of the evidence for motion that is told. Noise exceeds it with a probability below e^-6, and it is one look.
+MOTION_LEAST = 6.0
+#: What the axes beside the strongest must show, nats: an event of one axis is none of the sensor.
+REST_LEAST = 3.0
 
 
 def missing(record: Record) -> tuple[Look, Mask] | None:
@@ -136,13 +138,23 @@ def saturation(state: State) -> tuple[Look, State] | None:
             continue
         half = 0.5 * state.lsb
         predicted = sign * (y - state.whitened * np.sqrt(state.variance))
-        beyond = ndtr((predicted - edge - half) / np.sqrt(state.variance))
+        deviation = np.sqrt(state.variance)
+        beyond = ndtr((predicted - edge - half) / deviation)
         expected = float(np.nansum(beyond))
         # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
-        if expected < NET_LEAST + math.log(2.0) or at_edge.sum() < 0.5 * expected:
+        worth = expected - math.log(2.0)
+        if half > 0.0:
+            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
+            cell = ndtr((predicted - edge + half) / deviation) - beyond
+            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
+            worth = max(worth, pile - math.log(20.0))
+        elif not state.redrawn:
+            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
+            worth = max(worth, (int(at_edge.sum()) - 1) * math.log(100.0))
+        if worth < NET_LEAST or at_edge.sum() < 0.5 * expected:
             continue
         sides.append((sign * edge, int(at_edge.sum())))
-        gain += expected
+        gain += worth + math.log(2.0)
         found = _unclipped(found, at_edge, edge, sign)
     if not sides:
         return None
@@ -186,63 +198,84 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
     for name in names:
         w2 = np.where(np.isfinite(record.axes[name].whitened), record.axes[name].whitened ** 2, np.nan)
         filled = np.where(np.isfinite(w2), w2, 1.0)
-        around = max(3, min(n // 3, round(120.0 * rate)))
+        around = max(3, min(n // 3, round(600.0 * rate)))
         block = max(1, round(rate))
         level = _robust_level(filled, block, around)
         squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
-    count = len(names)
-    worth, half = np.zeros(n), np.zeros(n, np.int64)
-    for length in MOTION_S:
-        window = round(length * rate)
-        if window < 1 or window > n // 4:
-            continue
-        mean = uniform_filter1d(power, window, axis=1, mode="reflect") if window > 1 else power
-        gain = 0.5 * window * _excess(mean)
-        # One axis alone is an outlier or a change of its own noise: the others together must show the burst too.
-        strongest = gain.argmax(axis=0)
-        rest = gain.sum(axis=0) - gain.max(axis=0)
-        others = (mean.sum(axis=0) - np.take_along_axis(mean, strongest[None], axis=0)[0]) / (count - 1)
-        # Windows a quarter of a length apart, of every length.
-        ln_looks = math.log(4.0 * n / window) + math.log(len(MOTION_S))
-        each = -chi2.logsf(2.0 * gain.sum(axis=0), count)  # a size of its own on every axis
-        common = -chi2.logsf(window * count * _excess(mean.mean(axis=0)), 1)  # one size on all
-        beside = np.maximum(-chi2.logsf(2.0 * rest, count - 1), -chi2.logsf(window * (count - 1) * _excess(others), 1))
-        told = np.minimum(np.maximum(each, common) - math.log(2.0) - ln_looks, beside - REST_PRICE)
-        better = told > worth
-        worth[better], half[better] = told[better], (window + 1) // 2
-    bursts: list[tuple[int, int]] = []
-    total, left = 0.0, worth.copy()
-    while left.max() > BURST_LEAST and len(bursts) < 1000:
-        at = int(np.argmax(left))
-        a, b = max(0, at - int(half[at])), min(n, at + int(half[at]) + 1)
-        bursts.append((a, b))
-        total += float(left[at])
-        margin = max(1, round(2.0 * rate))
-        left[max(0, a - margin) : b + margin] = 0.0
-    if total < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
+    whole, bursts = _moving(power, max(1, round(PIECE_S * rate)))
+    if not bursts or whole < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
+    each = np.array([[_burst(power[k, a:b]) for a, b in joined] for k in range(len(names))])
+    # Beside the strongest axis of each burst; every axis gains half a nat by chance.
+    beside = each.sum(axis=0) - each.max(axis=0) - 0.5 * (len(names) - 1)
+    if beside.sum() < REST_LEAST:
+        return {}
     pad = max(1, round(0.5 * rate))
     mask = np.zeros(n, bool)
     for a, b in joined:
         mask[max(0, a - pad) : b + pad] = True
     found: dict[str, tuple[Look, Mask]] = {}
     for k, name in enumerate(names):
-        worth_here = sum(_burst(power[k, a:b]) for a, b in joined)
         shown = [(a, b) for a, b in joined if _burst(power[k, a:b]) > 2.0]
         if not shown:
             continue
         look = Look(
             "motion",
-            worth_here,
-            total,
+            float(each[k].sum()),
+            whole,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
             when=(shown[0][0] / rate, shown[-1][1] / rate),
         )
         found[name] = (look, mask)
     return found if len(found) >= 2 else {}
+
+
+def _moving(power: Array, piece: int) -> tuple[float, list[tuple[int, int]]]:
+    """ln of the evidence that the sensor moves now and then, and when (samples). `power` [axes, n]: squared innovations
+    over the level of their axis.
+
+    Every piece of `piece` samples rests or moves; a motion makes all axes louder by one of the ratios for as long as it
+    lasts (a hidden Markov model, forward and backward). The evidence is the mean over lengths and shares of the
+    likelihood over that of rest: noise alone exceeds e^x with a probability below e^-x.
+    """
+    count = power.shape[1] // piece
+    energy = power[:, : count * piece].reshape(len(power), count, piece).sum(axis=(0, 2))
+    ratio = np.array(MOTION_RATIOS)
+    louder = 0.5 * energy[:, None] * (1.0 - 1.0 / ratio) - 0.5 * len(power) * piece * np.log(ratio)
+    like = np.hstack([np.ones((count, 1)), np.exp(np.minimum(louder, 600.0))])
+    begins, lasts = (grid.ravel() for grid in np.meshgrid(MOTION_BEGINS, MOTION_S))
+    ends = np.minimum(1.0, PIECE_S / lasts)
+    states = 1 + ratio.size
+    move = np.zeros((begins.size, states, states))
+    move[:, 0, 0] = 1.0 - begins
+    move[:, 0, 1:] = begins[:, None] / ratio.size
+    move[:, 1:, 0] = ends[:, None]
+    move[:, range(1, states), range(1, states)] = 1.0 - ends[:, None]
+    ahead = np.empty((count, begins.size, states))
+    ln_evidence = np.zeros(begins.size)
+    now = np.zeros((begins.size, states))
+    now[:, 0] = 1.0
+    for k in range(count):
+        now = np.einsum("cs,cst->ct", now, move) * like[k]
+        total = now.sum(axis=1, keepdims=True)
+        now /= total
+        ln_evidence += np.log(total[:, 0])
+        ahead[k] = now
+    weight = np.exp(ln_evidence - ln_evidence.max())
+    weight /= weight.sum()
+    behind = np.ones((begins.size, states))
+    moving = np.empty(count)
+    for k in range(count - 1, -1, -1):
+        both = ahead[k] * behind
+        moving[k] = 1.0 - float(weight @ (both[:, 0] / both.sum(axis=1)))
+        behind = np.einsum("cst,ct->cs", move, behind * like[k])
+        behind /= behind.max(axis=1, keepdims=True)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (moving > 0.5).astype(int), [0]])))
+    bursts = [(int(a) * piece, int(b) * piece) for a, b in edges.reshape(-1, 2)]
+    return float(np.logaddexp.reduce(ln_evidence)) - math.log(begins.size), bursts
 
 
 def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:

@@ -30,7 +30,7 @@ STATIONARY = (periodic.looks, noise.colored)
 CERTAIN = 50.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
-#: From this finding on, a cause that shows nothing waits until the others show nothing either.
+#: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
 #: Times that one cause is named on an axis: more jumps or changes of the noise are none of single ones.
 MOST = {"step": 3, "variance_change": 3}
@@ -167,10 +167,10 @@ def _rounds(
         if one.state.below_lattice:
             return
         advance(f"{one.state.axis}: round {number}")
-        looks = _looked(one, record, [cause for cause in causes if cause not in idle], idle)
+        looks = _looked(one, record, [cause for cause in causes if cause not in idle], least, idle)
         if idle and (not looks or looks[0].net < least):
             waiting, idle = list(idle), set()
-            looks = sorted([*looks, *_looked(one, record, waiting, set())], key=lambda look: -look.net)
+            looks = sorted([*looks, *_looked(one, record, waiting, least, set())], key=lambda look: -look.net)
         one.refused = looks
         if not looks or looks[0].net < least:
             return
@@ -188,15 +188,16 @@ def _looked(
     one: Diagnosed,
     record: Record,
     causes: Sequence[Callable[[State, Record], list[Look]]],
+    least: float,
     idle: set[Callable[[State, Record], list[Look]]],
 ) -> list[Look]:
-    """The looks of `causes`, the most worth first; those without any are added to `idle`."""
+    """The looks of `causes`, the most worth first; causes of which none is worth `least` are added to `idle`."""
     named = Counter(finding.look.cause for finding in one.findings)
     found: list[Look] = []
     for cause in causes:
         looks = [look for look in cause(one.state, record) if named[look.cause] < MOST.get(look.cause, ROUNDS)]
         found += looks
-        if not looks:
+        if all(look.net < least for look in looks):
             idle.add(cause)
     return sorted(found, key=lambda look: -look.net)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from selfcal.diagnosis.fit import Fit, Series, best, fit, moved, run
+from selfcal.diagnosis.fit import Fit, Series, best, curved, fit, moved, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
@@ -87,7 +88,7 @@ class State:
         """The state with `changes`, fitted."""
         state = replace(self, **changes)
         series = state.series
-        fits = tuple(_fit_from(series, terms, self.fits) for terms in state.bases())
+        fits = tuple(curved(series, _fit_from(series, terms, self.fits)) for terms in state.bases())
         state = replace(state, fits=fits)
         chosen = state.best
         _, white, s = run(series, chosen.terms, chosen.theta, innovations=True)
@@ -100,12 +101,19 @@ class State:
         fits = [_fit_from(series, terms, self.fits) for terms in self.near()]
         return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
 
-    def rich_gain(self, more: Array) -> float:
-        """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column."""
+    @cached_property
+    def rich(self) -> Fit:
+        """A drift of two terms."""
         terms = replace(self.extras, walk=True, markov=True)
-        before = fit(self.series, terms, moved(self.best, terms))
-        after = fit(self.series.beside(more), terms, before.theta)
-        return after.ln_likelihood - max(before.ln_likelihood, self.best.ln_likelihood)
+        return curved(self.series, fit(self.series, terms, moved(self.best, terms)))
+
+    def rich_gain(self, more: Array) -> float:
+        """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column. 1/f noise
+        has several terms by itself."""
+        if self.extras.flicker:
+            return math.inf
+        after = refit(self.series.beside(more), self.rich)
+        return after.ln_likelihood - max(self.rich.ln_likelihood, self.best.ln_likelihood)
 
     def scores(self, more: Array) -> Array:
         """Gain [k] of each further column alone at the fitted drift: one pass for all of them."""
@@ -126,7 +134,7 @@ class State:
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     same = [one for one in known if one.terms == terms]
     if same:
-        return fit(series, terms, same[0].theta, step=0.25)
+        return refit(series, same[0]) if same[0].spread.size else fit(series, terms, same[0].theta, step=0.25)
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
     if near:
         return fit(series, terms, moved(near[0], terms))

@@ -82,8 +82,9 @@ class Matrices:
 
 def flicker_rates(duration_s: float, dt: float) -> Array:
     """Correlation rates, 1/s, of the Gauss-Markov terms that together make 1/f noise over a record: a decade apart or a
-    little less, from a third of a turn in the record to beyond half the sampling rate."""
-    low, high = math.log10(2.0 / duration_s), math.log10(4.0 / dt)
+    little less, from a third of a turn in the record to a sixth of the sampling rate. White noise makes up what lacks
+    above; a faster term would only alias, and a sensor that averages has no such power."""
+    low, high = math.log10(2.0 / duration_s), math.log10(1.0 / dt)
     count = max(2, min(8, 1 + math.ceil(high - low)))
     return np.logspace(low, high, count)
 

@@ -113,7 +113,8 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
     if lsb > 0.0:
         runs = _longest_run(y)
         found["longest_repeat"] = math.log(runs)
-        codes = np.rint(y[np.isfinite(y)] / lsb).astype(np.int64)
+        read = y[np.isfinite(y)]
+        codes = np.rint((read - read[0]) / lsb).astype(np.int64)
         odd = int((codes & 1).sum())
         found["odd_even_codes"] = (codes.size - 2 * odd) / math.sqrt(codes.size) if 0 < odd < codes.size else 9.0
     return found

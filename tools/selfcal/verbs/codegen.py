@@ -99,6 +99,8 @@ def _header(model: Model, tables: Tables) -> str:
 #error "set SELFCAL_ALPHA_MAX to {alpha}: this model has a grid of so many nodes of alpha"
 #elif SELFCAL_HYPOTHESIS_NODES_MAX < {most}
 #error "set SELFCAL_HYPOTHESIS_NODES_MAX to {most}: this model has a hypothesis of so many nodes"
+#elif SELFCAL_NODES_MAX < {tables.nodes}
+#error "set SELFCAL_NODES_MAX to {tables.nodes}: this model has so many nodes"
 #endif
 #if SELFCAL_AXES_MAX < {axes}
 #error "set SELFCAL_AXES_MAX to {axes}: this model has so many axes"

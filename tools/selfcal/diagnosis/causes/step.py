@@ -12,9 +12,16 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, net
 from selfcal.diagnosis.statemodel import Array
 
-#: ln of the places that count as independent looks. The best of them gains about 4.5 nats of noise alone, but its tail
-#: is longer than theirs: of 96 clean records two gained 12 nats.
-LN_PLACES = 6.5
+
+def ln_places(n: int, response: Array, gain: float) -> float:
+    """ln of the independent places among `n`.
+
+    Scores of neighbouring places are as alike as the whitened responses are: a step's decays by the filter's gain a
+    sample. The largest of such a process (Leadbetter, Lindgren & Rootzen 1983, theorem 12.2.9) is that of
+    n (1 - r) 2 gain independent ones, r the correlation of neighbours.
+    """
+    r = float(response[1:] @ response[:-1]) / float(response @ response)
+    return math.log(max(1.0, n * (1.0 - r))) + math.log(max(1.0, 2.0 * gain))
 
 
 def scan(state: State, w: Array, response: Array) -> tuple[Array, Array]:
@@ -43,7 +50,7 @@ def looks(state: State, record: Record) -> list[Look]:
         return []
     w = np.nan_to_num(state.whitened)
     _, white, _ = run(state.series, fit.terms, fit.theta, innovations=True)
-    response = _response(state)
+    response = response_of(state)
     B, A = scan(state, w, response)
     Z = np.nan_to_num(white[:, 1:]) / fit.sigma
     q = np.linalg.qr(Z)[0]
@@ -63,7 +70,8 @@ def looks(state: State, record: Record) -> list[Look]:
     assert best is not None
     place = _refined(best[1], gain)
     gain_exact, fit_with = state.with_columns(_column(n, place))
-    worth = net(gain_exact, 1, LN_PLACES)
+    gain_exact = min(gain_exact, state.rich_gain(_column(n, place)))
+    worth = net(gain_exact, 1, ln_places(n, response, gain_exact))
     if worth < 1.0:
         return []
     time = float(record.time_s[place])
@@ -90,7 +98,7 @@ def _column(n: int, place: int) -> Array:
     return values
 
 
-def _response(state: State) -> Array:
+def response_of(state: State) -> Array:
     """Whitened innovations of a unit step once the filter has settled, over sigma."""
     n = state.y.size
     clean = Series(np.zeros(2 * n), state.dt, np.ones(2 * n), np.vstack([_column(2 * n, n)]))
