@@ -103,11 +103,12 @@ def averaged(state: State, sd: list[float]) -> float:
 def at_point(tree: dict[str, Any], fit: Fit, law: str, **more: float) -> dict[str, Any]:
     """The model with one law alone, its parameters held at those of the fit, and with its regressors in use."""
     held: dict[str, Any] = json.loads(json.dumps({key: value for key, value in tree.items() if key != "simulate"}))
-    values = {"N": fit.sigma * math.sqrt(fit.dt), **more}
+    values = {"N": fit.sigma * math.sqrt(fit.dt)}
     if fit.terms.walk:
-        values.setdefault("K", fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt))
+        values["K"] = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
     elif fit.terms.markov:
         values |= {"sigma_m": fit.sigma * math.exp(fit.value("ln_markov")), "alpha": math.exp(fit.value("ln_alpha"))}
+    values |= more
     for name, value in values.items():
         prior = {"law": "log_uniform", "min": value * (1.0 - POINT), "max": value * (1.0 + POINT)}
         held["groups"]["gyro"]["priors"][name] = prior
