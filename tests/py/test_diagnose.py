@@ -223,6 +223,18 @@ def test_fail_on_for_a_production_line(tmp_path: Path) -> None:
         assert "step:" in done.stdout
 
 
+def test_identify_names_the_strongest_suspicion(tmp_path: Path) -> None:
+    """Of an axis that is not adequate, and of no other: gx has a line."""
+    effect(tmp_path, "periodic:axis=gx,frequency_hz=0.05,amplitude=0.1")
+    done = run("identify", "log.npz", "--axis", "gx", "--axis", "gy", "--json", "found.json", cwd=tmp_path)
+    lines = done.stdout.splitlines()
+    at = lines.index("strongest suspicion: gx: periodic")
+    assert lines[at + 1] == "why, and what mends it: selfcal diagnose log.npz"
+    axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
+    assert not axes["gx"]["adequate"] and axes["gx"]["suspicion"] == "periodic"
+    assert axes["gy"]["adequate"] and "suspicion" not in axes["gy"]
+
+
 def test_compare_tells_what_changed_and_no_more(tmp_path: Path) -> None:
     """Two records of one law and parameters: the second has a step, and nothing else may be told as a change of N."""
     model = tmp_path / "model.yaml"

@@ -6,7 +6,11 @@ cause is in the model and lies in it afterwards. The browser is Debian's chromiu
 
 from __future__ import annotations
 
+import html
+import json
 import math
+import re
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -30,6 +34,8 @@ from selfcal.diagnosis.statemodel import Array
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import load
+
+from conftest import run
 
 HOSTILE = '<script>alert("x")</script><img src=x onerror=alert(1)>\'"&'
 #: Points on a curve, at most.
@@ -280,9 +286,33 @@ def test_every_part_of_the_page_is_there(case: Case) -> None:
         "How to read this page",
     ):
         assert heading in text
-    assert "selfcal diagnose '" in text and "made here.csv' --axis gx --axis gy --report report.html" in text
+    assert "selfcal diagnose '" in text and "made here.csv' --report report.html" in text
     for row in case.document["axes"]["gy"]["not_found"]:
         assert row["cause"].replace("_", " ") in text
+
+
+def test_the_commands_on_the_page_reproduce_it(tmp_path: Path) -> None:
+    """As they stand there, options and all: a foreign header, counts, no time stamps. The first repeats the result."""
+    random = np.random.default_rng(4)
+    counts = np.rint(
+        2.0 * random.standard_normal((30_000, 2)) + 3.0 * (np.arange(30_000) > 17_000)[:, None] * [1.0, 0.0]
+    )
+    np.savetxt(tmp_path / "raw.csv", counts, delimiter=",", fmt="%d", header="rate x[LSB],ry[LSB]", comments="")
+    read = ["--column", "gx=rate x", "--column", "gy=ry", "--scale", "0.05[deg/s]", "--rate", "100"]
+    given = ["raw.csv", "--axis", "gx", *read, "--decimate", "10"]
+    done = run("diagnose", *given, "--report", "page.html", "--json", "first.json", cwd=tmp_path)
+    assert done.returncode == 0, done
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    found = re.search(r"<pre [^>]*aria-label=Commands[^>]*><code>(.*?)</code>", text, re.DOTALL)
+    assert found is not None
+    commands = [shlex.split(line) for line in html.unescape(found[1]).splitlines()]
+    assert [command[:2] for command in commands] == [
+        ["selfcal", verb] for verb in ("diagnose", "simulate", "diagnose", "identify")
+    ]
+    for command in commands:
+        done = run(*command[1:], cwd=tmp_path)
+        assert done.returncode == 0, done
+    assert json.loads((tmp_path / "report.json").read_text()) == json.loads((tmp_path / "first.json").read_text())
 
 
 def test_the_same_diagnosis_makes_the_same_page(case: Case) -> None:

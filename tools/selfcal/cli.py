@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from selfcal.ending import install, last_signal
+from selfcal.ending import Held, install, last_signal
 from selfcal.errors import UserError, printable
 from selfcal.suffixes import READ, WRITTEN
 
@@ -197,6 +197,7 @@ def diagnose(
         scale=parse_scales(scale or ()),
     )
     verb.show(result, to_stderr=str(json) == "-")
+    Held().check()
     if fail_on is not None and verb.failing(result, fail_on):
         sys.exit(1)
 

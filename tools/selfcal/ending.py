@@ -19,6 +19,10 @@ class Ended(KeyboardInterrupt):
         self.number = number
 
 
+class Stopped(Exception):
+    """Raised at a point where long work may end early, for its caller to keep what is done."""
+
+
 class _State:
     """What came while signals are held."""
 

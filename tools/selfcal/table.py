@@ -121,6 +121,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         ]
         if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
             failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
+    suspected = [f"{name}: {axis['suspicion'].replace('_', ' ')}" for name, axis in axes.items() if "suspicion" in axis]
+    if suspected:
+        failed.append(f"strongest suspicion: {'; '.join(suspected)}")
     if any(line.startswith("not adequate") for line in failed):
         failed.append(f"why, and what mends it: selfcal diagnose {printable(recording['path'])}")
     return table, [*kept, *failed]
@@ -145,7 +148,7 @@ def _regressor_table(axes: Mapping[str, Any]) -> Table:
                     "-" if not math.isfinite(c["median"]) else f"{c['median']:.4g} \\[{c['q05']:.4g}, {c['q95']:.4g}]",
                     c["unit"],
                     style="bold" if regressor in axis["regressors_in_use"] else None,
-                    end_section=(regressor, entry) == entries[-1],
+                    end_section=regressor == entries[-1][0] and column == list(entry["coefficients"])[-1],
                 )
     return table
 

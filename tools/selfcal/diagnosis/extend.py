@@ -3,85 +3,166 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
-from selfcal.model import MOST_COLUMNS, Model
+from selfcal.model import MOST_COLUMNS, RATIO_LIMITS, Model
+from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
-#: Laws that a named cause asks for, and what their priors need beside the file's own.
-LAWS = {"flicker": "flicker", "colored_noise": "moving_average"}
+#: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
+NODES = [24, 20]
+#: Windows of a channel's trailing mean, s.
+WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
 
 def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> dict[str, Any]:
     """The model file's tree. `simulate` in it reproduces each axis: its law, parameters, bias and effects."""
     tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
     tree["name"] = f"{model.name}, extended"
-    entries: dict[str, dict[str, Any]] = {}
-    for name, one in found.items():
-        group = model.group_of(name).name
-        for k, regressor in enumerate(one.state.regressors):
-            key = regressor.name.removesuffix(".sin").removesuffix(".cos")
-            entry = entries.setdefault(key, {"name": key, **regressor.entry, "sd": {}, "probability": 0.5})
-            if regressor.cause == "cross_axis":
-                entry["reference"] = float(f"{record.axes[str(regressor.entry['column'])].level:.6g}")
-            size = abs(float(one.state.best.c[1 + k])) + 2.0 * float(one.state.best.sd[1 + k])
-            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * size:.3g}"))
-    kept: list[dict[str, Any]] = []
-    used = 0
-    for entry in entries.values():
-        columns = 2 if entry["kind"] == "periodic" else 1
-        if used + columns <= MOST_COLUMNS:
-            kept.append(entry)
-            used += columns
+    kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
     for name, one in found.items():
         group = tree["groups"][model.group_of(name).name]
         for finding in one.findings:
             estimate = finding.look.estimate
-            law = LAWS.get(finding.look.cause)
-            if law is not None:
-                tree["hypotheses"].setdefault(law, 1)
-                tree["nodes"]["host"].setdefault(law, [24, 20])
-                if law == "flicker":
-                    group["priors"].setdefault("B", dict(group["priors"]["sigma_m"]))
-                else:
-                    group["priors"].setdefault("spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
+            if finding.look.cause == "flicker":
+                _law(tree, "flicker", "B", dict(group["priors"]["sigma_m"]))
+            elif finding.look.cause == "colored_noise":
+                _color(tree, one)
             elif finding.look.cause == "quantization":
-                group["lsb"] = float(f"{estimate['lsb']['median']:.8g}")
+                group["lsb"] = _digits(estimate["lsb"]["median"])
             elif finding.look.cause == "saturation":
-                group["range"] = float(f"{abs(estimate['limit']['median']):.8g}")
-    # Every group needs the priors of every law.
-    for group in tree["groups"].values():
-        if "flicker" in tree["hypotheses"]:
-            group["priors"].setdefault("B", dict(group["priors"]["sigma_m"]))
-        if "moving_average" in tree["hypotheses"]:
-            group["priors"].setdefault("spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
+                group["range"] = _digits(abs(estimate["limit"]["median"]))
+    # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
+    colored = any(one.state.extras.color for one in found.values())
     tree["simulate"] = {
-        "rate_hz": record.rate_hz,
+        "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
         "axes": {name: _truth(one) for name, one in found.items()},
-        "effects": [text for name, one in found.items() for text in _effects(name, one, record)],
+        "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
+
+
+def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> list[dict[str, Any]]:
+    """Entries for the columns that were found, the strongest first, as many as a model may have."""
+    stated = {column for one in model.regressors for column in one.columns}
+    entries: dict[str, dict[str, Any]] = {}
+    strength: dict[str, float] = {}
+    for name, one in found.items():
+        group = model.group_of(name).name
+        for k, regressor in enumerate(one.state.regressors):
+            if regressor.name in stated:
+                continue
+            key = _key(regressor.name)
+            entry = entries.setdefault(key, {"name": key, **regressor.entry, "sd": {}, "probability": 0.5})
+            if regressor.cause == "cross_axis":
+                entry["reference"] = _digits(record.axes[str(regressor.entry["column"])].level)
+            c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
+            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))
+            strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
+    kept: list[dict[str, Any]] = []
+    used = len(stated)
+    for key in sorted(entries, key=lambda key: -strength[key]):
+        entry = entries[key]
+        columns = 2 if entry["kind"] == "periodic" else 1
+        if used + columns <= MOST_COLUMNS:
+            if key in record.channels:
+                _smooth(entry, key, record, found)
+            kept.append(entry)
+            used += columns
+    return kept
+
+
+def _smooth(entry: dict[str, Any], channel: str, record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """The window whose trailing mean explains the axes best. A centred mean, which the diagnosis takes, needs values
+    that a module does not have yet; a trailing one lags, so a shorter window suits it."""
+    gains: dict[float, float] = {}
+    for width in WINDOWS_S:
+        window = max(1, round(width * record.rate_hz))
+        if window > record.present.size // 10:
+            break
+        values = trailing_mean(record.channels[channel], window) - float(entry["reference"])
+        gains[width if window > 1 else 0.0] = sum(
+            _with_values(one, channel, values)
+            for one in found.values()
+            if any(column.name == channel for column in one.state.regressors)
+        )
+    best = max(gains, key=lambda width: gains[width])
+    entry.pop("window_s", None)
+    if best:
+        entry["window_s"] = best
+
+
+def _with_values(one: Diagnosed, channel: str, values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    """ln likelihood of the axis with other values of one of its columns, at the drift that was found."""
+    columns = tuple(
+        replace(column, values=values) if column.name == channel else column for column in one.state.regressors
+    )
+    fit = one.state.best
+    return finish(replace(one.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
+
+
+def _law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any]) -> None:
+    """Have the model one law more, with a prior of its parameter in every group and nodes on every target."""
+    tree["hypotheses"].setdefault(law, 1)
+    for target, nodes in tree["nodes"].items():
+        nodes.setdefault(law, NODES if target == "host" else list(nodes["gauss_markov"]))
+    for group in tree["groups"].values():
+        own = dict(group["priors"]["sigma_m"]) if parameter == "B" else dict(prior)
+        group["priors"].setdefault(parameter, own)
+
+
+def _color(tree: dict[str, Any], one: Diagnosed) -> None:
+    """A law for white noise with memory.
+
+    A first-order process at the bank's own rate is a Gauss-Markov drift of its correlation time, beside a walk. Block
+    means of a faster one, and a moving average, are correlated with their neighbours alone."""
+    fit = one.state.best
+    correlation = math.tanh(fit.value("color"))
+    at_bank_rate = abs(fit.dt * float(tree["bank_rate_hz"]) - 1.0) < 0.01
+    if fit.terms.color == "ar" and correlation > 0.0 and at_bank_rate and "correlation_time_s" not in tree:
+        time_s = -fit.dt / math.log(correlation)
+        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt) if fit.terms.walk else 0.0
+        most = min(10.0 * fit.sigma / max(K * math.sqrt(time_s), 1e-300), RATIO_LIMITS[1])
+        tree["correlation_time_s"] = _digits(time_s)
+        prior = {"law": "log_uniform", "min": _digits(0.01 * most), "max": _digits(most)}
+        _law(tree, "walk_and_markov", "markov_ratio", prior)
+        return
+    _law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
 
 
 def _truth(one: Diagnosed) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias."""
     fit = one.state.best
     N = fit.sigma * math.sqrt(fit.dt)
+    if fit.terms.color:
+        # The simulator's noise with memory has this level at low frequency, and (1 - lag1) / (1 + lag1) of it in all.
+        m = math.tanh(fit.value("color"))
+        lag1 = m if fit.terms.color == "ar" else m / (1.0 + m * m)
+        N *= math.sqrt((1.0 + lag1) / (1.0 - lag1))
     # The read-out adds lsb^2 / 12 by itself.
     N = math.sqrt(max(N * N - one.state.lsb**2 / 12.0 * fit.dt, 1e-4 * N * N))
+    # The simulator's ramp and temperature begin at 0.
+    at_first = sum(
+        float(c * column.values[0])
+        for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
+        if column.cause in ("ramp", "temperature")
+    )
     truth: dict[str, Any] = {
         "hypothesis": "constant",
-        "bias": _digits(one.state.level + float(fit.c[0])),
+        "bias": _digits(one.state.level + float(fit.c[0]) + at_first),
         "N": _digits(N),
     }
     if fit.terms.walk:
@@ -102,27 +183,67 @@ def _digits(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _effects(name: str, one: Diagnosed, record: Record) -> list[str]:
-    """`--effect` texts that put each finding back into a simulated record."""
-    texts: list[str] = []
-    for finding in one.findings:
-        estimate = finding.look.estimate
-        pairs = {
-            key: value["median"] for key, value in estimate.items() if isinstance(value, Mapping) and key != "limit"
-        }
-        if finding.look.cause == "outliers":
-            pairs.pop("time_s", None)
-        if finding.look.cause in ("unexplained", "quantization", "saturation"):
-            continue  # the lattice and the range are in the groups
-        if finding.look.cause in ("missing_samples", "motion"):
-            pairs = {key: int(max(1, round(value))) for key, value in pairs.items()}
-        where = "" if finding.look.cause == "missing_samples" else f",axis={name}"
-        if finding.look.cause == "cross_axis":
-            where += f",other={estimate['other']}"
-        text = f"{finding.look.cause}:" + ",".join(f"{key}={value:.8g}" for key, value in pairs.items()) + where
-        if finding.look.cause != "missing_samples" or not any(old.startswith("missing") for old in texts):
-            texts.append(text)
+def _key(column: str) -> str:
+    """Name of the regressor that a column belongs to."""
+    return column.removesuffix(".sin").removesuffix(".cos")
+
+
+def _effects(name: str, one: Diagnosed) -> list[str]:
+    """`--effect` texts that put what an axis has into a simulated record. The simulator has one effect of a kind on an
+    axis: the strongest."""
+    found = [*_of_columns(one), *_of_findings(one)]
+    strongest: dict[str, tuple[float, dict[str, Any]]] = {}
+    for cause, strength, pairs in found:
+        if cause not in strongest or strongest[cause][0] < strength:
+            strongest[cause] = (strength, pairs)
+    texts = []
+    for cause, (_, pairs) in strongest.items():
+        where = {} if cause == "missing_samples" else {"axis": name}
+        values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in pairs.items()}
+        texts.append(f"{cause}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
     return texts
+
+
+def _of_columns(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
+    """Cause, strength in nats, and the effect's keys, of the columns in an axis' model."""
+    fit = one.state.best
+    sizes: dict[str, list[int]] = {}
+    for k, column in enumerate(one.state.regressors):
+        sizes.setdefault(_key(column.name), []).append(k)
+    for places in sizes.values():
+        column = one.state.regressors[places[0]]
+        c = [float(fit.c[1 + k]) for k in places]
+        strength = sum(
+            0.5 * (value / max(float(fit.sd[1 + k]), 1e-300)) ** 2 for value, k in zip(c, places, strict=True)
+        )
+        entry = column.entry
+        if column.cause in ("temperature", "supply"):
+            yield column.cause, strength, {"coefficient": c[0]}
+        elif column.cause == "cross_axis":
+            yield column.cause, strength, {"coefficient": c[0], "other": str(entry["column"])}
+        elif column.cause == "ramp":
+            yield column.cause, strength, {"slope": c[0]}
+        elif column.cause == "step":
+            yield column.cause, strength, {"time_s": float(entry["time_s"]), "amplitude": c[0]}
+        elif column.cause == "periodic":
+            yield column.cause, strength, {"frequency_hz": float(entry["frequency_hz"]), "amplitude": math.hypot(*c)}
+
+
+def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
+    """The same of what is no column. The lattice and the range are in the groups."""
+    for finding in one.findings:
+        look = finding.look
+        median = {key: value["median"] for key, value in look.estimate.items() if isinstance(value, Mapping)}
+        if look.cause in ("flicker", "colored_noise"):
+            yield look.cause, look.gain, median
+        elif look.cause == "periodic" and "width_hz" in median:
+            yield look.cause, look.gain, {key: median[key] for key in ("frequency_hz", "amplitude")}
+        elif look.cause == "outliers":
+            yield look.cause, look.gain, {"fraction": median["fraction"]}
+        elif look.cause == "variance_change":  # the simulator's ratio is of variances
+            yield look.cause, look.gain, {"time_s": median["time_s"], "ratio": median["ratio"] ** 2}
+        elif look.cause in ("missing_samples", "motion"):
+            yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 
 
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:

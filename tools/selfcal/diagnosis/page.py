@@ -87,17 +87,24 @@ code{font-size:.92em;overflow-wrap:anywhere}
 """
 
 
-def write_page(path: Path | str, document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> None:
+#: Options of the command line and their values, each as often as it was given.
+Options = Sequence[tuple[str, str]]
+
+
+def write_page(
+    path: Path | str, document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], options: Options = ()
+) -> None:
     """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    write_text(path, page(document, record, found))
+    write_text(path, page(document, record, found, options))
 
 
-def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> str:
+def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], options: Options = ()) -> str:
     """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and `found`.
+    `options`: how the recording was read and looked at, for the commands that reproduce it.
 
     The same arguments give the same page: the simulated records of the bands have a fixed seed."""
     name = Path(str(document["recording"]["path"])).name
-    body = _body(document, record, found)
+    body = _body(document, record, found, options)
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width,initial-scale=1'>",
@@ -115,13 +122,13 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
     return "".join(parts)
 
 
-def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], options: Options) -> list[str]:
     axes = {axis: entry for axis, entry in document["axes"].items() if "error" not in entry}
     failed = {axis: str(entry["error"]) for axis, entry in document["axes"].items() if "error" in entry}
     sections: list[list[_Part]] = []
     for k, (axis, entry) in enumerate(axes.items()):
         sections.append(list(_axis(k, axis, entry, record, found[axis])))
-    rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, record), *_reading()]
+    rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, options), *_reading()]
     parts = [_Part(text) for text in (*_summary(axes, failed), *_contents(axes))]
     parts += [part for section in sections for part in section]
     parts += [_Part(text) for text in rest]
@@ -493,21 +500,20 @@ def _least(size: Mapping[str, Any]) -> str:
     return ", ".join(told)
 
 
-def _reproduce(document: Mapping[str, Any], record: Record) -> Iterator[str]:
+def _reproduce(document: Mapping[str, Any], options: Options) -> Iterator[str]:
+    def given(*left_out: str) -> str:
+        return "".join(f" {name} {shlex.quote(value)}" for name, value in options if name not in left_out)
+
     log = shlex.quote(str(document["recording"]["path"]))
-    axes = "".join(f" --axis {shlex.quote(axis)}" for axis in document["axes"])
-    rate = f" --decimate {record.rate_hz:g}" if _decimated(document, record) else ""
+    how_read = ("--rate", "--column", "--unit", "--scale")  # a simulated recording states all that
     lines = [
-        f"selfcal diagnose {log}{axes}{rate} --report report.html --json report.json --write-model extended.yaml",
+        f"selfcal diagnose {log}{given()} --report report.html --json report.json --write-model extended.yaml",
         "selfcal simulate extended.yaml -o simulated.npz --seed 1",
-        "selfcal diagnose simulated.npz",
-        f"selfcal identify {log}{axes} --model extended.yaml",
+        f"selfcal diagnose simulated.npz{given(*how_read)}",
+        f"selfcal identify {log}{given('--model')} --model extended.yaml",
     ]
     yield "<section aria-labelledby=again><h2 id=again>Reproduce it</h2>"
-    yield (
-        f"<p>With selfcal {escape(selfcal.__version__)}. Add the options <code>--model</code>, <code>--rate</code>, "
-        "<code>--column</code>, <code>--unit</code> and <code>--scale</code> if the recording was read with them.</p>"
-    )
+    yield f"<p>With selfcal {escape(selfcal.__version__)}:</p>"
     yield f"<pre tabindex=0 aria-label=Commands role=group><code>{escape(chr(10).join(lines))}</code></pre>"
     if document.get("model"):
         plain = json.loads(json.dumps(document["model"], default=float))  # numpy's numbers too

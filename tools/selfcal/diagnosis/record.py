@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from selfcal.diagnosis.state import State
+from selfcal.diagnosis.state import Regressor, State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
 from selfcal.lattice import lattice_of
 from selfcal.model import Model
+from selfcal.model import Regressor as Stated
 from selfcal.recording import Recording
+from selfcal.regressors import columns_of, offered
 
 #: Columns that are no axis but may explain one, by cause: name and unit.
 CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
@@ -47,7 +49,8 @@ class Record:
 
 
 def of_recording(recording: Recording, model: Model, decimate: float | None = None) -> Record:
-    """Every sensor column that the model knows, in the unit of each axis' group, and the side channels.
+    """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
+    file states is in the model of each axis from the start.
 
     `decimate`, Hz: means of whole blocks at the rate nearest to it; a block of which half is missing is missing.
     """
@@ -69,6 +72,17 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             mean = np.bincount(index[kept], values[kept], minlength=n) / used
         return np.where(present, mean, np.nan)
 
+    def stated(name: str) -> tuple[Regressor, ...]:
+        """The model file's regressors of an axis."""
+        found: list[Regressor] = []
+        for one in offered(model, name):
+            values = columns_of((one,), recording)
+            entry = {"column": one.column, "frequency_hz": one.frequency_hz, "time_s": one.time_s}
+            for column, row in zip(one.columns, values.T, strict=True):
+                about = bridged(on_grid(np.ascontiguousarray(row))) - one.reference
+                found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
+        return tuple(found)
+
     states: dict[str, State] = {}
     for name in model.axes:
         if name not in recording.columns:
@@ -87,6 +101,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             dt=block / recording.rate_hz,
             level=level,
             r=np.where(present, block / np.maximum(used, 1), 1.0),
+            regressors=stated(name),
             lsb=found.step if found is not None and block == 1 else 0.0,
             stated_lsb=group.lsb,
             redrawn=block > 1,
@@ -110,6 +125,17 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         recording.off_grid_s,
         recording.rate_hz,
     )
+
+
+def _cause(one: Stated, model: Model) -> str:
+    """The cause that a regressor of the model file stands for."""
+    if one.kind == "column" and one.column in model.axes:
+        return "cross_axis"
+    return {"time": "ramp", "column": _channel(one.column), "rate": "rate"}.get(one.kind, one.kind)
+
+
+def _channel(column: str) -> str:
+    return next((cause for cause, (name, _) in CHANNELS.items() if name == column), "")
 
 
 def bridged(values: Array) -> Array:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from selfcal.document import check_writable, write_json
+from selfcal.ending import Held
 from selfcal.errors import UserError, printable
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -46,6 +47,7 @@ def compare(
     for log in logs:
         identified = identify(log, axes=axes, model=model)["axes"]
         diagnosed = diagnose(log, axes=axes, model=model, decimate=decimate)["axes"]
+        Held().check()
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
     changes: dict[str, list[dict[str, Any]]] = {}
     for (first, before), (second, after) in pairwise(zip(logs, seen, strict=True)):
@@ -59,7 +61,8 @@ def compare(
 
 
 def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What can change: parameters of the likeliest law, the bias, the size of each cause found."""
+    """What can change: parameters of the likeliest law, the bias, the coefficients of the model file's regressors, and
+    the size of each cause found."""
     found: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
         law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
@@ -74,6 +77,10 @@ def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> 
             "q95": bias["mean"] + half,
             "unit": bias["unit"],
         }
+        for regressor in identified.get("regressors", {}).values():
+            for column, estimate in regressor["coefficients"].items():
+                if math.isfinite(estimate["median"]):
+                    found[f"{column}.coefficient"] = estimate
     counted: dict[str, int] = {}
     for finding in diagnosed.get("findings", []):
         cause = str(finding["cause"])

@@ -15,11 +15,16 @@ from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.words import WORDS
 from selfcal.document import check_writable, write_json
+from selfcal.ending import Stopped, held
 from selfcal.errors import UserError, printable
 from selfcal.model import Model
 from selfcal.output import write_text
 from selfcal.recording import Scale, load
 from selfcal.verbs.identify import chosen_axes
+
+#: Why an axis has no result.
+BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
+INTERRUPTED = "interrupted before it was done"
 
 
 def diagnose(
@@ -42,23 +47,37 @@ def diagnose(
     `axes`: those reported on; every other column may explain them. `decimate`: look at block means at this rate, Hz.
     `report`: the page to write. `write_model`: where the extended model file goes. `fail_on` is only checked here.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
+
+    Under the command a signal ends it early: axes that are done are reported and written, the others have an error.
+    The caller then ends by `Held().check()`; a second signal ends at once.
     """
     if fail_on is not None and fail_on not in ("inadequate", *WORDS):
         raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
     check_writable(json, report, write_model)
     loaded = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
-    names = chosen_axes(recording, loaded, [axes] if isinstance(axes, str) else axes)
+    axes = [axes] if isinstance(axes, str) else axes
+    names = chosen_axes(recording, loaded, axes)
     record = of_recording(recording, loaded, decimate)
     judged = [name for name in names if name in record.axes]
     errors = {name: "every reading is the same" for name in names if name not in judged}
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with held() as ending, Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("diagnose", total=None)
-        found = diagnose_record(record, judged, lambda text: progress.update(task, description=text))
+
+        def advance(text: str) -> None:
+            if ending.asked:
+                raise Stopped
+            progress.update(task, description=text)
+
+        try:
+            found = diagnose_record(record, judged, advance)
+        except Stopped:
+            ending.check()
+            raise
         for name in judged:
             if name not in found:
-                errors[name] = "its noise is below the lattice of its readings: record with a finer range"
+                errors[name] = BELOW_LATTICE if record.axes[name].below_lattice else INTERRUPTED
         if not found:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
             raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
@@ -70,10 +89,32 @@ def diagnose(
     if report is not None:
         from selfcal.diagnosis.page import write_page
 
-        write_page(report, document, record, found)
+        write_page(report, document, record, found, _given(axes, model, decimate, rate, columns, units, scale))
     if json is not None:
         write_json(document, json)
     return document
+
+
+def _given(
+    axes: Sequence[str],
+    model: Path | str | None,
+    decimate: float | None,
+    rate: float | None,
+    columns: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    scale: Mapping[str, Scale] | None,
+) -> list[tuple[str, str]]:
+    """The command line's options that decide what is found, as they were given."""
+    given = [("--axis", name) for name in axes]
+    given += [] if model is None else [("--model", str(model))]
+    for option, value in (("--decimate", decimate), ("--rate", rate)):
+        given += [] if value is None else [(option, f"{value:.15g}")]
+    for option, pairs in (("--column", columns), ("--unit", units)):
+        given += [(option, f"{name}={value}") for name, value in (pairs or {}).items()]
+    for name, (size, unit) in (scale or {}).items():
+        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
+        given.append(("--scale", f"{name}={text}" if name else text))
+    return given
 
 
 def failing(document: Mapping[str, Any], wanted: str) -> bool:
@@ -95,6 +136,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         f"{recording['duration_s']:g} s\n",
         highlight=False,
         markup=False,
+        soft_wrap=True,
     )
     for name, axis in document["axes"].items():
         if "error" in axis:

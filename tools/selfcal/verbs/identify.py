@@ -93,7 +93,15 @@ def identify(
                 )
             except UserError as error:
                 found[name] = error
-    document = to_document(recording, found)
+        document = to_document(recording, found)
+        doubtful = [name for name, axis in found.items() if isinstance(axis, Identified) and not axis.adequate]
+        if doubtful:
+            from selfcal.diagnosis.suspicion import suspicions
+
+            progress.update(task, description="strongest suspicion")
+            rate_hz = loaded_model.bank_rate_hz if decimate is None else decimate
+            for name, cause in suspicions(recording, loaded_model, doubtful, rate_hz).items():
+                document["axes"][name]["suspicion"] = cause
     if json is not None:
         write_json(document, json)
     if export is not None:
