@@ -26,8 +26,8 @@ LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
     noise.outliers,
 )
 #: Those that motion must not be taken for, and what they must show to be taken first.
-STATIONARY = (periodic.looks, noise.colored)
-CERTAIN = 50.0
+STATIONARY = (periodic.looks, noise.colored, noise.variance_change)
+CERTAIN = 25.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
@@ -106,7 +106,7 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
 
 
 def _provisional(state: State, record: Record, advance: Callable[[str], None]) -> State:
-    """The state with the lines and the colour that are beyond doubt: motion is what stands out of such noise."""
+    """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
     one = Diagnosed(state, state)
     _rounds(record, one, advance, STATIONARY, CERTAIN)
     return one.state
