@@ -102,7 +102,7 @@ def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:
-    for document in ("README.md", "GUIDE.md", "CONTRIBUTING.md", "tools/README.md"):
+    for document in ("README.md", "GUIDE.md", "CONTRIBUTING.md", "tools/README.md", "tests/README.md"):
         text = (ROOT / document).read_text(encoding="utf-8")
         for link in re.findall(r"\]\(([^)#]+)", text):
             assert (ROOT / document).parent.joinpath(link).exists(), f"{document}: {link}"

@@ -49,7 +49,7 @@ EFFECTS = {
     "variance_change": ("time_s=1000,ratio=4", 1.0),
     "saturation": ("limit=0.13", 1.0),
     "missing_samples": ("missing=60", 1.0),
-    "motion": ("intervals=5,amplitude=0.8", 1.0),
+    "motion": ("intervals=5,amplitude=0.8", 10.0),
 }
 #: Hold the drift to its point: N is known to 1.4 % and K to 10 % at best, so that ±0.1 % costs 0.003 nat at most.
 POINT = 1.0e-3
@@ -221,7 +221,7 @@ def test_every_tool_takes_the_model_and_simulate_makes_the_effect_again(cause: s
     text, rate_hz = EFFECTS[cause]
     model, log = written(base_model(rate_hz), tmp_path / "base.yaml"), tmp_path / "log.npz"
     everywhere = cause in ("missing_samples", "motion")  # motion is common to several axes
-    simulate(model, log, seed=3, effects=[f"{cause}:{text}" + ("" if everywhere else ",axis=gx")])
+    simulate(model, log, seed=4, effects=[f"{cause}:{text}" + ("" if everywhere else ",axis=gx")])
     axes = ["gx", "gy", "gz"] if everywhere else ["gx"]
     found = diagnose(log, axes=axes, model=model, write_model=tmp_path / "extended.yaml")["axes"]["gx"]["findings"]
     assert found[0]["cause"] == cause
