@@ -167,10 +167,13 @@ def _rounds(
         if one.state.below_lattice:
             return
         advance(f"{one.state.axis}: round {number}")
-        looks = _looked(one, record, [cause for cause in causes if cause not in idle], least, idle)
-        if idle and (not looks or looks[0].net < least):
-            waiting, idle = list(idle), set()
-            looks = sorted([*looks, *_looked(one, record, waiting, least, set())], key=lambda look: -look.net)
+        waiting = [cause for cause in causes if cause in idle]
+        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least)
+        if waiting and (not looks or looks[0].net < least):
+            more, unworthy = _looked(one, record, waiting, least)
+            looks, idle = sorted([*looks, *more], key=lambda look: -look.net), idle | unworthy
+        else:
+            idle |= set(waiting)
         one.refused = looks
         if not looks or looks[0].net < least:
             return
@@ -189,17 +192,17 @@ def _looked(
     record: Record,
     causes: Sequence[Callable[[State, Record], list[Look]]],
     least: float,
-    idle: set[Callable[[State, Record], list[Look]]],
-) -> list[Look]:
-    """The looks of `causes`, the most worth first; causes of which none is worth `least` are added to `idle`."""
+) -> tuple[list[Look], set[Callable[[State, Record], list[Look]]]]:
+    """The looks of `causes`, the most worth first, and the causes of which none is worth `least`."""
     named = Counter(finding.look.cause for finding in one.findings)
     found: list[Look] = []
+    idle: set[Callable[[State, Record], list[Look]]] = set()
     for cause in causes:
         looks = [look for look in cause(one.state, record) if named[look.cause] < MOST.get(look.cause, ROUNDS)]
         found += looks
         if all(look.net < least for look in looks):
             idle.add(cause)
-    return sorted(found, key=lambda look: -look.net)
+    return sorted(found, key=lambda look: -look.net), idle
 
 
 def _harmonics(one: Diagnosed) -> None:
