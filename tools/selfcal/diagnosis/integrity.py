@@ -26,10 +26,11 @@ PIECE_S = 0.5
 MOTION_RATIOS = (1.25, 1.6, 2.2, 3.5, 6.0, 12.0)
 MOTION_S = (1.0, 4.0, 16.0)
 MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
-#: ln of the evidence for motion that is told. Noise exceeds it with a probability below e^-6, and it is one look.
-MOTION_LEAST = 6.0
-#: What the axes beside the strongest must show, nats: an event of one axis is none of the sensor.
-REST_LEAST = 3.0
+#: Pieces at most: they take 3 KB each.
+PIECES_MOST = 40_000
+#: ln of the evidence for motion that is told. Without motion it exceeds this with a probability below e^-5; of 120 clean
+#: records none showed 2.2.
+MOTION_LEAST = 5.0
 
 
 def missing(record: Record) -> tuple[Look, Mask] | None:
@@ -203,15 +204,10 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
         level = _robust_level(filled, block, around)
         squares.append(np.minimum(filled / level, 25.0))
     power = np.array(squares)
-    whole, bursts = _moving(power, max(1, round(PIECE_S * rate)))
+    whole, bursts = _moving(power, rate)
     if not bursts or whole < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
         return {}
     joined = _joined_bursts(bursts, round(2.0 * rate))
-    each = np.array([[_burst(power[k, a:b]) for a, b in joined] for k in range(len(names))])
-    # Beside the strongest axis of each burst; every axis gains half a nat by chance.
-    beside = each.sum(axis=0) - each.max(axis=0) - 0.5 * (len(names) - 1)
-    if beside.sum() < REST_LEAST:
-        return {}
     pad = max(1, round(0.5 * rate))
     mask = np.zeros(n, bool)
     for a, b in joined:
@@ -223,7 +219,7 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
             continue
         look = Look(
             "motion",
-            float(each[k].sum()),
+            sum(_burst(power[k, a:b]) for a, b in joined),
             whole,
             {"intervals": interval(float(len(shown)), 0.0, "1")},
             {},
@@ -233,49 +229,66 @@ def motion(record: Record) -> dict[str, tuple[Look, Mask]]:
     return found if len(found) >= 2 else {}
 
 
-def _moving(power: Array, piece: int) -> tuple[float, list[tuple[int, int]]]:
+def _moving(power: Array, rate: float) -> tuple[float, list[tuple[int, int]]]:
     """ln of the evidence that the sensor moves now and then, and when (samples). `power` [axes, n]: squared innovations
-    over the level of their axis.
+    over the level of their axis, at `rate`, Hz.
 
-    Every piece of `piece` samples rests or moves; a motion makes all axes louder by one of the ratios for as long as it
-    lasts (a hidden Markov model, forward and backward). The evidence is the mean over lengths and shares of the
-    likelihood over that of rest: noise alone exceeds e^x with a probability below e^-x.
+    In every piece all rests, one axis alone is loud (a jump, an outlier, its own noise), or the
+    sensor moves: all axes are louder by one ratio, for as long as it lasts. The evidence is the likelihood of this
+    hidden Markov model over that of the one without motion, each the mean over lengths and shares: without motion it
+    exceeds e^x with a probability below e^-x.
     """
-    count = power.shape[1] // piece
-    energy = power[:, : count * piece].reshape(len(power), count, piece).sum(axis=(0, 2))
+    axes, n = power.shape
+    piece = max(1, round(PIECE_S * rate), n // PIECES_MOST)
+    count = n // piece
+    energy = power[:, : count * piece].reshape(axes, count, piece).sum(axis=2)
     ratio = np.array(MOTION_RATIOS)
-    louder = 0.5 * energy[:, None] * (1.0 - 1.0 / ratio) - 0.5 * len(power) * piece * np.log(ratio)
-    like = np.hstack([np.ones((count, 1)), np.exp(np.minimum(louder, 600.0))])
-    begins, lasts = (grid.ravel() for grid in np.meshgrid(MOTION_BEGINS, MOTION_S))
-    ends = np.minimum(1.0, PIECE_S / lasts)
-    states = 1 + ratio.size
-    move = np.zeros((begins.size, states, states))
-    move[:, 0, 0] = 1.0 - begins
-    move[:, 0, 1:] = begins[:, None] / ratio.size
-    move[:, 1:, 0] = ends[:, None]
-    move[:, range(1, states), range(1, states)] = 1.0 - ends[:, None]
-    ahead = np.empty((count, begins.size, states))
-    ln_evidence = np.zeros(begins.size)
-    now = np.zeros((begins.size, states))
-    now[:, 0] = 1.0
-    for k in range(count):
-        now = np.einsum("cs,cst->ct", now, move) * like[k]
-        total = now.sum(axis=1, keepdims=True)
-        now /= total
-        ln_evidence += np.log(total[:, 0])
-        ahead[k] = now
-    weight = np.exp(ln_evidence - ln_evidence.max())
-    weight /= weight.sum()
-    behind = np.ones((begins.size, states))
-    moving = np.empty(count)
-    for k in range(count - 1, -1, -1):
-        both = ahead[k] * behind
-        moving[k] = 1.0 - float(weight @ (both[:, 0] / both.sum(axis=1)))
-        behind = np.einsum("cst,ct->cs", move, behind * like[k])
-        behind /= behind.max(axis=1, keepdims=True)
+    gain = 0.5 * (1.0 - 1.0 / ratio)
+    together = energy.sum(axis=0)[:, None] * gain - 0.5 * axes * piece * np.log(ratio)
+    alone = energy.T[:, :, None] * gain - 0.5 * piece * np.log(ratio)
+    like = np.exp(np.minimum(np.hstack([together, alone.reshape(count, -1)]), 600.0))
+    share = 0.5 / np.repeat([ratio.size, axes * ratio.size], [ratio.size, axes * ratio.size])
+    ln_with, moving = _forward_backward(like, share, ratio.size, piece / rate)
+    ln_without, _ = _forward_backward(like[:, ratio.size :], share[ratio.size :], 0, piece / rate)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (moving > 0.5).astype(int), [0]])))
-    bursts = [(int(a) * piece, int(b) * piece) for a, b in edges.reshape(-1, 2)]
-    return float(np.logaddexp.reduce(ln_evidence)) - math.log(begins.size), bursts
+    return ln_with - ln_without, [(int(a) * piece, int(b) * piece) for a, b in edges.reshape(-1, 2)]
+
+
+def _forward_backward(like: Array, share: Array, moved: int, piece_s: float) -> tuple[float, Array]:
+    """ln of the mean likelihood over lengths and shares, and the probability [pieces] of the first `moved` states.
+
+    `like` [pieces, states]: likelihood of each state over rest's; `share` [states] of what begins; `piece_s`, s."""
+    begins, lasts = (grid.ravel()[:, None] for grid in np.meshgrid(MOTION_BEGINS, MOTION_S))
+    ends = np.minimum(1.0, piece_s / lasts)
+    count = len(like)
+    rest, loud = np.ones((begins.size, 1)), np.zeros((begins.size, share.size))
+    ln_evidence = np.zeros(begins.size)
+    ahead = np.empty((count if moved else 0, begins.size, share.size + 1))
+    for k in range(count):
+        rest, loud = (
+            rest * (1.0 - begins * share.sum()) + ends * loud.sum(axis=1, keepdims=True),
+            (loud * (1.0 - ends) + rest * begins * share) * like[k],
+        )
+        total = rest + loud.sum(axis=1, keepdims=True)
+        rest, loud = rest / total, loud / total
+        ln_evidence += np.log(total[:, 0])
+        if moved:
+            ahead[k, :, :1], ahead[k, :, 1:] = rest, loud
+    weight = np.exp(ln_evidence - ln_evidence.max())
+    probability = np.zeros(count)
+    rest, loud = np.ones((begins.size, 1)), np.ones((begins.size, share.size))
+    for k in range(count - 1, -1, -1) if moved else ():
+        both = ahead[k] * np.hstack([rest, loud])
+        here = both[:, 1 : 1 + moved].sum(axis=1) / both.sum(axis=1)
+        probability[k] = float(weight @ here) / float(weight.sum())
+        after = loud * like[k]
+        rest, loud = (
+            rest * (1.0 - begins * share.sum()) + begins * (after @ share)[:, None],
+            after * (1.0 - ends) + rest * ends,
+        )
+        largest = np.maximum(rest, loud.max(axis=1, keepdims=True))
+        rest, loud = rest / largest, loud / largest
+    return float(np.logaddexp.reduce(ln_evidence)) - math.log(begins.size), probability
 
 
 def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:

@@ -15,7 +15,7 @@ from selfcal.diagnosis.fit import Fit, Series, best, curved, fit, moved, refit, 
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 1e-3
+P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
 FAR = 40.0
