@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from selfcal.diagnosis.fit import Series, fit, ln_likelihood
 from selfcal.diagnosis.fit import run as run_filter
 from selfcal.diagnosis.statemodel import Terms, matrices
 from selfcal.errors import UserError
-from selfcal.model import DEFAULT
+from selfcal.model import DEFAULT, Model
 from selfcal.recording import save
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose, failing
@@ -267,3 +268,50 @@ def test_a_change_of_the_sampling_clock_is_told(tmp_path: Path) -> None:
         (finding,) = axis["findings"]
         assert finding["estimate"] == {"statistic": "sampling_interval", "measured": pytest.approx(1.02, rel=1e-3)}
         assert finding["when"][0] == pytest.approx(1500.0, rel=0.02)
+
+
+INTERRUPTED = """
+import os, signal, sys, time
+from selfcal import cli
+from selfcal.verbs import diagnose as verb
+
+loop, last = verb.diagnose_record, time.monotonic()
+
+def interrupted(record, axes, advance):
+    seen = 0
+    def noted(text):
+        nonlocal seen
+        global last
+        seen += text == "gz: round 1"
+        if text == "gz: round 1" and seen == 2:  # the first is the look for motion
+            while time.monotonic() - last < 2.0:  # until the other axes are done
+                time.sleep(0.1)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.2)
+        last = time.monotonic()
+        advance(text)
+    return loop(record, axes, noted)
+
+verb.diagnose_record = interrupted
+cli.main()
+"""
+
+
+def test_ctrl_c_leaves_what_was_found(tmp_path: Path) -> None:
+    """Three axes; the signal comes in the first round of the last one, when the others are done."""
+    random = np.random.default_rng(6)
+    values = 0.1 * random.standard_normal((3, 1500))
+    values[0, 800:] += 0.5
+    axes = dict(zip(("gx", "gy", "gz"), values, strict=True))
+    save(tmp_path / "log.npz", {name: ("deg/s", row) for name, row in axes.items()}, 1.0)
+    files = ["--json", "found.json", "--report", "page.html", "--write-model", "extended.yaml"]
+    command = [sys.executable, "-c", INTERRUPTED, "diagnose", "log.npz", *files, "--fail-on", "inadequate"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 130, done
+    assert "step: The bias jumps once." in done.stdout
+    assert "gz: no result: interrupted before it was done" in done.stdout
+    found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
+    assert [finding["cause"] for finding in found["gx"]["findings"]] == ["step"]
+    assert found["gy"]["verdict"] == "adequate" and "interrupted" in found["gz"]["error"]
+    assert "Not diagnosed: " in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert Model.load(tmp_path / "extended.yaml").regressors[0].kind == "step"

@@ -28,8 +28,8 @@ MOTION_S = (1.0, 4.0, 16.0)
 MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
 #: Pieces at most: they take 3 KB each.
 PIECES_MOST = 40_000
-#: ln of the evidence for motion that is told. Without motion it exceeds this with a probability below e^-5; of 120 clean
-#: records none showed 2.2.
+#: ln of the evidence for motion that is told. Without motion it exceeds this with a probability below e^-5; of 120
+#: clean records none showed 2.2.
 MOTION_LEAST = 5.0
 
 

@@ -7,6 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from selfcal.diagnosis import integrity
@@ -14,6 +15,7 @@ from selfcal.diagnosis.causes import noise, periodic, regressors, step
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import Statistic, combined, judged
+from selfcal.ending import Stopped
 
 #: Causes that one round tries on an axis.
 LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
@@ -71,7 +73,11 @@ class Diagnosed:
 def diagnose_record(
     record: Record, axes: Sequence[str], advance: Callable[[str], None] = lambda text: None
 ) -> dict[str, Diagnosed]:
-    """Walk the loop on every axis of `axes`; the others of the record serve as side channels."""
+    """Walk the loop on every axis of `axes`; the others of the record serve as side channels.
+
+    `advance` may raise Stopped: axes whose rounds are done are then ended and given, the others are left out. Without
+    any, Stopped goes on to the caller.
+    """
     advance("fit")
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         states = dict(zip(record.axes, pool.map(lambda state: state.refit(), record.axes.values()), strict=True))
@@ -82,14 +88,24 @@ def diagnose_record(
     record = replace(record, axes=states)
     found = {name: Diagnosed(states[name], states[name]) for name in axes}
     record = _integrity(record, found, advance)
+    done: set[str] = set()
+
+    def walk(name: str) -> None:
+        with suppress(Stopped):
+            _rounds(record, found[name], advance)
+            done.add(name)
+
     # Threads: nearly all the time goes into the compiled filter and the transforms, which run side by side.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(lambda name: _rounds(record, found[name], advance), axes))
+        list(pool.map(walk, axes))
+        found = {name: one for name, one in found.items() if name in done}
+        if axes and not found:
+            raise Stopped
         _directions(record, found)
         for one in found.values():
             _harmonics(one)
         _share(found)
-        list(pool.map(lambda name: _end(found[name], advance), axes))
+        list(pool.map(lambda one: _end(one, advance), found.values()))
     return found
 
 
@@ -100,7 +116,8 @@ def _stated(state: State) -> bool:
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     """What is left over, and the statistics of the model that the loop began with."""
-    advance(f"{one.state.axis}: statistics")
+    with suppress(Stopped):
+        advance(f"{one.state.axis}: statistics")
     _unexplained(one)
     one.before = judged(one.first, seed=1) if one.findings and not one.first.below_lattice else one.after
 
