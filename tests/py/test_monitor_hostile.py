@@ -168,6 +168,8 @@ def test_no_law_is_most_probable_until_all_probabilities_came() -> None:
         assert "N ? [" not in shown(view)
     whole = AxisReport("gx", 1.0, False, values | {"random_walk_probability": 0.563})
     assert most_probable(whole) == "random_walk"
+    # one of them is no number
+    assert most_probable(AxisReport("gx", 1.0, True, values | {"random_walk_probability": math.nan})) is None
     # a model without that law sends no such item
     assert most_probable(AxisReport("gx", 1.0, True, values)) == "gauss_markov"
 

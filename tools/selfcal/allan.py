@@ -327,6 +327,7 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     """
     import allantools  # loads slowly
 
+    values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     broken = np.isnan(values)
     ends = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
     starts, stops = ends[::2], ends[1::2]

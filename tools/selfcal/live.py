@@ -235,11 +235,12 @@ def frame_counts(decoder: Decoder, source: Source) -> str:
 
 
 def most_probable(report: AxisReport) -> str | None:
-    """The law with the greatest probability; None if one that did not arrive could be greater."""
+    """The law with the greatest probability; None if one that did not arrive, or is no number, could be greater."""
     known = {law: report.values[f"{law}_probability"] for law in LAWS if f"{law}_probability" in report.values}
     if not known or not (report.complete or known.keys() >= set(PLAIN)):
         return None
-    return max(known, key=lambda law: known[law])
+    unknown = sum(math.isnan(value) for value in known.values())
+    return None if 0 < unknown < len(known) else max(known, key=lambda law: known[law])
 
 
 def _bar_cells(laws: Sequence[str], width: int) -> int:
