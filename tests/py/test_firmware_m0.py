@@ -210,21 +210,21 @@ def test_a_reset_during_a_report() -> None:
     made.usart.say(b"O\r")
     tap = Tap(made)
     while not (made.value("app.computing") and made.value("app.work.hypothesis") == 2):
-        made.run(0.1)  # Gauss-Markov takes seconds
+        made.run(0.1)  # a report that began anew would be at an earlier law of the first axis
     settings = set_up(made)
     made.sensor.reset()
     made.run(1.5)
     assert made.value("app.computing")
-    assert made.value("app.work.hypothesis") == 2
+    axis = made.value("app.stage")
+    assert (axis, made.value("app.work.hypothesis")) >= (0, 2)
     assert made.value("sensor.counters.faults") >= 1
     assert set_up(made) == settings
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
-    axis = made.value("app.stage")
     long_ago = -10_000 % 2**32  # ten seconds before the start
     made.machine.uc.mem_write(parts.place(made.elf, "app.told_ms")[0], long_ago.to_bytes(4, "little"))
     made.run(0.5)
     assert made.value("app.computing")
-    assert made.value("app.stage") == axis
+    assert made.value("app.stage") >= axis
     decoder, found = reports(messages(made))
     assert decoder.status["sensor_fault_count"] >= 1
     assert not found

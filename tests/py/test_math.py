@@ -91,6 +91,7 @@ def test_reports_stand_such_errors(tmp_path: Path) -> None:
 
     Those are 1e-3 in P, 0.02 sd in the mean (float against textbook), 3 % in sd and 0.05 nat (against a dense grid).
     All up, all down, by turns and at random; six records with and without drift, gaps and a far bias (erring.c).
+    The evidence and the parameters are those of laws whose P is above 1e-6.
     """
     accuracy = ROOT / "tests" / "accuracy"
     tables = codegen(None, tmp_path, target="cortex-m4f")
