@@ -83,7 +83,8 @@ def looks(state: State, record: Record) -> list[Look]:
             gain_exact,
             worth,
             {
-                "time_s": interval(time, spread, "s"),
+                # between the last reading before it and the first one with it
+                "time_s": interval(time - 0.5 * state.dt, spread, "s"),
                 "amplitude": interval(float(fit_with.c[-1]), float(fit_with.sd[-1]), state.unit),
             },
             {"regressors": (*state.regressors, column)},
