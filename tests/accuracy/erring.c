@@ -69,14 +69,13 @@ static void compare(const selfcal_report_t *true_one, const selfcal_report_t *ot
     for (int h = 0; h < HYPOTHESES; h++) {
         const selfcal_posterior_t *a = &true_one->hypothesis[h], *b = &other->hypothesis[h];
         worse(0, fabs((double)a->probability - (double)b->probability));
-        /* That of a law ruled out by thousands of nats is n ln N of a float N, which leans on its limit. It decides nothing. */
-        if (a->probability > 1e-6F) {
-            worse(3, fabs(a->ln_evidence - b->ln_evidence));
+        if (!(a->probability > 1e-6F)) {
+            continue; /* One that is ruled out may lean on a limit of N, so closely that what ln N is rounded by shows. */
         }
+        worse(3, fabs(a->ln_evidence - b->ln_evidence));
         for (int p = 0; p < SELFCAL_PARAMETERS; p++) {
             const selfcal_estimate_t *ours = &a->parameter[p], *theirs = &b->parameter[p];
-            /* One that is ruled out may lean on a limit of N, so closely that what ln N is rounded by shows. */
-            if (!isnan(ours->mean) && a->probability > 1e-6F) {
+            if (!isnan(ours->mean)) {
                 worse(1, fabs((double)(ours->mean - theirs->mean) / (double)ours->sd));
                 worse(2, fabs((double)theirs->sd / (double)ours->sd - 1.0));
             }

@@ -239,8 +239,9 @@ def most_probable(report: AxisReport) -> str | None:
     known = {law: report.values[f"{law}_probability"] for law in LAWS if f"{law}_probability" in report.values}
     if not known or not (report.complete or known.keys() >= set(PLAIN)):
         return None
-    unknown = sum(math.isnan(value) for value in known.values())
-    return None if 0 < unknown < len(known) else max(known, key=lambda law: known[law])
+    if len({math.isnan(probability) for probability in known.values()}) > 1:
+        return None  # all of them NaN is a report outside the priors: the view says that
+    return max(known, key=lambda law: known[law])
 
 
 def _bar_cells(laws: Sequence[str], width: int) -> int:
