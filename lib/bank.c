@@ -454,13 +454,13 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         leave_level(self, j);
         const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)now->d, e = (selfcal_wide_t)now->e;
         if (node->beta == R(0.0)) {
-            now->d = (selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q);
+            now->d = r_fmin((selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q), P_MAX);
             continue; /* the prediction x stays */
         }
         const selfcal_wide_t less = -expm1(intervals * log1p(-beta)); /* 1 - phi^count */
         const selfcal_wide_t less_sq = less * (2.0 - less);
         const selfcal_wide_t stationary = (selfcal_wide_t)node->q / (beta * (2.0 - beta));
-        now->d = (selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d));
+        now->d = r_fmin((selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d)), P_MAX);
         now->e = (selfcal_real_t)(e + less * (1.0 - (selfcal_wide_t)node->u_inf - e));
         if (self->columns != NULL) {
             self->model->regressors->code->gap(self, j, less);

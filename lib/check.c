@@ -28,9 +28,6 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
 /* No drift forgets more, see ALPHA_DT_MAX: 1 - e^-6.9. */
 #define BETA_MAX R(0.999)
 
-/* No drift's variance is greater: after the longest gap, 2^32 intervals, it is 4.3e21. */
-#define P_MAX R(1e22)
-
 /* Beneath it a float is a denormal, whose rounding is not relative. */
 #define LEAST R(1.2e-38)
 

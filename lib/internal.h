@@ -138,6 +138,9 @@ static inline const selfcal_prior_t *priors_of(const selfcal_model_t *model, con
 /* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies variances of
  * 2^32 rho^2, rho^2 and a part of r, which must remain a float. Beyond it only sigma_w is known: a node more would say nothing. */
 #define LN_RHO_MAX R(13.8)
+/* No drift's variance is greater: the longest gap makes it 4.3e21. Of several such gaps without a sample between them, the last adds
+ * less. */
+#define P_MAX R(1e22)
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
 /* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and neighbours

@@ -1144,6 +1144,10 @@ static void deposit(const spread_t *spread, selfcal_real_t middle, selfcal_real_
     }
 }
 
+/* A cell so far above the best of the search, in nats, is no likelihood: the nodes are too far apart for what lies between them. Its mass
+ * stays a float, and the report says that the grid does not bear it. */
+#define LOST R(30.0)
+
 /* What a cell adds to the sums, sigma_v integrated: its mass, the same times sigma_v^2 over that of the mode, and first and second
  * moments of N and of the drift parameter about the best cell, relative. */
 typedef struct {
@@ -1187,7 +1191,10 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     if (!(reach.from < reach.to) || !(profile - reach.drop > work->best - R(3.0) * work->depth)) { /* nor NaN */
         return sum;
     }
-    const selfcal_real_t height = r_exp(profile - work->best - reach.base) * density;
+    if (profile - reach.drop > work->best + LOST) {
+        work->off_grid = (selfcal_wide_t)INFINITY;
+    }
+    const selfcal_real_t height = r_exp(r_fmin(profile - work->best - reach.base, LOST)) * density;
     side_t side[2];
     bool whole = reach.from == work->delta_lo && reach.to == work->delta_hi;
     for (unsigned j = 0; j < sides; j++) {
@@ -1441,7 +1448,8 @@ static void finish_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t
     }
     const selfcal_real_t ln_mean = ln_first / total;
     const selfcal_real_t ln_sd = r_sqrt(r_fmax(ln_second / total - ln_mean * ln_mean, R(0.0)));
-    estimate->mean = (float)r_fma(centre, mean, centre);
+    /* No cell lies below the limit, but the mean may round there about a best cell far above. */
+    estimate->mean = (float)r_fmax(r_fma(centre, mean, centre), r_exp((selfcal_real_t)prior->ln_min));
     estimate->sd = (float)(centre * r_sqrt(variance));
     estimate->median = (float)r_exp(quantile(work, p, total, R(0.5)));
     estimate->q05 = (float)r_exp(quantile(work, p, total, R(0.05)));
