@@ -167,9 +167,9 @@ $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(
 	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(BACK)/%) -c $(TESTED:%=$(BACK)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
-$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h
+$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
 	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
-$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h
+$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
 	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))

@@ -163,21 +163,14 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
     const double dt_s = 1.0 / scene.rate_hz;
     Random random = stream(scene.seed, index, drift);
     std::vector<double> out(scene.samples, 0.0);
-    if (axis.law == Law::random_walk || axis.law == Law::moving_average || axis.law == Law::walk_and_markov) {
-        double x = 0.0;
-        std::generate(out.begin(), out.end(), [&] { return x += axis.K * std::sqrt(dt_s) * random.normal(); });
-    }
-    if (axis.law == Law::walk_and_markov) {
-        GaussMarkov x(axis.markov_ratio * axis.K * std::sqrt(axis.correlation_time_s), 1.0 / axis.correlation_time_s, dt_s, random);
-        for (double &value : out) {
-            value += x.next();
-        }
-    } else if (axis.law == Law::gauss_markov) {
-        GaussMarkov x(axis.sigma_m, axis.alpha, dt_s, random);
-        std::generate(out.begin(), out.end(), [&] { return x.next(); });
-    } else if (axis.law == Law::flicker) {
-        for (const double factor : {0.1, 1.0, 10.0}) {
-            GaussMarkov x(axis.B * std::sqrt(std::log(10.0) / pi), factor * axis.alpha, dt_s, random);
+    for (const Term &term : axis.law.terms) {
+        if (term.walk) {
+            double x = 0.0;
+            for (double &value : out) {
+                value += x += term.deviation * axis.drift * std::sqrt(dt_s) * random.normal();
+            }
+        } else {
+            GaussMarkov x(deviation(axis.law, term, axis.drift, axis.second), bandwidth(term, axis.second), dt_s, random);
             for (double &value : out) {
                 value += x.next();
             }
@@ -203,8 +196,8 @@ void add_noise_and_effects(const Scene &scene, std::size_t index, const Axis &ax
     if (axis.noise_lag1 != 0.0) {
         colour(noise, axis.noise_lag1);
     }
-    if (axis.law == Law::moving_average) {
-        average(noise, axis.spectral_ratio, std::sqrt(scene.rate_hz), scene.bank_block, stream(scene.seed, index, earlier));
+    if (axis.law.coloured_noise) {
+        average(noise, axis.second, std::sqrt(scene.rate_hz), scene.bank_block, stream(scene.seed, index, earlier));
     }
     Random outlier = stream(scene.seed, index, outliers);
     Random shake = stream(scene.seed, index, motion);

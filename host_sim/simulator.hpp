@@ -17,16 +17,11 @@
 namespace selfcal_reference {
 
 struct Axis {
-    Law law = Law::constant;
+    Law law;              // no term: the bias is constant
     double bias = 0.0;    // unit
     double N = 0.0;       // unit/sqrt(Hz)
-    double K = 0.0;       // unit/s/sqrt(Hz), random walk
-    double sigma_m = 0.0; // unit, Gauss-Markov
-    double alpha = 0.0;   // 1/s, Gauss-Markov and flicker
-    double B = 0.0;       // unit, flicker: the law of three terms, not the effect below
-    double spectral_ratio = 1.0; // moving average
-    double markov_ratio = 0.0;   // walk and Markov: sigma_m over K sqrt(correlation_time_s)
-    double correlation_time_s = 1.0;
+    double drift = 0.0;   // the law's K, unit/s/sqrt(Hz), or its sigma_m or B, unit
+    double second = 1.0;  // the law's alpha, 1/s, or its ratio
     double range = 0.0;   // unit, readings are clipped to +-range; 0: none
     double lsb = 0.0;     // unit, readings are whole multiples of it; 0: none
 

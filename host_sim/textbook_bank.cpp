@@ -2,6 +2,7 @@
 
 #include "parallel.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -11,7 +12,6 @@ namespace {
 
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr double ln_2pi = 1.8378770664093454836;
-constexpr double pi = 3.14159265358979323846;
 
 // x_i as a linear system: state' = transition state + noise of covariance `step`, `start` that of the state at the instant
 // before the first sample, `output` what of it is read, `level` what of that is drift.
@@ -19,50 +19,36 @@ struct Drift {
     Eigen::MatrixXd transition, step, start;
     Eigen::RowVectorXd output, level;
     double white;            // variance of the white noise beside it
-    double innovation = 0.0; // of the state 1, times r_i, in place of that: variance of a moving average's e_i
+    double innovation = 0.0; // variance of e_i over r_i, the last state but one, in place of that
 };
 
-Drift drift_of(const Node &node, double dt_s) {
-    const auto n = static_cast<Eigen::Index>(order(node.law));
+Drift drift_of(const Law &law, const Node &node, double dt_s) {
+    const auto n = static_cast<Eigen::Index>(order(law));
     Drift drift;
     drift.transition = Eigen::MatrixXd::Identity(n, n);
     drift.step = drift.start = Eigen::MatrixXd::Zero(n, n);
     drift.output = drift.level = Eigen::RowVectorXd::Ones(n);
     drift.white = node.sigma_v * node.sigma_v;
-    const auto random_walk = [&](Eigen::Index i, double density) { drift.step(i, i) = density * density * dt_s; }; // (23), x_0 = 0
-    const auto gauss_markov = [&](Eigen::Index i, double deviation, double alpha) { // stationary from the start
-        drift.transition(i, i) = std::exp(-alpha * dt_s);
-        drift.start(i, i) = deviation * deviation;
-        drift.step(i, i) = -deviation * deviation * std::expm1(-2.0 * alpha * dt_s);
-    };
-    double theta = 0.0;
-    switch (node.law) {
-    case Law::constant:
-        break;
-    case Law::random_walk:
-        random_walk(0, node.drift);
-        break;
-    case Law::gauss_markov:
-        gauss_markov(0, node.drift, node.alpha);
-        break;
-    case Law::flicker:
-        for (Eigen::Index i = 0; i < n; ++i) {
-            gauss_markov(i, node.drift * std::sqrt(std::log(10.0) / pi), node.alpha * std::pow(10.0, static_cast<double>(i - 1)));
+    Eigen::Index i = 0;
+    for (const Term &term : law.terms) {
+        if (term.walk) { // (23), x_0 = 0
+            const double density = term.deviation * node.drift;
+            drift.step(i, i) = density * density * dt_s;
+        } else { // stationary from the start
+            const double alpha = bandwidth(term, node.second), sigma = deviation(law, term, node.drift, node.second);
+            drift.transition(i, i) = std::exp(-alpha * dt_s);
+            drift.start(i, i) = sigma * sigma;
+            drift.step(i, i) = -sigma * sigma * std::expm1(-2.0 * alpha * dt_s);
         }
-        break;
-    case Law::moving_average:
-        random_walk(0, node.drift);
+        ++i;
+    }
+    if (law.coloured_noise) {
+        const double theta = (node.second - 1.0) / (node.second + 1.0);
         drift.transition.bottomRightCorner(2, 2) << 0.0, 0.0, 1.0, 0.0; // e_i is new, e_(i-1) was e_i
-        drift.start(1, 1) = drift.innovation = drift.white;
-        theta = (node.alpha - 1.0) / (node.alpha + 1.0);
-        drift.output << 1.0, 1.0 / (1.0 + theta), theta / (1.0 + theta);
-        drift.level << 1.0, 0.0, 0.0;
+        drift.start(i, i) = drift.innovation = drift.white;
+        drift.output.tail(2) << 1.0 / (1.0 + theta), theta / (1.0 + theta);
+        drift.level.tail(2).setZero();
         drift.white = 0.0;
-        break;
-    case Law::walk_and_markov:
-        gauss_markov(0, node.drift, node.alpha);
-        random_walk(1, node.walk);
-        break;
     }
     return drift;
 }
@@ -75,12 +61,13 @@ template <int size> class Filter {
     using Square = Eigen::Matrix<double, size, size, 0, most, most>;
 
   public:
-    Filter(const Record &record, const Node &node) : record_(record) {
-        const Drift drift = drift_of(node, record.dt_s);
+    Filter(const Record &record, const Law &law, const Node &node) : record_(record) {
+        const Drift drift = drift_of(law, node, record.dt_s);
         const Eigen::Index bias = drift.output.size();
         const Eigen::Index n = bias + 1 + static_cast<Eigen::Index>(record.regressors);
         r_ = drift.white;
         innovation_ = drift.innovation;
+        new_ = bias - 2;
         transition_ = Square::Identity(n, n);
         transition_.topLeftCorner(bias, bias) = drift.transition;
         step_ = Square::Zero(n, n);
@@ -106,7 +93,7 @@ template <int size> class Filter {
         const bool missing = std::isnan(record_.y[i]);
         const double r = record_.r == nullptr || missing ? 1.0 : record_.r[i];
         if (innovation_ > 0.0) {
-            step_(1, 1) = r * innovation_;
+            step_(new_, new_) = r * innovation_;
         }
         predict();
         if (missing) {
@@ -143,6 +130,7 @@ template <int size> class Filter {
 
     const Record &record_;
     double r_, innovation_;
+    Eigen::Index new_; // place of e_i, if there is one
     double ln_p_ = 0.0;
     Square transition_, step_, covariance_;
     Vector mean_;
@@ -150,20 +138,21 @@ template <int size> class Filter {
 };
 
 // Calls use(filter). The compiler knows the size of a small state and writes its products out; larger states are few.
-template <int size = 2, typename Use> void with_filter(const Record &record, const Node &node, const Use &use) {
-    if (order(node.law) + 1 + record.regressors == size) {
-        Filter<size> filter(record, node);
+template <int size = 2, typename Use>
+void with_filter(const Record &record, const Law &law, const Node &node, const Use &use) {
+    if (order(law) + 1 + record.regressors == size) {
+        Filter<size> filter(record, law, node);
         use(filter);
     } else if constexpr (size < 5) {
-        with_filter<size + 1>(record, node, use);
+        with_filter<size + 1>(record, law, node, use);
     } else {
-        Filter<Eigen::Dynamic> filter(record, node);
+        Filter<Eigen::Dynamic> filter(record, law, node);
         use(filter);
     }
 }
 
 // Equations (11) to (14) from the filters of one instant.
-Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_prior,
+Posterior combine(std::size_t laws, const std::vector<Node> &nodes, const std::vector<double> &ln_prior,
                   const std::vector<Filtered> &filtered) {
     Posterior out;
     double highest = -std::numeric_limits<double>::infinity();
@@ -176,14 +165,14 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
         out.weight[j] = std::exp(ln_prior[j] + filtered[j].ln_p - highest);
         sum += out.weight[j];
     }
-    out.probability.fill(0.0);
-    out.mean.fill(Eigen::Vector3d::Zero());
-    out.covariance.fill(Eigen::Matrix3d::Zero());
-    out.bias_mean.fill(0.0);
-    out.bias_var.fill(0.0);
-    const auto value = [&](std::size_t j) { return Eigen::Vector3d(nodes[j].drift, nodes[j].alpha, nodes[j].sigma_v); };
+    out.probability.assign(laws, 0.0);
+    out.mean.assign(laws, Eigen::Vector3d::Zero());
+    out.covariance.assign(laws, Eigen::Matrix3d::Zero());
+    out.bias_mean.assign(laws, 0.0);
+    out.bias_var.assign(laws, 0.0);
+    const auto value = [&](std::size_t j) { return Eigen::Vector3d(nodes[j].drift, nodes[j].second, nodes[j].sigma_v); };
     for (std::size_t j = 0; j < nodes.size(); ++j) { // (12), (13), not yet over Pr(H = h_k | Y_i)
-        const auto k = static_cast<std::size_t>(nodes[j].law);
+        const auto k = nodes[j].hypothesis;
         out.weight[j] /= sum;
         out.probability[k] += out.weight[j];
         out.mean[k] += out.weight[j] * value(j);
@@ -194,7 +183,7 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
         out.bias_mean[k] /= out.probability[k];
     }
     for (std::size_t j = 0; j < nodes.size(); ++j) { // (14), about the mean so that nothing cancels
-        const auto k = static_cast<std::size_t>(nodes[j].law);
+        const auto k = nodes[j].hypothesis;
         const double mu = out.weight[j] / out.probability[k];
         const Eigen::Vector3d error = value(j) - out.mean[k];
         const double bias_error = filtered[j].now_mean - out.bias_mean[k];
@@ -212,21 +201,21 @@ Posterior combine(const std::vector<Node> &nodes, const std::vector<double> &ln_
 
 } // namespace
 
-std::size_t order(Law law) {
-    switch (law) {
-    case Law::flicker:
-    case Law::moving_average:
-        return 3;
-    case Law::walk_and_markov:
-        return 2;
-    default:
-        return 1;
-    }
+double bandwidth(const Term &term, double second) { return term.stated ? term.bandwidth : term.bandwidth * second; }
+
+double deviation(const Law &law, const Term &term, double drift, double second) {
+    const double own = term.deviation * drift * (term.by_ratio ? second : 1.0);
+    const bool beside_walk = std::any_of(law.terms.begin(), law.terms.end(), [](const Term &other) { return other.walk; });
+    return beside_walk ? own / std::sqrt(bandwidth(term, second)) : own;
 }
 
-Filtered run_filter(const Record &record, const Node &node, double *standardized) {
+std::size_t order(const Law &law) {
+    return std::max<std::size_t>(1, law.terms.size() + (law.coloured_noise ? 2 : 0));
+}
+
+Filtered run_filter(const Record &record, const Law &law, const Node &node, double *standardized) {
     Filtered out;
-    with_filter(record, node, [&](auto &filter) {
+    with_filter(record, law, node, [&](auto &filter) {
         for (std::size_t i = 0; i < record.n; ++i) {
             const double innovation = filter.sample(i);
             if (standardized != nullptr) {
@@ -238,19 +227,19 @@ Filtered run_filter(const Record &record, const Node &node, double *standardized
     return out;
 }
 
-std::vector<Filtered> run_filters(const Record &record, const std::vector<Node> &nodes) {
+std::vector<Filtered> run_filters(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes) {
     std::vector<Filtered> out(nodes.size());
-    parallel_for(nodes.size(), [&](std::size_t j) { out[j] = run_filter(record, nodes[j]); });
+    parallel_for(nodes.size(), [&](std::size_t j) { out[j] = run_filter(record, laws[nodes[j].hypothesis], nodes[j]); });
     return out;
 }
 
-std::vector<Posterior> run_bank(const Record &record, const std::vector<Node> &nodes,
+std::vector<Posterior> run_bank(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes,
                                 const std::vector<double> &ln_prior, const std::vector<std::size_t> &after) {
     // (11) is recursive; its normalisation cancels between instants, so each filter runs through alone and the weights
     // are normalised where they are wanted.
     std::vector<std::vector<Filtered>> at(after.size(), std::vector<Filtered>(nodes.size()));
     parallel_for(nodes.size(), [&](std::size_t j) {
-        with_filter(record, nodes[j], [&](auto &filter) {
+        with_filter(record, laws[nodes[j].hypothesis], nodes[j], [&](auto &filter) {
             std::size_t i = 0;
             for (std::size_t m = 0; m < after.size(); ++m) {
                 for (; i < after[m]; ++i) {
@@ -263,7 +252,7 @@ std::vector<Posterior> run_bank(const Record &record, const std::vector<Node> &n
     std::vector<Posterior> out;
     out.reserve(at.size());
     for (const std::vector<Filtered> &filtered : at) {
-        out.push_back(combine(nodes, ln_prior, filtered));
+        out.push_back(combine(laws.size(), nodes, ln_prior, filtered));
     }
     return out;
 }

@@ -15,35 +15,48 @@
 #define EIGEN_DONT_VECTORIZE
 #include <Eigen/Core>
 
-#include <array>
 #include <cstddef>
 #include <vector>
 
 namespace selfcal_reference {
 
-// The last three are not the paper's, whose filter takes any linear law: x_i then has more than one state.
-//   flicker: three Gauss-Markov terms of one deviation, bandwidths alpha/10, alpha and 10 alpha. With the deviation
-//     B sqrt(ln 10 / pi) their two-sided spectrum is B^2 / (2 pi f) within 12 % for f from alpha/10 to 10 alpha over 2 pi,
-//     2.3 % above it in the middle; the Allan deviation of such noise is 0.664 B (sqrt(2 ln 2 / pi)).
-//   moving_average: x_i as under random_walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, r_i sigma_v^2) (r = 1
-//     where a sample is missing). Stated by (1 + theta) / (1 - theta), the spectrum's amplitude at 0 Hz over that at 1/(2 dt).
-//   walk_and_markov: the sum of the laws 1 and 2.
-enum class Law { constant = 0, random_walk = 1, gauss_markov = 2, flicker = 3, moving_average = 4, walk_and_markov = 5 };
-constexpr std::size_t laws = 6;
-constexpr std::size_t order_max = 3; // states of x_i
+// The law of x_i: a sum of terms, each a random walk or a Gauss-Markov process, with the drift parameter d (K, sigma_m
+// or B) of the node. The paper's laws have one term or none; its filter takes any linear law.
+//   walk:   x_i = x_(i-1) + deviation d sqrt(dt) w_i
+//   markov: deviation d is its standard deviation, and `bandwidth` times the node's alpha (if stated: 1/s) its bandwidth.
+//           Beside a walk, where d is a K, its standard deviation is deviation d / sqrt(bandwidth).
+//   by_ratio: the node's second parameter multiplies the deviation.
+// Coloured noise: instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, r_i sigma_v^2) (r = 1 where a sample is
+// missing), stated by the second parameter (1 + theta) / (1 - theta), the spectrum's amplitude at 0 Hz over that at 1/(2 dt).
+struct Term {
+    bool walk = true;
+    double deviation = 1.0;
+    double bandwidth = 1.0;
+    bool stated = false;
+    bool by_ratio = false;
+};
+struct Law {
+    std::vector<Term> terms;
+    bool coloured_noise = false;
+};
+constexpr std::size_t terms_max = 3;
+constexpr std::size_t order_max = 5; // states of x_i: its terms, and e_i, e_(i-1) of coloured noise
 constexpr std::size_t regressors_max = 6;
+
+// Of a term at one value of the law's parameters: bandwidth, 1/s, and standard deviation of a Gauss-Markov process.
+double bandwidth(const Term &term, double second);
+double deviation(const Law &law, const Term &term, double drift, double second);
 
 // One value theta^kj of the parameters of hypothesis k.
 struct Node {
-    Law law;
-    double drift;   // random walk and moving average: K, unit/s/sqrt(Hz); Gauss-Markov: sigma_m, unit; flicker: B, unit
-    double alpha;   // Gauss-Markov and flicker, 1/s; moving average: the ratio of amplitudes
-    double sigma_v; // unit, per sample
-    double walk = 0.0; // K beside Gauss-Markov, unit/s/sqrt(Hz)
+    std::size_t hypothesis; // k, an index into the laws
+    double drift;           // K, unit/s/sqrt(Hz), if the law has a walk; else sigma_m or B, unit
+    double second;          // alpha, 1/s, or the ratio
+    double sigma_v;         // unit, per sample
 };
 
-// States of x_i: 1 but for flicker (3), moving average (3: the walk, e_i, e_(i-1)) and walk and Markov (2).
-std::size_t order(Law law);
+// States of x_i: at least one.
+std::size_t order(const Law &law);
 
 // One axis of a recording. A sample that is NaN is missing: the filter predicts over it.
 struct Record {
@@ -67,23 +80,23 @@ struct Filtered {
 };
 
 // One filter over the whole record. If `standardized` is not null it receives nu_i / sqrt(s_i) [n], NaN where missing.
-Filtered run_filter(const Record &record, const Node &node, double *standardized = nullptr);
+Filtered run_filter(const Record &record, const Law &law, const Node &node, double *standardized = nullptr);
 
 // run_filter() for every node, spread over the machine's cores.
-std::vector<Filtered> run_filters(const Record &record, const std::vector<Node> &nodes);
+std::vector<Filtered> run_filters(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes);
 
 // Posterior of the whole bank after one sample. A hypothesis of probability 0 has NaN moments.
 struct Posterior {
     std::vector<double> weight;                   // [nodes], sum 1: mu_i^kj Pr(H = h_k | Y_i)          (11), (13)
-    std::array<double, laws> probability;         //                                                     (13)
-    std::array<Eigen::Vector3d, laws> mean;       // of (drift, alpha, sigma_v) under each hypothesis    (12)
-    std::array<Eigen::Matrix3d, laws> covariance; //                                                     (14)
-    std::array<double, laws> bias_mean, bias_var; // of x0 + x_i + c' z_i under each hypothesis          (12), (14)
+    std::vector<double> probability;              //                                                     (13)
+    std::vector<Eigen::Vector3d> mean;            // of (drift, second, sigma_v) under each hypothesis   (12)
+    std::vector<Eigen::Matrix3d> covariance;      //                                                     (14)
+    std::vector<double> bias_mean, bias_var;      // of x0 + x_i + c' z_i under each hypothesis          (12), (14)
 };
 
 // The bank at chosen samples. `ln_prior` [nodes] is ln(mu_0^kj Pr(H = h_k)) up to one constant; `after` [m] ascending,
 // each the number of samples seen, 0 to n.
-std::vector<Posterior> run_bank(const Record &record, const std::vector<Node> &nodes,
+std::vector<Posterior> run_bank(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes,
                                 const std::vector<double> &ln_prior, const std::vector<std::size_t> &after);
 
 } // namespace selfcal_reference

@@ -33,6 +33,10 @@
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
+/* Of a term's deviation and bandwidth. */
+#define FACTOR_MIN 1e-3F
+#define FACTOR_MAX 1e3F
+
 /* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
 #define LN_RATIO_MAX 6.91F
 
@@ -72,6 +76,37 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     return place;
 }
 
+static bool valid_term(const selfcal_term_t *term, float dt_s) {
+    const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
+    const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
+    const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
+    const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
+    return (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor))) && term->deviation >= FACTOR_MIN &&
+           term->deviation <= FACTOR_MAX;
+}
+
+/* A law that the bank has filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
+static bool valid_law(const selfcal_law_t *law, float dt_s) {
+    if (law->terms > SELFCAL_LAW_TERMS || !is_bool(&law->coloured_noise)) {
+        return false;
+    }
+    unsigned by_ratio = 0;
+    for (uint8_t a = 0; a < law->terms; a++) {
+        const selfcal_term_t *term = &law->term[a];
+        if (!is_bool(&term->stated) || !is_bool(&term->by_ratio) || !valid_term(term, dt_s)) {
+            return false;
+        }
+        by_ratio += term->by_ratio ? 1U : 0U;
+    }
+    const bool states_fit = (uint8_t)(law->terms + (law->coloured_noise ? 1U : 0U)) <= SELFCAL_TERMS_MAX;
+    return states_fit && (is_plain(law) || is_sum(law)) && !(has_ratio(law) && has_alpha(law)) &&
+           (by_ratio == 0U || by_ratio < law->terms) && !(law->coloured_noise && (by_ratio > 0U || law->terms == 0U));
+}
+
+bool selfcal_law_is_sum(const selfcal_law_t *law) {
+    return !is_plain(law);
+}
+
 static bool valid_model(const selfcal_model_t *model) {
     if ((model->forgetting != NULL &&
          (model->forgetting->code == NULL || !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
@@ -88,26 +123,19 @@ static bool valid_model(const selfcal_model_t *model) {
     uint32_t nodes = 0;
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
-        const bool rho = hypothesis->law != SELFCAL_CONSTANT;
-        const bool alpha = has_alpha(hypothesis->law);
-#if SELFCAL_TERMS_MAX > 1
-        if (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes)) {
+        if (hypothesis->law == NULL || !valid_law(hypothesis->law, model->dt_s) ||
+            (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes))) {
             return false;
         }
-        if (hypothesis->law == SELFCAL_WALK_AND_MARKOV &&
-            (!((selfcal_wide_t)hypothesis->correlation_time_s * ALPHA_DT_MAX >= (selfcal_wide_t)model->dt_s) ||
-             !(hypothesis->correlation_time_s <= TIME_MAX * model->dt_s))) {
-            return false;
-        }
-        for (uint8_t a = 0; has_ratio(hypothesis->law) && a < model->axes; a++) {
-            const selfcal_prior_t *ratio = &priors_of(model, hypothesis, a)[SELFCAL_ALPHA];
-            if (ratio->ln_min < -LN_RATIO_MAX || ratio->ln_max > LN_RATIO_MAX) {
+        const bool rho = has_drift(hypothesis->law), ratio = has_ratio(hypothesis->law);
+        const bool alpha = ratio || has_alpha(hypothesis->law);
+        for (uint8_t a = 0; ratio && a < model->axes; a++) {
+            const selfcal_prior_t *prior = &priors_of(model, hypothesis, a)[SELFCAL_RATIO];
+            if (prior->ln_min < -LN_RATIO_MAX || prior->ln_max > LN_RATIO_MAX) {
                 return false;
             }
         }
-#endif
-        if ((unsigned)hypothesis->law >= (SELFCAL_TERMS_MAX > 1 ? SELFCAL_LAWS : SELFCAL_FLICKER) ||
-            rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) ||
+        if (rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) ||
             (rho && !valid_grid(hypothesis->rho, SELFCAL_GRID_MAX)) || (alpha && !valid_grid(hypothesis->alpha, SELFCAL_ALPHA_MAX)) ||
             hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
             return false;
@@ -121,7 +149,7 @@ static bool valid_model(const selfcal_model_t *model) {
 /* A node at the instant of its first sample. */
 static void init_node(selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
-    const selfcal_law_t law = self->model->hypothesis[place.hypothesis].law;
+    const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
     selfcal_node_t *node = &self->node[index];
 #if SELFCAL_TERMS_MAX > 1
     if (is_sum(law)) {
@@ -130,18 +158,18 @@ static void init_node(selfcal_t *self, uint16_t index) {
         return;
     }
 #endif
-    const selfcal_wide_t variance = law != SELFCAL_CONSTANT ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
+    const selfcal_wide_t variance = has_drift(law) ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
     selfcal_wide_t beta = 0.0;
-    if (law == SELFCAL_GAUSS_MARKOV) {
+    if (has_decay(law)) {
         beta = -expm1(-fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, ALPHA_DT_MAX));
     }
     const selfcal_wide_t one_less_phi_sq = beta * (2.0 - beta);
     selfcal_wide_t q = 0.0;       /* drift variance per interval */
     selfcal_wide_t p_first = 0.0; /* predicted drift variance at the first sample */
-    if (law == SELFCAL_RANDOM_WALK) {
+    if (has_walk(law)) {
         q = variance;
         p_first = q; /* x_0 = 0 */
-    } else if (law == SELFCAL_GAUSS_MARKOV) {
+    } else if (has_decay(law)) {
         p_first = variance; /* stationary */
         q = p_first * one_less_phi_sq;
     }
@@ -237,9 +265,9 @@ static void place_nodes(selfcal_t *self) {
              * report takes no expectation, must be level there. */
             const selfcal_real_t above = is_sum(hypothesis->law) ? R(3.0) : markov ? R(1.25) : R(0.5);
             ln_range_t ln_sigma = sigma[axis];
-            if (is_sum(hypothesis->law) && hypothesis->law == SELFCAL_MOVING_AVERAGE) {
-                ln_sigma.hi -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_max);
-                ln_sigma.lo -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_SPECTRAL_RATIO].ln_min);
+            if (hypothesis->law->coloured_noise) {
+                ln_sigma.hi -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_RATIO].ln_max);
+                ln_sigma.lo -= ln_difference_gain((selfcal_real_t)prior[SELFCAL_RATIO].ln_min);
             }
             rho_lo = r_fmin(rho_lo, (selfcal_real_t)drift->ln_min + shift - ln_sigma.hi - R(0.5));
             rho_hi = r_fmax(rho_hi, (selfcal_real_t)drift->ln_max + shift - ln_sigma.lo + above);
@@ -651,7 +679,7 @@ void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_
 void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_node_t *node = &self->node[index];
-    view->law = self->model->hypothesis[place.hypothesis].law;
+    view->hypothesis = place.hypothesis;
     view->ln_rho = (selfcal_wide_t)place.ln_rho;
     view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
 #if SELFCAL_TERMS_MAX > 1

@@ -5,23 +5,25 @@ typedef struct {
     selfcal_real_t mean, var;
 } moments_t;
 
-static moments_t predict_law(selfcal_law_t law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
+static moments_t predict_law(const selfcal_law_t *law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
     moments_t now = {(selfcal_real_t)posterior->bias_mean, (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
-    if (has_walk(law)) {
-        const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
-        const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
-        now.var = r_fma(r_fma(mean, mean, sd * sd), elapsed_s, now.var);
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (law->term[a].kind == SELFCAL_WALK) {
+            const selfcal_real_t deviation = (selfcal_real_t)law->term[a].deviation, rate = deviation * deviation * elapsed_s;
+            const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
+            const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
+            now.var = r_fma(r_fma(mean, mean, sd * sd), rate, now.var);
+        }
     }
     if (has_decay(law)) {
         selfcal_real_t fall = R(0.0), growth = R(0.0);
         for (unsigned j = 0; j < SELFCAL_ALPHA_MAX; j++) {
             const selfcal_decay_t *decay = &posterior->decay[j];
             selfcal_real_t psi[SELFCAL_TERMS_MAX];
-            for (unsigned a = 0; a < SELFCAL_TERMS_MAX; a++) { /* of terms that a law has not, all else is 0 */
-                static const selfcal_real_t flicker[] = {R(0.1), R(1.0), R(10.0)}, walk_and_markov[] = {R(0.0), R(1.0), R(0.0)};
-                const selfcal_real_t *faster = law == SELFCAL_FLICKER ? flicker : walk_and_markov;
-                const selfcal_real_t alpha = (selfcal_real_t)decay->alpha * (is_sum(law) ? faster[a] : R(1.0));
-                psi[a] = -r_expm1(-alpha * elapsed_s);
+            for (unsigned a = 0; a < terms_of(law); a++) {
+                const selfcal_term_t *term = &law->term[a]; /* a walk's bandwidth is 0 */
+                const selfcal_real_t alpha = term->stated ? R(1.0) : (selfcal_real_t)decay->alpha;
+                psi[a] = -r_expm1(-(selfcal_real_t)term->bandwidth * alpha * elapsed_s);
                 fall = r_fma(psi[a], (selfcal_real_t)decay->mean[a], fall);
                 selfcal_real_t with = (selfcal_real_t)decay->var[a];
                 for (unsigned b = 0; b <= a; b++) {

@@ -94,43 +94,91 @@ static inline size_t term_pair(size_t a, size_t b) {
     return a * (a + 1U) / 2U + b;
 }
 
-/* What the laws have. */
-static inline bool is_sum(selfcal_law_t law) {
-    return SELFCAL_TERMS_MAX > 1 && law >= SELFCAL_FLICKER;
+/* What a law has. */
+static inline bool has_walk(const selfcal_law_t *law) {
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (law->term[a].kind == SELFCAL_WALK) {
+            return true;
+        }
+    }
+    return false;
 }
 
-/* The second grid dimension of these is a ratio within 1e-3 to 1e3, no bandwidth. */
-static inline bool has_ratio(selfcal_law_t law) {
-    return is_sum(law) && law >= SELFCAL_MOVING_AVERAGE;
+/* Its terms; a law with more than this build has room for is refused. */
+static inline size_t terms_of(const selfcal_law_t *law) {
+    return law->terms < SELFCAL_TERMS_MAX ? law->terms : SELFCAL_TERMS_MAX;
 }
 
-/* A deviation goes with rho, sigma_m or B; else K, if anything. */
-static inline bool has_deviation(selfcal_law_t law) {
-    return law == SELFCAL_GAUSS_MARKOV || (is_sum(law) && law == SELFCAL_FLICKER);
+static inline bool has_drift(const selfcal_law_t *law) {
+    return law->terms > 0U;
 }
 
-static inline bool has_walk(selfcal_law_t law) {
-    return law == SELFCAL_RANDOM_WALK || has_ratio(law);
+/* The drift parameter is sigma_m; else K, if the law has a drift. */
+static inline bool has_deviation(const selfcal_law_t *law) {
+    return has_drift(law) && !has_walk(law);
 }
 
-/* Terms of the drift decay. */
-static inline bool has_decay(selfcal_law_t law) {
-    return has_deviation(law) || (is_sum(law) && law == SELFCAL_WALK_AND_MARKOV);
+static inline bool has_decay(const selfcal_law_t *law) {
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (law->term[a].kind == SELFCAL_MARKOV) {
+            return true;
+        }
+    }
+    return false;
 }
 
-static inline bool has_alpha(selfcal_law_t law) {
-    return law == SELFCAL_GAUSS_MARKOV || is_sum(law);
+static inline bool has_alpha(const selfcal_law_t *law) {
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (law->term[a].kind == SELFCAL_MARKOV && !law->term[a].stated) {
+            return true;
+        }
+    }
+    return false;
+}
+
+static inline bool has_ratio(const selfcal_law_t *law) {
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (law->term[a].by_ratio) {
+            return true;
+        }
+    }
+    return law->coloured_noise;
+}
+
+/* One plain term, or none: the filters of bank.c. All others are sums (terms.c). */
+static inline bool is_plain(const selfcal_law_t *law) {
+    const selfcal_term_t *term = &law->term[0];
+    return !law->coloured_noise && (law->terms == 0U || (law->terms == 1U && term->deviation == 1.0F && !term->by_ratio &&
+                                                          (term->kind == SELFCAL_WALK || (term->bandwidth == 1.0F && !term->stated))));
+}
+
+static inline bool is_sum(const selfcal_law_t *law) {
+    return SELFCAL_TERMS_MAX > 1 && !is_plain(law);
+}
+
+/* A plain Gauss-Markov drift, a pole of its own at each alpha. */
+static inline bool is_markov(const selfcal_law_t *law) {
+    return is_plain(law) && has_decay(law);
+}
+
+/* Of a term, 1/s, at an alpha; 0 of a walk, which does not decay. */
+static inline selfcal_wide_t bandwidth_of(const selfcal_term_t *term, selfcal_wide_t alpha) {
+    return term->kind == SELFCAL_WALK ? 0.0 : (selfcal_wide_t)term->bandwidth * (term->stated ? 1.0 : alpha);
+}
+
+/* Stationary variance of a Gauss-Markov term over sigma_v^2, at a node of rho^2 = `square` and of the law's second parameter. */
+static inline selfcal_wide_t markov_variance(const selfcal_law_t *law, const selfcal_term_t *term, selfcal_wide_t square,
+                                             selfcal_wide_t second, selfcal_wide_t dt_s) {
+    const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation * (term->by_ratio ? second : 1.0);
+    const selfcal_wide_t variance = deviation * deviation * square;
+    return has_walk(law) ? variance / (bandwidth_of(term, second) * dt_s) : variance; /* rho^2 = K^2 dt / sigma_v^2 */
 }
 
 /* Priors of an axis under a hypothesis. */
 static inline const selfcal_prior_t *priors_of(const selfcal_model_t *model, const selfcal_hypothesis_t *hypothesis, uint8_t axis) {
-#if SELFCAL_TERMS_MAX > 1
     if (hypothesis->prior != NULL) {
         return &hypothesis->prior[(size_t)axis * SELFCAL_PARAMETERS];
     }
-#else
-    (void)hypothesis;
-#endif
     return model->axis[axis].prior;
 }
 
@@ -268,7 +316,6 @@ struct selfcal_regressors_code {
 };
 
 #if SELFCAL_TERMS_MAX > 1
-#define SELFCAL_FLICKER_TERM 0.7329355988794278 /* ln(10)/pi: variance of one of its terms over B^2 */
 /* terms.c, for the nodes of sums: what bank.c does for the others. */
 struct span; /* kernel.h */
 size_t selfcal_terms_nodes(const selfcal_model_t *model);

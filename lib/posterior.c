@@ -66,7 +66,7 @@ static const selfcal_prior_t *prior_of(const selfcal_work_t *work) {
 }
 
 /* The drift parameter that goes with rho. */
-static selfcal_parameter_t drift_parameter(selfcal_law_t law) {
+static selfcal_parameter_t drift_parameter(const selfcal_law_t *law) {
     return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
 }
 
@@ -163,11 +163,11 @@ static void transform_line(const selfcal_grid_t *grid, bool transposed, const se
 
 /* 1 - phi of the drift at an alpha; 0 of a random walk. */
 static selfcal_real_t beta_at(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    const bool pole = is_markov(hypothesis_of(work)->law);
     return pole ? -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s) : R(0.0);
 }
 static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    const bool pole = is_markov(hypothesis_of(work)->law);
     return pole ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
@@ -202,10 +202,11 @@ static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *
 /* `beta`: beta_at() the alpha. */
 static void expectation(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta, expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
-    e->profile = e->ln_sigma = e->ln_v = 0.0;
     if (!has_expectation(work)) {
+        memset(e, 0, sizeof *e);
         return;
     }
+    e->profile = e->ln_sigma = e->ln_v = 0.0;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
     expected_t real;
@@ -575,7 +576,7 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
-    const bool pole = hypothesis_of(work)->law == SELFCAL_GAUSS_MARKOV;
+    const bool pole = is_markov(hypothesis_of(work)->law);
     const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - work->truth.ln_noise));
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
@@ -804,9 +805,9 @@ static void cell_parameters(const selfcal_work_t *work, const cell_t *cell, self
     ln_value[SELFCAL_SIGMA_M] = ln_value[SELFCAL_K];
 }
 
-static bool has_parameter(selfcal_law_t law, unsigned parameter) {
+static bool has_parameter(const selfcal_law_t *law, unsigned parameter) {
     return parameter == SELFCAL_N || (parameter == SELFCAL_K && has_walk(law)) ||
-           (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && has_alpha(law));
+           (parameter == SELFCAL_SIGMA_M && has_deviation(law)) || (parameter == SELFCAL_ALPHA && (has_alpha(law) || has_ratio(law)));
 }
 
 /* What counts of sigma_v in a cell: the part of [delta_lo, delta_hi] about the height's peak that the limits leave, and how far from the
@@ -1491,6 +1492,46 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
 }
 #endif
 
+/* As a term decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
+ * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) stationary, times sigma_v^2. `off`: the node's mean
+ * less bias_about. */
+static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_view_t *v, const selfcal_now_t *now, selfcal_wide_t own,
+                         selfcal_wide_t off) {
+    const selfcal_law_t *law = hypothesis_of(work)->law;
+    const size_t terms = terms_of(law);
+    const selfcal_wide_t square = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v->ln_rho);
+    selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
+    selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
+#if SELFCAL_TERMS_MAX > 1
+    const selfcal_wide_t second = exp(v->ln_alpha), dt_s = (selfcal_wide_t)work->bank->model->dt_s;
+    if (is_sum(law)) {
+        selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
+    }
+#endif
+    for (size_t a = 0; a < terms; a++) {
+        selfcal_wide_t stationary = square;
+#if SELFCAL_TERMS_MAX > 1
+        if (is_sum(law)) { /* a walk does not decay: its psi is 0 */
+            const selfcal_term_t *term = &law->term[a];
+            stationary = term->kind == SELFCAL_WALK ? 0.0 : markov_variance(law, term, square, second, dt_s);
+        }
+#endif
+        const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now->drift[a];
+        selfcal_wide_t with_all = 0.0;
+        for (size_t b = 0; b < terms; b++) {
+            const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
+            with_all += spread[pair];
+            if (b <= a) {
+                decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
+                    own * (spread[pair] + now->own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
+                    weighed_fall * now->drift[b];
+            }
+        }
+        decay[a] += weighed_fall;
+        decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now->own[1 + a]) - weighed_fall * off);
+    }
+}
+
 /* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means, and their own variance.
  * That goes with sigma_v^2, and so does how far the bias prior pulls, by a node's conditional mode: where the drift may hide the white
  * noise one sigma_v for all nodes would be off by decades, and rho^2 alone change too much from node to node. */
@@ -1521,7 +1562,7 @@ static void step_bias(selfcal_work_t *work) {
         now.own[1] = v->bias_left * lost * variance;
         now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
 #if SELFCAL_TERMS_MAX > 1
-        if (is_sum(v->law)) {
+        if (is_sum(hypothesis_of(work)->law)) {
             now_terms(work, k, x0, variance, v->bias_left, &now);
         }
 #endif
@@ -1534,37 +1575,8 @@ static void step_bias(selfcal_work_t *work) {
     work->bias_first += weighed;
     work->bias_second += weighed * off;
     work->bias_own += own * (v->drift_var + now.own[0]);
-    if (has_decay(v->law)) {
-        /* As the drift decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
-         * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) rho^2, times sigma_v^2. */
-        selfcal_wide_t *decay = work->bias_decay[k % grid_nodes(hypothesis_of(work)->alpha)];
-        selfcal_wide_t stationary = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v->ln_rho);
-        selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
-        size_t terms = 1;
-#if SELFCAL_TERMS_MAX > 1
-        if (is_sum(v->law)) {
-            terms = SELFCAL_TERMS_MAX;
-            stationary *= v->law == SELFCAL_FLICKER ? SELFCAL_FLICKER_TERM
-                                                   : exp(2.0 * v->ln_alpha) * (selfcal_wide_t)hypothesis_of(work)->correlation_time_s /
-                                                         (selfcal_wide_t)work->bank->model->dt_s; /* of the term that decays */
-            selfcal_terms_spread(work->bank, (size_t)work->first_node + k, spread);
-        }
-#endif
-        for (size_t a = 0; a < terms; a++) {
-            const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now.drift[a];
-            selfcal_wide_t with_all = 0.0;
-            for (size_t b = 0; b < terms; b++) {
-                const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
-                with_all += spread[pair];
-                if (b <= a) {
-                    decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
-                        own * (spread[pair] + now.own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
-                        weighed_fall * now.drift[b];
-                }
-            }
-            decay[a] += weighed_fall;
-            decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now.own[1 + a]) - weighed_fall * off);
-        }
+    if (has_decay(hypothesis_of(work)->law)) {
+        gather_decay(work, k, v, &now, own, off);
     }
 }
 
@@ -1574,14 +1586,11 @@ static void finish_bias(const selfcal_work_t *work, selfcal_posterior_t *posteri
     const selfcal_wide_t own = work->bias_own / work->mass;
     posterior->bias_mean = (float)(work->bias_about + mean + selfcal_offset(work->bank, work->axis));
     posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
-    for (uint16_t j = 0; hypothesis_of(work)->alpha != NULL && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
+    for (uint16_t j = 0; has_decay(hypothesis_of(work)->law) && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
         const selfcal_wide_t *decay = work->bias_decay[j];
-        posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
-#if SELFCAL_TERMS_MAX > 1
-        if (hypothesis_of(work)->law == SELFCAL_WALK_AND_MARKOV) {
-            posterior->decay[j].alpha = 1.0F / hypothesis_of(work)->correlation_time_s;
+        if (hypothesis_of(work)->alpha != NULL) {
+            posterior->decay[j].alpha = (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
         }
-#endif
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             posterior->decay[j].mean[a] = (float)(decay[a] / work->bias_weight);
             posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias_weight);

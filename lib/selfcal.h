@@ -5,7 +5,7 @@
  *   resting sensor. By Bayes' rule it gives the probability of each drift law, the noise parameters with intervals, and
  *   the bias with its uncertainty. One axis reads, at bank interval i,
  *       y_i = x0 + x_i + v_i,   x0 ~ N(0, P0),   v_i ~ N(0, sigma_v^2),
- *   with the drift x_i of one of the laws in selfcal_law_t. Source of the method: Stepanov & Motorin, IFAC-PapersOnLine
+ *   with the drift x_i of a law (selfcal_law_t). Source of the method: Stepanov & Motorin, IFAC-PapersOnLine
  *   50-1 (2017) 2830-2835; equation numbers in this library are theirs.
  *
  * HOW TO INTEGRATE
@@ -172,8 +172,8 @@ extern "C" {
 #error "SELFCAL_REGRESSORS_MAX must be 1 to 6"
 #endif
 
-/* Drift terms, or states, of one law at most: 1 for the paper's laws, 3 for those that are sums as well (selfcal_law_t from
- * SELFCAL_FLICKER on; to be set for the application too). With 1 their code is compiled out, and their models are refused. */
+/* States of one law at most: 1 for the paper's laws, 3 for sums of terms and coloured noise (see selfcal_law_t).
+ * To be set for the application too. With 1 the code of sums is compiled out, and models with them are refused. */
 #ifndef SELFCAL_TERMS_MAX
 #define SELFCAL_TERMS_MAX 1
 #endif
@@ -232,29 +232,43 @@ typedef double selfcal_wide_t;
 /* ------------------------------------------------------------------------------------------------------------ model
  * All tables are const and made by `selfcal codegen` or by the Python tools from the same YAML file. */
 
-typedef enum {
-    SELFCAL_CONSTANT = 0,     /* x_i = 0 */
-    SELFCAL_RANDOM_WALK = 1,  /* x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                            (23) */
-    SELFCAL_GAUSS_MARKOV = 2, /* x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-alpha dt) */
-    /* Sums, with SELFCAL_TERMS_MAX of 3. */
-    SELFCAL_FLICKER = 3, /* three Gauss-Markov terms of deviation B sqrt(ln(10)/pi), bandwidths alpha/10, alpha, 10 alpha: a two-sided
-                            spectrum of B^2 / (2 pi f) within 12 % where 2 pi f is between the outer ones */
-    SELFCAL_MOVING_AVERAGE = 4, /* random walk, and instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, sigma_v^2): N is
-                                   the density at low frequency; spectral_ratio = (1 + theta) / (1 - theta), prior within 1e-3 to 1e3 */
-    SELFCAL_WALK_AND_MARKOV = 5, /* random walk, and a Gauss-Markov drift beside it, whose correlation time 1/alpha the hypothesis states
-                                    and whose sigma_m is markov_ratio K / sqrt(alpha), prior within 1e-3 to 1e3 */
-    SELFCAL_LAWS = 6
+/* A law is data: the terms of its drift, and the kind of its white noise.
+ *   SELFCAL_WALK:   x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                                             (23)
+ *   SELFCAL_MARKOV: x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-bandwidth dt), stationary
+ * A law has at most three parameters: N, the drift parameter, and a second one.
+ * The drift parameter is K if a term is a walk, else sigma_m (B for flicker).
+ * The second one is alpha, which scales the bandwidths that are not stated, or a ratio. No law has both. */
+typedef enum { SELFCAL_WALK = 0, SELFCAL_MARKOV = 1 } selfcal_term_kind_t;
+
+typedef struct {
+    selfcal_term_kind_t kind;
+    float deviation; /* times the drift parameter: this term's K or sigma_m; 1e-3 to 1e3.
+                        Beside a walk, a Gauss-Markov term has sigma_m = deviation K / sqrt(bandwidth). */
+    float bandwidth; /* of a Gauss-Markov term: times alpha, 1e-3 to 1e3; if stated, 1/s. 0 of a walk */
+    bool stated;     /* the model states the bandwidth: 1e-6 to 6.9 over dt_s */
+    bool by_ratio;   /* the law's ratio multiplies the deviation */
+} selfcal_term_t;
+
+/* Laws of one plain term or none take the fast filters. Others need SELFCAL_TERMS_MAX of 3, see selfcal_law_is_sum().
+ * Coloured: instead of v_i, (e_i + theta e_(i-1)) / (1 + theta) with e_i ~ N(0, sigma_v^2). N is then the density at low
+ * frequency, and the law's ratio is (1 + theta) / (1 - theta), prior within 1e-3 to 1e3. */
+#define SELFCAL_LAW_TERMS 3
+typedef struct {
+    uint8_t terms;       /* those used; with coloured noise 1 or 2 */
+    bool coloured_noise;
+    selfcal_term_t term[SELFCAL_LAW_TERMS];
 } selfcal_law_t;
 
-/* Two share a place where no law has both. */
+/* Whether the law needs the filters for several states: SELFCAL_TERMS_MAX of 3, and SELFCAL_TERMS_SIZE for its nodes. */
+bool selfcal_law_is_sum(const selfcal_law_t *law);
+
+/* Places of parameters. A law has K or sigma_m, and alpha or a ratio. */
 typedef enum {
     SELFCAL_N = 0,
     SELFCAL_K = 1,
-    SELFCAL_SIGMA_M = 2,
-    SELFCAL_B = 2,
+    SELFCAL_SIGMA_M = 2, /* flicker's B as well */
     SELFCAL_ALPHA = 3,
-    SELFCAL_SPECTRAL_RATIO = 3,
-    SELFCAL_MARKOV_RATIO = 3,
+    SELFCAL_RATIO = 3,
     SELFCAL_PARAMETERS = 4
 } selfcal_parameter_t;
 
@@ -284,14 +298,11 @@ typedef struct {
  * looks at the sums sooner (a report, a node's) places them by what is there, for good: with fewer than 8 bank samples often not where
  * later ones need them. Where the nodes lie decides how well the likelihood is interpolated, not the prior. */
 typedef struct {
-    selfcal_law_t law;
+    const selfcal_law_t *law;    /* one law may stand in several hypotheses, with other priors */
     float ln_probability;        /* prior */
-    const selfcal_grid_t *rho;   /* NULL for SELFCAL_CONSTANT */
-    const selfcal_grid_t *alpha; /* NULL but for SELFCAL_GAUSS_MARKOV and the sums; of a ratio where the law has one */
-#if SELFCAL_TERMS_MAX > 1
+    const selfcal_grid_t *rho;   /* NULL for a law without terms */
+    const selfcal_grid_t *alpha; /* of alpha or of the ratio; NULL if the law has neither */
     const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
-    float correlation_time_s;     /* of SELFCAL_WALK_AND_MARKOV, s: from dt_s/6 to 1e6 dt_s. List the law once for each time in question */
-#endif
 } selfcal_hypothesis_t;
 
 typedef struct selfcal_regressors_code selfcal_regressors_code_t;
@@ -657,7 +668,7 @@ const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis);
 
 /* What one node knows of one axis, for tests and tools; folds the batch first, hence not const. */
 typedef struct {
-    selfcal_law_t law;
+    uint8_t hypothesis;
     selfcal_wide_t ln_rho, ln_alpha; /* the node; NaN where the law has none */
     selfcal_wide_t a, b, c, ln_s;      /* sums A, B, C about the offset, and D, see bank.c */
     selfcal_wide_t drift;     /* at the last interval, if x0 were the offset */
@@ -729,12 +740,12 @@ typedef struct {
     uint8_t flags;
 } selfcal_estimate_t;
 
-/* What a decaying drift does to the bias, for selfcal_predict(): with psi = 1 - e^(-alpha t) of each alpha node, t after the
- * report the bias's mean is bias_mean - f, f = sum psi mean, and its variance bias_sd^2 + sum (psi var + psi^2 var_sq) - f^2. Flicker:
- * the same for each of its terms, of alpha/10, alpha and 10 alpha, with psi psi' var_sq for each pair of them, b <= a at a (a + 1)/2 + b.
- * A walk beside a Gauss-Markov drift: the second term decays, the first stays. */
+/* How a decaying drift moves the bias, for selfcal_predict(). One entry for each node of alpha (or of the ratio).
+ * Each term a of the law falls by psi_a = 1 - e^(-bandwidth_a t) in the time t after the report; a walk stays.
+ * The bias's mean is then bias_mean - f, f = sum psi mean. Its variance is
+ * bias_sd^2 + sum (psi var + sum over b psi_a psi_b var_sq) - f^2, the pair b <= a at a (a + 1)/2 + b. */
 typedef struct {
-    float alpha; /* 1/s */
+    float alpha; /* 1/s; of no meaning where the law has a ratio */
     float mean[SELFCAL_TERMS_MAX];
     float var[SELFCAL_TERMS_MAX];
     float var_sq[SELFCAL_TERM_PAIRS];
@@ -745,7 +756,7 @@ typedef struct {
     selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
     float bias_mean, bias_sd;   /* x0 + drift now (+ c' z, see selfcal_report_begin_subset()), under this hypothesis, unit */
-    selfcal_decay_t decay[SELFCAL_ALPHA_MAX]; /* where a term decays: of each node of alpha or of the ratio; else 0 */
+    selfcal_decay_t decay[SELFCAL_ALPHA_MAX]; /* where a term decays; else 0 */
 } selfcal_posterior_t;
 
 typedef struct {
@@ -886,7 +897,7 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
 /* The bias of the report's axis `elapsed_s` after the last bank interval (missing ones told by selfcal_skip() included) that the
  * report rests on, and its standard deviation, mixed over the hypotheses; both in the axis's unit. A reading less `bias` is the
  * corrected reading, at rest or moving. Under the constant law the bias stays; under the random walk its variance grows by
- * E(K^2) per second; under Gauss-Markov the drift decays towards 0 and its variance grows to sigma_m^2, under flicker that of each term:
+ * E(K^2) per second; a Gauss-Markov term decays towards 0 and its variance grows to sigma_m^2:
  * exact moments of the mixture over the nodes and sigma_v, as far as the report's own are. NaN where those are. `model` is the bank's.
  * SELFCAL_BAD_ARGUMENT: null pointer, elapsed_s negative or not finite. O(alpha nodes). */
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd);
@@ -1061,7 +1072,7 @@ typedef struct {
     const selfcal_model_t *model;
     const selfcal_module_t *module;
     uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
-    uint8_t of_law[SELFCAL_LAWS];      /* hypothesis with that law; SELFCAL_HYPOTHESES_MAX: none */
+    uint8_t of_law[3];      /* hypothesis with that law; SELFCAL_HYPOTHESES_MAX: none */
     /* of the frames under way */
     uint8_t source;
     const selfcal_report_t *report;

@@ -5,6 +5,7 @@
 #include <math.h>
 #include <string.h>
 
+enum { CONSTANT, RANDOM_WALK, GAUSS_MARKOV }; /* laws that have items */
 enum { STATISTICS = 5 }; /* mean, median, sd, q05, q95: items in this order */
 enum { STATUS, REPORT, CORRECTED, ANSWER }; /* what the frames under way are of */
 
@@ -17,13 +18,13 @@ static const struct {
 static const struct {
     uint8_t law, parameter, first_item, flags_shift;
 } estimate_table[] = {
-    {SELFCAL_CONSTANT, SELFCAL_N, SELFCAL_AXIS_CONSTANT_N_MEAN, SELFCAL_AXIS_CONSTANT_N_FLAGS_SHIFT},
-    {SELFCAL_RANDOM_WALK, SELFCAL_N, SELFCAL_AXIS_RANDOM_WALK_N_MEAN, SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_SHIFT},
-    {SELFCAL_RANDOM_WALK, SELFCAL_K, SELFCAL_AXIS_RANDOM_WALK_K_MEAN, SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_SHIFT},
-    {SELFCAL_GAUSS_MARKOV, SELFCAL_N, SELFCAL_AXIS_GAUSS_MARKOV_N_MEAN, SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_SHIFT},
-    {SELFCAL_GAUSS_MARKOV, SELFCAL_SIGMA_M, SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEAN,
+    {CONSTANT, SELFCAL_N, SELFCAL_AXIS_CONSTANT_N_MEAN, SELFCAL_AXIS_CONSTANT_N_FLAGS_SHIFT},
+    {RANDOM_WALK, SELFCAL_N, SELFCAL_AXIS_RANDOM_WALK_N_MEAN, SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_SHIFT},
+    {RANDOM_WALK, SELFCAL_K, SELFCAL_AXIS_RANDOM_WALK_K_MEAN, SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_SHIFT},
+    {GAUSS_MARKOV, SELFCAL_N, SELFCAL_AXIS_GAUSS_MARKOV_N_MEAN, SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_SHIFT},
+    {GAUSS_MARKOV, SELFCAL_SIGMA_M, SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEAN,
      SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS_SHIFT},
-    {SELFCAL_GAUSS_MARKOV, SELFCAL_ALPHA, SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEAN,
+    {GAUSS_MARKOV, SELFCAL_ALPHA, SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEAN,
      SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS_SHIFT},
 };
 enum { ESTIMATES = sizeof estimate_table / sizeof estimate_table[0] };
@@ -99,8 +100,9 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
     }
     memset(self->of_law, SELFCAL_HYPOTHESES_MAX, sizeof self->of_law);
     for (uint8_t k = 0; k < model->hypotheses; k++) {
-        const selfcal_law_t law = model->hypothesis[k].law;
-        if ((unsigned)law >= SELFCAL_LAWS || self->of_law[law] != SELFCAL_HYPOTHESES_MAX) {
+        const selfcal_law_t *of = model->hypothesis[k].law;
+        const unsigned law = of->terms == 0U ? CONSTANT : of->term[0].kind == SELFCAL_WALK ? RANDOM_WALK : GAUSS_MARKOV;
+        if (of->terms > 1U || of->coloured_noise || self->of_law[law] != SELFCAL_HYPOTHESES_MAX) {
             return SELFCAL_BAD_MODEL;
         }
         self->of_law[law] = k;
@@ -266,15 +268,15 @@ static bool axis_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *
     case SELFCAL_AXIS_LN_EVIDENCE: *value = float_bits((float)self->ln_best); return true;
     case SELFCAL_AXIS_BIAS_MEAN: *value = float_bits(r->bias_mean); return true;
     case SELFCAL_AXIS_BIAS_SD: *value = float_bits(r->bias_sd); return true;
-    case SELFCAL_AXIS_CONSTANT_PROBABILITY: return probability_value(self, SELFCAL_CONSTANT, value);
-    case SELFCAL_AXIS_RANDOM_WALK_PROBABILITY: return probability_value(self, SELFCAL_RANDOM_WALK, value);
-    case SELFCAL_AXIS_GAUSS_MARKOV_PROBABILITY: return probability_value(self, SELFCAL_GAUSS_MARKOV, value);
+    case SELFCAL_AXIS_CONSTANT_PROBABILITY: return probability_value(self, CONSTANT, value);
+    case SELFCAL_AXIS_RANDOM_WALK_PROBABILITY: return probability_value(self, RANDOM_WALK, value);
+    case SELFCAL_AXIS_GAUSS_MARKOV_PROBABILITY: return probability_value(self, GAUSS_MARKOV, value);
     case SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF:
-        return evidence_value(self, SELFCAL_CONSTANT, SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF_PER_UNIT, value);
+        return evidence_value(self, CONSTANT, SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF_PER_UNIT, value);
     case SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF:
-        return evidence_value(self, SELFCAL_RANDOM_WALK, SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF_PER_UNIT, value);
+        return evidence_value(self, RANDOM_WALK, SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF_PER_UNIT, value);
     case SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF:
-        return evidence_value(self, SELFCAL_GAUSS_MARKOV, SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF_PER_UNIT, value);
+        return evidence_value(self, GAUSS_MARKOV, SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF_PER_UNIT, value);
     case SELFCAL_AXIS_CONSTANT_N_FLAGS: *value = estimate_flags_value(self); return true;
     case SELFCAL_AXIS_END_ITEMS:
         *value = (self->time_ms & SELFCAL_AXIS_END_TIME_MS_MASK) << SELFCAL_AXIS_END_TIME_MS_SHIFT |

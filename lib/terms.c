@@ -21,8 +21,9 @@
 /* Products of s are so far from 0 and infinity that the next s cannot reach either. */
 #define PRODUCT_MAX 1e200
 
-static size_t order_of(selfcal_law_t law) {
-    return law == SELFCAL_FLICKER ? 3U : 2U;
+/* States: one a term, and e_(i-1) of coloured noise. */
+static size_t order_of(const selfcal_law_t *law) {
+    return (size_t)law->terms + (law->coloured_noise ? 1U : 0U);
 }
 
 size_t selfcal_terms_nodes(const selfcal_model_t *model) {
@@ -100,36 +101,30 @@ static selfcal_wide_t white_of(const selfcal_term_node_t *node) {
 }
 
 void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
-    const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[place.hypothesis];
-    const selfcal_law_t law = hypothesis->law;
-    const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
+    const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
+    const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho), second = exp((selfcal_wide_t)place.ln_alpha);
+    const selfcal_wide_t dt_s = (selfcal_wide_t)self->model->dt_s;
     selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
     memset(node, 0, sizeof *node);
-    if (law == SELFCAL_FLICKER) {
-        const selfcal_wide_t variance = square * SELFCAL_FLICKER_TERM; /* stationary, of each term */
-        selfcal_wide_t alpha_dt = 0.1 * exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s;
-        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
-            node->beta[a] = (selfcal_real_t)-expm1(-fmin(alpha_dt, ALPHA_DT_MAX));
+    for (size_t a = 0; a < law->terms; a++) {
+        const selfcal_term_t *term = &law->term[a];
+        if (term->kind == SELFCAL_WALK) {
+            const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation;
+            node->q[a] = (selfcal_real_t)(deviation * deviation * square);
+            node->p[term_pair(a, a)] = deviation * deviation * square; /* x_0 = 0 */
+        } else {
+            const selfcal_wide_t variance = markov_variance(law, term, square, second, dt_s); /* stationary */
+            node->beta[a] = (selfcal_real_t)-expm1(-fmin(bandwidth_of(term, second) * dt_s, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
             node->p[term_pair(a, a)] = variance;
-            alpha_dt *= 10.0;
         }
-        return;
     }
-    node->q[0] = (selfcal_real_t)square;
-    node->p[term_pair(0, 0)] = square; /* x_0 = 0 */
-    if (law == SELFCAL_WALK_AND_MARKOV) {
-        const selfcal_wide_t interval = (selfcal_wide_t)self->model->dt_s / (selfcal_wide_t)hypothesis->correlation_time_s;
-        const selfcal_wide_t variance = exp(2.0 * (selfcal_wide_t)place.ln_alpha) * square / interval; /* ratio^2 K^2 / alpha */
-        node->beta[1] = (selfcal_real_t)-expm1(-interval);
-        const selfcal_wide_t beta = (selfcal_wide_t)node->beta[1];
-        node->q[1] = (selfcal_real_t)(variance * beta * (2.0 - beta));
-        node->p[term_pair(1, 1)] = variance;
-    } else {
+    if (law->coloured_noise) {
+        const size_t last = law->terms;
         node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
-        node->beta[1] = R(1.0);
-        node->p[term_pair(1, 1)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
+        node->beta[last] = R(1.0);
+        node->p[term_pair(last, last)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
     }
 }
 

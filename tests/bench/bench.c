@@ -253,9 +253,10 @@ static selfcal_wide_t paper_sigma(unsigned k) {
 static void paper_init(paper_filter_t *f, const selfcal_node_view_t *node, selfcal_wide_t sigma_v) {
     const selfcal_wide_t bias_sd = (selfcal_wide_t)model.axis[0].bias_sd;
     selfcal_wide_t phi = 1.0, q = 0.0, p_first = 0.0; /* before the first prediction */
-    if (node->law == SELFCAL_RANDOM_WALK) {
+    const selfcal_law_t *law = model.hypothesis[node->hypothesis].law;
+    if (law->terms > 0U && law->term[0].kind == SELFCAL_WALK) {
         q = exp(2.0 * node->ln_rho);
-    } else if (node->law == SELFCAL_GAUSS_MARKOV) {
+    } else if (law->terms > 0U) {
         const selfcal_wide_t alpha_dt = exp(node->ln_alpha) * (selfcal_wide_t)model.dt_s;
         phi = exp(-alpha_dt);
         p_first = exp(2.0 * node->ln_rho);

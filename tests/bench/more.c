@@ -4,6 +4,10 @@
 #include "internal.h"
 #include "record.h"
 
+#if SELFCAL_TERMS_MAX > 1
+#include "../c/laws.h"
+#endif
+
 #define AXES SELFCAL_MODEL_AXES
 /* Bank samples counted at a time: whole batches. Of sums fewer, since they take an emulated Cortex-M0 a while. */
 #define WINDOW (SELFCAL_TERMS_MAX > 1 ? 32U : 64U)
@@ -75,7 +79,7 @@ static void measure(const char *name, const selfcal_model_t *model, bool fast, b
 
 #if SELFCAL_TERMS_MAX > 1
 
-static void measure_sum(const char *name, selfcal_law_t law, bool fast) {
+static void measure_sum(const char *name, unsigned law, bool fast) {
     static const selfcal_real_t fit[SUM_GRID * SUM_GRID] = {0}; /* for reports, which there are none of */
     static const selfcal_grid_t grid = {SUM_GRID, fit};
     static const selfcal_prior_t ratio = {-1.0F, 1.0F, false};
@@ -83,11 +87,10 @@ static void measure_sum(const char *name, selfcal_law_t law, bool fast) {
     selfcal_model_t model = record_narrow_model(fast, axis);
     for (unsigned a = 0; a < AXES; a++) {
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            prior[a][p] = law != SELFCAL_FLICKER && p == SELFCAL_SPECTRAL_RATIO ? ratio : axis[a].prior[p];
+            prior[a][p] = law != FLICKER && p == SELFCAL_RATIO ? ratio : axis[a].prior[p];
         }
     }
-    /* a correlation time of 100 s */
-    const selfcal_hypothesis_t hypothesis = {law, 0.0F, &grid, &grid, &prior[0][0], 100.0F};
+    const selfcal_hypothesis_t hypothesis = {&named_law[law], 0.0F, &grid, &grid, &prior[0][0]};
     model.hypothesis = &hypothesis;
     model.hypotheses = 1;
     model.nodes = SUM_GRID * SUM_GRID;
@@ -95,12 +98,12 @@ static void measure_sum(const char *name, selfcal_law_t law, bool fast) {
 }
 
 static void measure_all(void) {
-    measure_sum("flicker.steady", SELFCAL_FLICKER, true);
-    measure_sum("flicker.varying", SELFCAL_FLICKER, false);
-    measure_sum("moving_average.steady", SELFCAL_MOVING_AVERAGE, true);
-    measure_sum("moving_average.varying", SELFCAL_MOVING_AVERAGE, false);
-    measure_sum("walk_and_markov.steady", SELFCAL_WALK_AND_MARKOV, true);
-    measure_sum("walk_and_markov.varying", SELFCAL_WALK_AND_MARKOV, false);
+    measure_sum("flicker.steady", FLICKER, true);
+    measure_sum("flicker.varying", FLICKER, false);
+    measure_sum("moving_average.steady", MOVING_AVERAGE, true);
+    measure_sum("moving_average.varying", MOVING_AVERAGE, false);
+    measure_sum("walk_and_markov.steady", WALK_AND_MARKOV, true);
+    measure_sum("walk_and_markov.varying", WALK_AND_MARKOV, false);
 }
 
 #elif defined(BENCH_PLAIN)
@@ -119,7 +122,7 @@ static void measure_columns(const char *name, uint8_t columns, bool fast) {
     selfcal_model_t model = record_narrow_model(fast, axis);
     const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd};
     model.regressors = columns > 0U ? &regressors : NULL;
-    while (model.hypothesis->law != SELFCAL_RANDOM_WALK) {
+    while (model.hypothesis->law->terms == 0U || model.hypothesis->law->term[0].kind != SELFCAL_WALK) {
         model.hypothesis++;
     }
     model.hypotheses = 1;

@@ -7,6 +7,8 @@
  *
  * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
 #include "selfcal.h"
+
+#include "laws.h"
 #include "slcan.h"
 
 #include <math.h>
@@ -18,7 +20,7 @@ enum { AXES = 6, STATUS_MS = 10000 };
 
 static const char *const law_name[] = {"constant", "random_walk", "gauss_markov"};
 static const char *const parameter_name[] = {"N", "K", "sigma_m", "alpha"};
-static const bool has[SELFCAL_LAWS][SELFCAL_PARAMETERS] = {
+static const bool has[3][SELFCAL_PARAMETERS] = {
     {true, false, false, false}, {true, true, false, false}, {true, false, true, true}};
 
 static uint32_t state;
@@ -101,7 +103,7 @@ int main(int argc, char **argv)
 {
     static const char *const axis_name[AXES] = {"az", "gx", "ay", "gz", "ax", "gy"};
     static const char *const message[AXES] = {"AZ", "GX", "AY", "GZ", "AX", "GY"};
-    static const selfcal_law_t order[] = {SELFCAL_RANDOM_WALK, SELFCAL_GAUSS_MARKOV, SELFCAL_CONSTANT};
+    static const int order[] = {RANDOM_WALK, GAUSS_MARKOV, CONSTANT};
     if (argc != 5) {
         return 2;
     }
@@ -115,7 +117,7 @@ int main(int argc, char **argv)
     selfcal_hypothesis_t hypothesis[3];
     memset(hypothesis, 0, sizeof hypothesis);
     for (int k = 0; k < 3; k++) {
-        hypothesis[k].law = order[k];
+        hypothesis[k].law = &named_law[order[k]];
     }
     selfcal_model_t model;
     memset(&model, 0, sizeof model);
@@ -202,7 +204,7 @@ int main(int argc, char **argv)
             report.bias_mean = told(message[a], "bias_mean", random_float());
             report.bias_sd = told(message[a], "bias_sd", random_float());
             for (uint8_t k = 0; k < hypotheses; k++) {
-                random_posterior(&report.hypothesis[k], message[a], (int)order[k]);
+                random_posterior(&report.hypothesis[k], message[a], order[k]);
             }
             for (uint32_t after = (a * slow_ms / STATUS_MS + 1U) * STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
                 require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));

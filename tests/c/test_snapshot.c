@@ -141,8 +141,8 @@ static void make_small(void) {
     model.hypotheses = 2;
     model.axes = 1;
     model.nodes = (uint16_t)(1U + model.hypothesis[1].rho->nodes);
-    TEST_ASSERT_EQUAL(SELFCAL_CONSTANT, model.hypothesis[0].law);
-    TEST_ASSERT_EQUAL(SELFCAL_RANDOM_WALK, model.hypothesis[1].law);
+    TEST_ASSERT_EQUAL(0, model.hypothesis[0].law->terms);
+    TEST_ASSERT_EQUAL(SELFCAL_WALK, model.hypothesis[1].law->term[0].kind);
 }
 
 static void begin(bank_t *to) {

@@ -1,6 +1,8 @@
 /* The frames against the format in words (the comment of lib/selfcal.dbc), taken apart here without selfcal_frames.h.
  * Every item's bits against the DBC: tests/py/test_wire.py. */
 #include "selfcal.h"
+
+#include "laws.h"
 #include "unity.h"
 
 #include <math.h>
@@ -8,7 +10,9 @@
 
 static const selfcal_axis_t axis_table[2];
 static const selfcal_hypothesis_t all_laws[] = {
-    {SELFCAL_GAUSS_MARKOV, 0.0F, NULL, NULL}, {SELFCAL_CONSTANT, 0.0F, NULL, NULL}, {SELFCAL_RANDOM_WALK, 0.0F, NULL, NULL}};
+    {&named_law[GAUSS_MARKOV], 0.0F, NULL, NULL, NULL},
+    {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
+    {&named_law[RANDOM_WALK], 0.0F, NULL, NULL, NULL}};
 static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL};
 static const char *const names[] = {"ay", "gx"};
 
@@ -121,7 +125,8 @@ static void test_full_report_has_44_frames_opened_and_closed(void)
 
 static void test_items_of_absent_hypotheses_are_not_sent(void)
 {
-    static const selfcal_hypothesis_t two[] = {{SELFCAL_RANDOM_WALK, 0.0F, NULL, NULL}, {SELFCAL_CONSTANT, 0.0F, NULL, NULL}};
+    static const selfcal_hypothesis_t two[] = {{&named_law[RANDOM_WALK], 0.0F, NULL, NULL, NULL},
+                                               {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL}};
     static const selfcal_model_t model = {1, 1.0F, 1, 2, 2, 2, axis_table, two, NULL, NULL};
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_init(&telemetry, &model, names));
     report.hypothesis[0].parameter[SELFCAL_K].median = 7.0F;
@@ -273,7 +278,8 @@ static void test_bad_arguments_and_models_are_refused(void)
     static const char *const unknown[] = {"ay", "mx"};
     static const char *const twice[] = {"gx", "gx"};
     static const char *const none[] = {"gx", NULL};
-    static const selfcal_hypothesis_t same[] = {{SELFCAL_CONSTANT, 0.0F, NULL, NULL}, {SELFCAL_CONSTANT, 0.0F, NULL, NULL}};
+    static const selfcal_hypothesis_t same[] = {{&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
+                                                {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL}};
     static const selfcal_model_t same_law = {1, 1.0F, 1, 2, 2, 2, axis_table, same, NULL, NULL};
     selfcal_telemetry_t other;
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_telemetry_init(&other, &full, unknown));

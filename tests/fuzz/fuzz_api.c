@@ -13,6 +13,8 @@
 
 #include "selfcal.h"
 
+#include "../c/laws.h"
+
 enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID };
 enum { STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 32 };
 enum { EFFORT = 1500, SAMPLES_MIN = 10 }; /* for bank samples, some 0.1 ms; but a batch and a part of the next are had by all */
@@ -49,6 +51,7 @@ static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {
     {-6.9F, -0.7F, false}, {-10.0F, -3.0F, false}, {-7.0F, -1.0F, false}, {-2.0F, 2.0F, false}};
 static selfcal_prior_t of_ratio[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
+static selfcal_law_t law_table[NAMED_LAWS];
 static selfcal_real_t fit[NODES_A_GRID * NODES_A_GRID];
 static const selfcal_grid_t grid = {NODES_A_GRID, fit};
 static selfcal_model_t model;
@@ -136,7 +139,7 @@ static void make_model(input_t *in, bool any_sums) {
     static const float intervals[] = {1.0F, 0.1F, 1.0F / 819.2F, 100.0F};
     static const uint32_t blocks[] = {1, 2, 3, 8};
     static const float priors[][2] = {{-7.0F, -0.7F}, {-14.0F, 4.0F}, {-1.0F, 1.0F}};
-    /* bits: SELFCAL_FLICKER, SELFCAL_MOVING_AVERAGE, SELFCAL_WALK_AND_MARKOV. 36 nodes each: models of several are rare */
+    /* bits: flicker, moving average, walk and Markov. 36 nodes each: models of several are rare */
     static const uint8_t sums[] = {0, 1, 2, 1, 4, 0, 2, 4};
     const uint8_t shape = byte(in), kind = byte(in), limits = byte(in);
     memset(&model, 0, sizeof model);
@@ -168,19 +171,18 @@ static void make_model(input_t *in, bool any_sums) {
     const unsigned more = limits >> 4 & 7U;
     const bool all = any_sums && shape >> 5 == 6U;
     if (SELFCAL_TERMS_MAX > 1) {
-        laws |= (all ? more : sums[more]) << SELFCAL_FLICKER;
+        laws |= (all ? more : sums[more]) << FLICKER;
     }
-    for (unsigned law = 0; law < SELFCAL_LAWS; law++) {
+    memcpy(law_table, named_law, sizeof law_table);
+    law_table[WALK_AND_MARKOV].term[1].bandwidth = 1.0F / (((limits >> 7 & 1U) != 0U ? 0.2F : 100.0F) * model.dt_s);
+    for (unsigned law = 0; law < NAMED_LAWS; law++) {
         if ((laws >> law & 1U) != 0U) {
             selfcal_hypothesis_t *h = &hypothesis_table[model.hypotheses++];
-            h->law = (selfcal_law_t)law;
+            h->law = &law_table[law];
             h->ln_probability = -1.0F;
-            h->rho = law != SELFCAL_CONSTANT ? &grid : NULL;
-            h->alpha = law >= SELFCAL_GAUSS_MARKOV ? &grid : NULL;
-#if SELFCAL_TERMS_MAX > 1
-            h->prior = law >= SELFCAL_MOVING_AVERAGE ? &of_ratio[0][0] : NULL;
-            h->correlation_time_s = ((limits >> 7 & 1U) != 0U ? 0.2F : 100.0F) * model.dt_s;
-#endif
+            h->rho = law != CONSTANT ? &grid : NULL;
+            h->alpha = law >= GAUSS_MARKOV ? &grid : NULL;
+            h->prior = law >= MOVING_AVERAGE ? &of_ratio[0][0] : NULL;
             model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
         }
     }
@@ -207,7 +209,17 @@ static void make_model(input_t *in, bool any_sums) {
         return;
     }
     /* something is wrong with this one */
-    switch (byte(in) % 24U) {
+    switch (byte(in) % 25U) {
+    case 23: {
+        selfcal_term_t *term = &law_table[byte(in) % NAMED_LAWS].term[byte(in) % SELFCAL_LAW_TERMS];
+        term->kind = (byte(in) & 1U) != 0U ? SELFCAL_WALK : SELFCAL_MARKOV;
+        term->deviation = any_float(in);
+        term->bandwidth = any_float(in);
+        term->stated = (byte(in) & 1U) != 0U;
+        term->by_ratio = (byte(in) & 1U) != 0U;
+        break;
+    }
+    case 24: law_table[byte(in) % NAMED_LAWS].terms = byte(in) & 7U; break;
     case 0: model.dt_s = any_float(in); break;
     case 1: model.block = (uint32_t)bits(in, 4); break;
     case 2: model.axes = byte(in); break;
@@ -220,7 +232,11 @@ static void make_model(input_t *in, bool any_sums) {
     case 9: axis_table[0].stuck_limit = byte(in); break;
     case 10: axis_table[0].prior[byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
     case 11: axis_table[0].prior[byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
-    case 12: hypothesis_table[0].law = (selfcal_law_t)(byte(in) & 7U); break;
+    case 12: {
+        const unsigned other = byte(in) & 7U;
+        hypothesis_table[0].law = other < NAMED_LAWS ? &law_table[other] : NULL;
+        break;
+    }
     case 13: hypothesis_table[0].rho = hypothesis_table[0].rho == NULL ? &grid : NULL; break;
     case 14: hypothesis_table[0].alpha = hypothesis_table[0].alpha == NULL ? &grid : NULL; break;
     case 15: regressors.count = byte(in); break;
@@ -234,7 +250,7 @@ static void make_model(input_t *in, bool any_sums) {
     default:
         hypothesis_table[0].ln_probability = any_float(in);
 #if SELFCAL_TERMS_MAX > 1
-        hypothesis_table[model.hypotheses - 1U].correlation_time_s = any_float(in);
+        law_table[WALK_AND_MARKOV].term[1].bandwidth = any_float(in);
 #endif
         break;
     }
@@ -270,7 +286,7 @@ static size_t plain_nodes(void) {
     size_t nodes = 0;
     for (uint8_t h = 0; h < model.hypotheses; h++) {
         const selfcal_hypothesis_t *of = &hypothesis_table[h];
-        nodes += of->law >= SELFCAL_FLICKER ? 0U : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
+        nodes += selfcal_law_is_sum(of->law) ? 0U : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
     }
     return nodes;
 }

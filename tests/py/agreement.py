@@ -17,8 +17,8 @@ from scipy.optimize import minimize_scalar
 
 from selfcal import _library32, _reference
 from selfcal.engines.library import Bank
-from selfcal.engines.reference import textbook_node
-from selfcal.model import DEFAULT, LAWS, PLACES, SUMS, Model, Regressor
+from selfcal.laws import NAMED, PLACES, SUMS
+from selfcal.model import DEFAULT, Model, Regressor
 from selfcal.result import AxisResult
 from selfcal.tables import Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
@@ -151,15 +151,14 @@ def a_record(
     deviation (a walk: of a step) over the white noise instead of the prior's, the other parameters in its middle.
     """
     group = model_of(law).group_of("gx")
-    rng = np.random.default_rng([n, seed, list(LAWS).index(law), columns])
+    rng = np.random.default_rng([n, seed, list(NAMED).index(law), columns])
     if rho is None:
         truth = draw(group, law, rng)
     else:
-        truth = {name: math.sqrt(group.priors[name].min * group.priors[name].max) for name in LAWS[law]}
+        truth = {name: math.sqrt(group.priors[name].min * group.priors[name].max) for name in NAMED[law].parameters}
         truth |= {"N": 1e-3 if rho > 0.1 else 0.1, "bias": 0.0}
-        truth |= {"correlation_time_s": group.correlation_time_s} if law == "walk_and_markov" else {}
-        truth[LAWS[law][1]] = rho * truth["N"]
-    y, _ = simulate_bank_samples(law, truth, 1.0, n, seed=seed)
+        truth[NAMED[law].parameters[1]] = rho * truth["N"]
+    y, _ = simulate_bank_samples(group.laws[law], truth, 1.0, n, seed=seed)
     z = None
     if columns:
         z = columns_of(n, seed)[:, :columns]
@@ -177,10 +176,10 @@ def a_record(
 
 @dataclass(frozen=True)
 class Nodes:
-    """Some of a bank's, [m]: index in it, law (index into LAWS), and parameters over sigma_v."""
+    """Some of a bank's, [m]: index in it, hypothesis (index into the tables'), and parameters over sigma_v."""
 
     index: NDArray[np.int64]
-    law: NDArray[np.int64]
+    hypothesis: NDArray[np.int64]
     rho: Floats
     alpha: Floats
 
@@ -188,15 +187,15 @@ class Nodes:
     def of(bank: Bank, every: int = 1) -> Nodes:
         """Every so many, and those of the constant."""
         views = [bank.raw.node(0, j) for j in range(bank.raw.nodes)]
-        index = np.array([j for j, view in enumerate(views) if j % every == 0 or view["law"] == 0])
-        keys = ("law", "ln_rho", "ln_alpha")
-        law, ln_rho, ln_alpha = (np.array([views[j][key] for j in index]) for key in keys)
-        return Nodes(index, law.astype(np.int64), np.exp(np.nan_to_num(ln_rho)), np.exp(np.nan_to_num(ln_alpha)))
+        index = np.array([j for j, view in enumerate(views) if j % every == 0 or math.isnan(view["ln_rho"])])
+        keys = ("hypothesis", "ln_rho", "ln_alpha")
+        hypothesis, ln_rho, ln_alpha = (np.array([views[j][key] for j in index]) for key in keys)
+        return Nodes(index, hypothesis.astype(np.int64), np.exp(np.nan_to_num(ln_rho)), np.exp(np.nan_to_num(ln_alpha)))
 
-    def values(self, sigma: Floats, dt_s: float) -> tuple[Floats, Floats, Floats]:
-        """sigma_v, drift (a walk's as its density) and alpha of all nodes over all sigma [m, s]."""
-        walks = [k for k, law in enumerate(LAWS) if LAWS[law][1:2] == ("K",)]
-        scale = np.where(np.isin(self.law, walks), 1.0 / math.sqrt(dt_s), 1.0)
+    def values(self, sigma: Floats, tables: Tables) -> tuple[Floats, Floats, Floats]:
+        """sigma_v, drift (a walk's as its density) and alpha or ratio of all nodes over all sigma [m, s]."""
+        walks = [k for k, h in enumerate(tables.hypotheses) if h.law.has_walk]
+        scale = np.where(np.isin(self.hypothesis, walks), 1.0 / math.sqrt(tables.dt_s), 1.0)
         shape = (self.index.size, sigma.size)
         drift = np.outer(self.rho * scale, sigma)
         return np.broadcast_to(sigma, shape), drift, np.broadcast_to(self.alpha[:, None], shape)
@@ -223,26 +222,23 @@ def textbook(y: Floats, tables: Tables, nodes: Nodes, sigma: Floats, z: Floats |
     centred = np.ascontiguousarray((z - reference)[:, used]) if z is not None and used else None
     coefficient_sd = np.array([tables.regressors[k].coefficient_sd[0] for k in used]) if used else None
     offset = float(np.nanmean(y))
-    values = nodes.values(sigma, tables.dt_s)
+    values = nodes.values(sigma, tables)
     found = np.empty(values[0].shape)
-    times = {h.law: h.correlation_time_s for h in tables.hypotheses}
-    for law in np.unique(nodes.law):
-        mine, names = nodes.law == law, LAWS[list(LAWS)[law]]
-        sigma_v, *others = (np.ascontiguousarray(value[mine].ravel()) for value in values)
-        parameters = {"N": sigma_v} | dict(zip(names[1:], others, strict=False))
-        drift, alpha, walk = textbook_node(list(LAWS)[law], parameters, times[law])
+    for k in np.unique(nodes.hypothesis):
+        mine = nodes.hypothesis == k
+        sigma_v, drift, second = (np.ascontiguousarray(value[mine].ravel()) for value in values)
         ln_p, _, _ = _reference.run_filters(
             y - offset,
             tables.dt_s,
             -offset,
             tables.axes[0].bias_sd,
-            np.full(sigma_v.size, law, np.int32),
+            [tables.hypotheses[k].law.as_tuple],
+            np.zeros(sigma_v.size, np.int32),
             drift,
-            alpha,
+            second,
             sigma_v,
             z=centred,
             coefficient_sd=coefficient_sd,
-            walk=walk,
         )
         found[mine] = ln_p.reshape(-1, sigma.size)
     return found
@@ -293,7 +289,7 @@ def compare(
         for build, each in found.items():
             of_node = banks[build].raw.log_likelihood_subset
             ours = np.array([[of_node(0, int(j), mask, s) for s in sigma] for j in nodes.index])
-            each.append(differences(ours, theirs, nodes.law, nodes.values(sigma, tables.dt_s)))
+            each.append(differences(ours, theirs, nodes.hypothesis, nodes.values(sigma, tables)))
     return {build: Agreement.worst(each) for build, each in found.items()}
 
 

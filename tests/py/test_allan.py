@@ -30,7 +30,8 @@ from selfcal.blocks import block_means
 from selfcal.checks import CHECK_LIMIT, judge
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import PLAIN, Model
+from selfcal.laws import PLAIN, named
+from selfcal.model import Model
 from selfcal.recording import as_float, save
 from selfcal.table import show
 from selfcal.tables import make_tables
@@ -59,7 +60,7 @@ def test_closed_forms_are_those_of_the_simulator(law: str) -> None:
     longest, which is not normal."""
     n, at = 1000, (1, 2, 5, 20, 100)
     stated = {"correlation_time_s": 100.0} if law == "walk_and_markov" else {}
-    terms = terms_of(law, CASES[law], 1.0, 100.0)
+    terms = terms_of(named(law, 100.0), CASES[law], 1.0)
     found = np.empty((2, 150, len(at)))
     windows = {}
     for seed in range(300):
@@ -81,14 +82,14 @@ def test_closed_forms_are_the_literatures() -> None:
     Gauss-Markov form, and flicker's floor 0.664 B, which three terms have to 3 %."""
     m = np.array([200.0, 2000.0, 20000.0])
     tau = 0.01 * m
-    assert terms_of("constant", {"N": 0.3}, 0.01).allan_variance(m) == pytest.approx(0.09 / tau, rel=1e-9)
-    walk = terms_of("random_walk", {"N": 1e-9, "K": 0.2}, 0.01).allan_variance(m)
+    assert terms_of(named("constant"), {"N": 0.3}, 0.01).allan_variance(m) == pytest.approx(0.09 / tau, rel=1e-9)
+    walk = terms_of(named("random_walk"), {"N": 1e-9, "K": 0.2}, 0.01).allan_variance(m)
     assert walk == pytest.approx(0.04 * tau / 3.0, rel=1e-4)
     q = 0.05 * tau
-    markov = terms_of("gauss_markov", {"N": 1e-9, "sigma_m": 2.0, "alpha": 0.05}, 0.01).allan_variance(m)
+    markov = terms_of(named("gauss_markov"), {"N": 1e-9, "sigma_m": 2.0, "alpha": 0.05}, 0.01).allan_variance(m)
     closed = 4.0 * 2.0 / q * (1.0 - (3.0 - 4.0 * np.exp(-q) + np.exp(-2.0 * q)) / (2.0 * q))
     assert markov == pytest.approx(closed, rel=1e-4)
-    flicker = terms_of("flicker", {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(np.array([3300.0]))
+    flicker = terms_of(named("flicker"), {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(np.array([3300.0]))
     assert math.sqrt(flicker[0]) == pytest.approx(0.664, rel=0.03)
 
 

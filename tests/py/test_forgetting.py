@@ -13,7 +13,7 @@ import pytest
 from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model, Regressor
+from selfcal.model import Model, Regressor
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
@@ -47,7 +47,7 @@ def test_the_likelihood_is_that_of_the_weighted_record(with_time: bool) -> None:
     sigma, worst = 0.06, 0.0
     for index in range(0, made.nodes, 7):
         view = bank.raw.node(0, index)
-        node = Filter.of(list(LAWS)[view["law"]], math.exp(view["ln_rho"]), math.exp(view["ln_alpha"]))
+        node = Filter.of(made.hypotheses[view["hypothesis"]].name, math.exp(view["ln_rho"]), math.exp(view["ln_alpha"]))
         truth = faded(node, y, columns, missing, half_life, sd, sigma)
         found = bank.raw.log_likelihood_subset(0, index, int(with_time), sigma)
         worst = max(worst, abs(found - truth))

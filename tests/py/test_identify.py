@@ -17,7 +17,8 @@ from selfcal.blocks import REPORT_MIN, block_means
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import NODES, PLAIN, Model, Prior
+from selfcal.laws import PLAIN
+from selfcal.model import NODES, Model, Prior
 from selfcal.recording import save
 from selfcal.table import show
 from selfcal.tables import make_tables

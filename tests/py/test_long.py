@@ -124,15 +124,17 @@ def test_double_against_the_textbook_at_a_million() -> None:
     for j in range(0, bank.raw.nodes, 20):
         node = bank.raw.node(0, j)
         sigma = math.sqrt((node["c"] - node["b"] ** 2 / node["a"]) / n)
-        drift = 0.0 if node["law"] == 0 else math.exp(node["ln_rho"]) * sigma
+        law = bank.tables.hypotheses[int(node["hypothesis"])].law
+        drift = math.exp(node["ln_rho"]) * sigma if law.terms else 0.0
         theirs, _, _ = _reference.run_filters(
             y.astype(np.float64) - offset,
             1.0,
             -offset,
             MODEL.group_of("gx").priors["bias"].sd,
-            np.array([node["law"]], np.int32),
+            [law.as_tuple],
+            np.zeros(1, np.int32),
             np.array([drift]),
-            np.array([math.exp(node["ln_alpha"]) if node["law"] == 2 else 1.0]),
+            np.array([math.exp(node["ln_alpha"]) if law.has_alpha else 1.0]),
             np.array([sigma]),
         )
         worst = max(worst, abs(bank.raw.log_likelihood(0, j, sigma) - float(theirs[0])))

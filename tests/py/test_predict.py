@@ -15,7 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from selfcal.engines.library import Bank
-from selfcal.model import LAWS, PLAIN, Model
+from selfcal.laws import NAMED, PLAIN
+from selfcal.model import Model
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
@@ -76,7 +77,7 @@ def hold(what: str, errors: NDArray[np.float64]) -> None:
 @pytest.mark.parametrize("samples", [300, 2000])
 @pytest.mark.parametrize("law", PLAIN)
 def test_the_error_is_what_is_stated(law: str, samples: int) -> None:
-    hold(f"{law}, {samples} samples", normalised_errors(law, samples, only(law), seed=list(LAWS).index(law)))
+    hold(f"{law}, {samples} samples", normalised_errors(law, samples, only(law), seed=list(NAMED).index(law)))
 
 
 def test_the_error_is_what_is_stated_with_the_law_unknown() -> None:

@@ -14,12 +14,15 @@ from selfcal import _reference
 from selfcal.engines import reference
 from selfcal.engines.reference import identify_axis
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PLAIN, Group, Prior
+from selfcal.laws import NAMED, PLAIN, named
+from selfcal.model import Group, Prior
 
 DT = 0.7
 BIAS_SD = 3.0
 BIAS_MEAN = 0.4
-#: (law, drift, alpha, sigma_v)
+#: The named laws; walk and Markov with a correlation time of 20 s.
+LAWS = [named(name, 20.0).as_tuple for name in NAMED]
+#: (law: an index into LAWS, drift, alpha or ratio, sigma_v)
 NODES = [(0, 0.0, 1.0, 0.3), (1, 0.2, 1.0, 0.3), (2, 0.5, 0.08, 0.3), (2, 0.5, 4.0, 0.05), (1, 2.0, 1.0, 1e-3)]
 #: Double precision through 30 samples; the worst node has P0 / sigma_v^2 = 1e7.
 LN_P_TOLERANCE = 1e-8
@@ -42,7 +45,7 @@ def record_covariance(node: tuple, n: int, dt: float, bias_sd: float, r: np.ndar
 
 def arrays(nodes: list[tuple]) -> tuple:
     law, drift, alpha, sigma_v = zip(*nodes, strict=True)
-    return np.array(law, np.int32), np.array(drift), np.array(alpha), np.array(sigma_v)
+    return LAWS, np.array(law, np.int32), np.array(drift), np.array(alpha), np.array(sigma_v)
 
 
 def a_record(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +85,7 @@ def test_innovations_are_the_cholesky_residuals(node: tuple) -> None:
     have = np.isfinite(y)
     covariance = record_covariance(node, 30, DT, BIAS_SD, r)[np.ix_(have, have)]
     expected = np.linalg.solve(np.linalg.cholesky(covariance), y[have] - BIAS_MEAN)
-    got = _reference.innovations(y, DT, BIAS_MEAN, BIAS_SD, *node, r=r)
+    got = _reference.innovations(y, DT, BIAS_MEAN, BIAS_SD, LAWS[node[0]], *node[1:], r=r)
     assert np.isnan(got[~have]).all()
     np.testing.assert_allclose(got[have], expected, atol=1e-6)  # the dense solve loses half the digits at P0/R = 1e7
 
@@ -161,7 +164,7 @@ def test_regressors_are_those_of_the_joint_normal_density(node: tuple, p: int) -
 
 
 def further_covariance(
-    law: int, drift: float, alpha: float, sigma_v: float, walk: float, r: np.ndarray
+    law: int, drift: float, second: float, sigma_v: float, r: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Covariances [n, n] of the drift and of the noise under laws 3 to 5, by their definitions. `r` [n]: factors on the
     white noise."""
@@ -169,21 +172,19 @@ def further_covariance(
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     white = np.diag(r) * sigma_v**2
     if law == 3:
-        terms = [np.exp(-alpha * ratio * DT * lag) for ratio in (0.1, 1.0, 10.0)]
+        terms = [np.exp(-second * ratio * DT * lag) for ratio in (0.1, 1.0, 10.0)]
         return drift**2 * np.log(10.0) / np.pi * sum(terms), white
     if law == 4:
-        theta = (alpha - 1.0) / (alpha + 1.0)
+        theta = (second - 1.0) / (second + 1.0)
         mixing = np.eye(n, n + 1, 1) + theta * np.eye(n, n + 1)  # of e_(-1), e_0, ..., e_(n-1)
         noise = mixing * np.concatenate([[1.0], r]) @ mixing.T * (sigma_v / (1.0 + theta)) ** 2
         return drift_covariance(1, drift, 1.0, n, DT), noise
-    return drift_covariance(2, drift, alpha, n, DT) + drift_covariance(1, walk, 1.0, n, DT), white
+    markov = drift_covariance(2, second * drift * np.sqrt(20.0), 0.05, n, DT)  # sigma_m = ratio K sqrt(time)
+    return markov + drift_covariance(1, drift, 1.0, n, DT), white
 
 
-@pytest.mark.parametrize(
-    ("law", "drift", "alpha", "walk"),
-    [(3, 0.4, 0.05, 0.0), (4, 0.2, 4.0, 0.0), (4, 0.1, 0.3, 0.0), (5, 0.5, 0.05, 0.1)],
-)
-def test_further_laws_are_those_of_the_joint_normal_density(law: int, drift: float, alpha: float, walk: float) -> None:
+@pytest.mark.parametrize(("law", "drift", "second"), [(3, 0.4, 0.05), (4, 0.2, 4.0), (4, 0.1, 0.3), (5, 0.1, 1.1)])
+def test_further_laws_are_those_of_the_joint_normal_density(law: int, drift: float, second: float) -> None:
     """Flicker, moving average, and random walk with Gauss-Markov, with gaps, factors on the white noise and two
     regressors: density of the record, and mean and variance of x0 + drift + c z at the last sample."""
     n, sigma_v, sd = 30, 0.3, np.array([0.2, 1.0])
@@ -192,11 +193,11 @@ def test_further_laws_are_those_of_the_joint_normal_density(law: int, drift: flo
     have = np.isfinite(y)
     r = np.where(have, r, 1.0)
     z = np.column_stack([np.arange(n) * 0.1, np.sin(np.arange(n))])
-    slow, noise = further_covariance(law, drift, alpha, sigma_v, walk, r)
+    slow, noise = further_covariance(law, drift, second, sigma_v, r)
     signal = slow + BIAS_SD**2 + z * sd**2 @ z.T
     dense = (signal + noise)[np.ix_(have, have)]
-    node = (np.array([law], np.int32), np.array([drift]), np.array([alpha]), np.array([sigma_v]))
-    beside = {"r": r, "z": z, "coefficient_sd": sd, "walk": np.array([walk])}
+    node = arrays([(law, drift, second, sigma_v)])
+    beside = {"r": r, "z": z, "coefficient_sd": sd}
     ln_p, mean, covariance = _reference.run_filters(y, DT, BIAS_MEAN, BIAS_SD, *node, **beside)
     expected = stats.multivariate_normal(np.full(have.sum(), BIAS_MEAN), dense).logpdf(y[have])
     assert ln_p[0] == pytest.approx(expected, abs=LN_P_TOLERANCE)
@@ -226,7 +227,7 @@ def test_bad_arguments_are_refused() -> None:
     y = np.zeros(5)
     with pytest.raises(ValueError, match="sigma_v"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(0, 0.0, 1.0, 0.0)]))
-    with pytest.raises(ValueError, match="law"):
+    with pytest.raises(ValueError, match="index into the laws"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(6, 0.0, 1.0, 1.0)]))
     with pytest.raises(ValueError, match="alpha"):
         _reference.run_filters(y, 1.0, 0.0, 1.0, *arrays([(4, 0.5, 0.0, 1.0)]))
@@ -271,8 +272,8 @@ def prior_density(prior: Prior, x: np.ndarray | float) -> np.ndarray:
 
 def box_quadrature(y: np.ndarray, r: np.ndarray, name: str, a_group: Group, points: int) -> dict:
     """Everything an engine reports of one hypothesis, by Gauss-Legendre over the prior box with the dense density."""
-    names = LAWS[name]
-    law = list(LAWS).index(name)
+    names = NAMED[name].parameters
+    law = list(NAMED).index(name)
     x, w = np.polynomial.legendre.leggauss(points)
     axes, weights = [], []
     for parameter in names:
@@ -339,7 +340,7 @@ def test_engine_equals_quadrature_over_the_prior_box(prior: str) -> None:
     for name, expected in zip(PLAIN, probability, strict=True):
         assert result.probability[name] == pytest.approx(expected, abs=2e-4)
         assert result.log_evidence[name] == pytest.approx(truth[name]["ln_evidence"], abs=4e-4)
-        for d, parameter in enumerate(LAWS[name]):
+        for d, parameter in enumerate(NAMED[name].parameters):
             got, sd = result.parameters[name][parameter], truth[name]["sd"][d]
             assert got.mean == pytest.approx(truth[name]["mean"][d], abs=2e-3 * sd)
             assert got.sd == pytest.approx(sd, rel=2e-3)
@@ -400,17 +401,17 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = {"N": 0, "K": 0}
     for seed in range(200):
         axis = _reference.Axis()
-        axis.law = list(LAWS).index("random_walk")
+        axis.law = NAMED["random_walk"].as_tuple
         axis.bias = BIAS_SD * random.normal()
-        for parameter in held:
+        for parameter, name in (("N", "N"), ("K", "drift")):
             prior = a_group.priors[parameter]
-            setattr(axis, parameter, prior.min * (prior.max / prior.min) ** random.uniform())
+            setattr(axis, name, prior.min * (prior.max / prior.min) ** random.uniform())
         scene = _reference.Scene()
         scene.seed, scene.rate_hz, scene.samples = seed, 1.0 / DT, 300
         y = _reference.simulate(scene, [axis])[0][0]
         estimates = identify_axis(y, DT, a_group, {"random_walk": 1.0}).parameters["random_walk"]
-        for parameter in held:
-            held[parameter] += estimates[parameter].q05 <= getattr(axis, parameter) <= estimates[parameter].q95
+        for parameter, true in (("N", axis.N), ("K", axis.drift)):
+            held[parameter] += estimates[parameter].q05 <= true <= estimates[parameter].q95
     low, high = stats.binom(200, 0.9).ppf([0.001, 0.999])
     for parameter, count in held.items():
         assert low <= count <= high, f"{parameter}: {count} of 200"

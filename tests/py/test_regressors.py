@@ -18,7 +18,8 @@ from selfcal import _library32
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import MOST_COLUMNS, PLAIN, Model
+from selfcal.laws import PLAIN
+from selfcal.model import MOST_COLUMNS, Model
 from selfcal.recording import save
 from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen

@@ -21,7 +21,7 @@ from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import identify_axis
 from selfcal.errors import UserError
-from selfcal.model import PLACES
+from selfcal.laws import PLACES
 from selfcal.recording import load
 from selfcal.tables import AxisTable, Tables, make_grid, make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples

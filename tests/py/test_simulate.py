@@ -16,7 +16,8 @@ from scipy import stats
 
 from selfcal import _reference, recording
 from selfcal.errors import UserError
-from selfcal.model import DEFAULT, LAWS, Model
+from selfcal.laws import NAMED
+from selfcal.model import DEFAULT, Model
 from selfcal.verbs.simulate import show, simulate
 
 DATA = Path(__file__).parents[1] / "data"
@@ -25,9 +26,9 @@ SIGMAS = 4.5
 
 def axis(law: str = "constant", **fields: float) -> _reference.Axis:
     made = _reference.Axis()
-    made.law = list(LAWS).index(law)
+    made.law = NAMED[law].as_tuple
     for name, value in fields.items():
-        setattr(made, name, value)
+        setattr(made, {"K": "drift", "sigma_m": "drift", "B": "drift", "alpha": "second"}.get(name, name), value)
     return made
 
 

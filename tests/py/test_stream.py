@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model
+from selfcal.model import Model
 from selfcal.tables import make_tables
 
 #: nat; what the double build is held to against the textbook bank.
@@ -30,7 +30,7 @@ def dense_log_likelihood(
     covariances written out (random walk from 0: sigma_w^2 min(i, j) with i, j from 1; Gauss-Markov: stationary)."""
     i = at - at[0]
     cov = np.full((y.size, y.size), p0) + np.diag(r) * sigma_v**2
-    law = list(LAWS)[int(node["law"])]
+    law = list(MODEL.hypotheses)[int(node["hypothesis"])]
     if law == "random_walk":
         cov += (math.exp(node["ln_rho"]) * sigma_v) ** 2 * (np.minimum.outer(i, i) + 1.0)
     elif law == "gauss_markov":

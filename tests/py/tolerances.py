@@ -29,7 +29,7 @@ from rich.table import Table
 
 from selfcal.engines import reference
 from selfcal.engines.library import Bank
-from selfcal.model import LAWS, PLAIN, SUMS
+from selfcal.laws import NAMED, PLAIN, SUMS
 from selfcal.recording import load
 from selfcal.result import AxisResult
 from selfcal.tables import make_tables
@@ -305,7 +305,7 @@ def ensemble() -> list[Row]:
 def jobs(longest: int, seeds: int) -> Iterator[Job]:
     """Every cell of the table."""
     lengths = [n for n in (10, 100, 1000, 10_000, 100_000, 1_000_000) if n <= longest]
-    for law in LAWS:
+    for law in NAMED:
         steps = 20.0 if law in SUMS else 1.0
         for n in lengths:
             for what in ("whole", "gaps"):
@@ -343,7 +343,7 @@ def show(rows: list[Row]) -> None:
     order = list(dict.fromkeys(row.pair for row in sorted(rows, key=lambda row: PAIRS.index(row.pair))))
     for pair in order:
         mine = [row for row in rows if row.pair == pair]
-        laws = {law: index for index, law in enumerate(LAWS)}
+        laws = {law: index for index, law in enumerate(NAMED)}
         mine.sort(
             key=lambda row: (list(LIMITS).index(row.build), laws.get(row.law, len(laws)), row.n, row.what, row.law)
         )

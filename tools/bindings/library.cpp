@@ -21,9 +21,10 @@ namespace nb = nanobind;
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
 using PriorTuple = std::tuple<double, double, bool>; // ln_min, ln_max, uniform
-using HypothesisTuple = std::tuple<int, double, std::optional<GridTuple>, std::optional<GridTuple>,
-                                   std::vector<std::vector<PriorTuple>>, // priors [axes][parameters], or none: the axes'
-                                   double>;                              // correlation_time_s
+using TermTuple = std::tuple<bool, double, double, bool, bool>; // walk, deviation, bandwidth, stated, by_ratio
+using LawTuple = std::tuple<std::vector<TermTuple>, bool>;      // terms, coloured_noise
+using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
+                                   std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none: the axes'
 
 using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -56,12 +57,11 @@ public:
             axes_.push_back(axis);
         }
         size_t nodes = 0;
-        for (const auto &[law, ln_probability, rho, alpha, priors, time_s] : hypotheses) {
-            const selfcal_hypothesis_t h{static_cast<selfcal_law_t>(law), static_cast<float>(ln_probability), add(rho), add(alpha),
-                                         add(priors), static_cast<float>(time_s)};
+        for (const auto &[law, ln_probability, rho, alpha, priors] : hypotheses) {
+            const selfcal_hypothesis_t h{add(law), static_cast<float>(ln_probability), add(rho), add(alpha), add(priors)};
             const size_t count = size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
             nodes += count;
-            term_nodes_ += law >= SELFCAL_FLICKER ? count : 0;
+            term_nodes_ += selfcal_law_is_sum(h.law) ? count : 0;
             hypotheses_.push_back(h);
         }
         model_ = {id,
@@ -175,7 +175,7 @@ public:
         selfcal_node_view_t v{};
         check(selfcal_node(&bank_, axis, index, &v));
         nb::dict d;
-        d["law"] = static_cast<int>(v.law);
+        d["hypothesis"] = static_cast<int>(v.hypothesis);
         d["ln_rho"] = v.ln_rho;
         d["ln_alpha"] = v.ln_alpha;
         d["a"] = v.a;
@@ -265,6 +265,18 @@ public:
     }
 
 private:
+    const selfcal_law_t *add(const LawTuple &t) {
+        const auto &[terms, coloured_noise] = t;
+        if (terms.size() > SELFCAL_LAW_TERMS)
+            throw std::invalid_argument("a law has at most " + std::to_string(SELFCAL_LAW_TERMS) + " terms");
+        selfcal_law_t &law = *laws_.emplace_back(std::make_unique<selfcal_law_t>());
+        law.coloured_noise = coloured_noise;
+        for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : terms)
+            law.term[law.terms++] = {walk ? SELFCAL_WALK : SELFCAL_MARKOV, static_cast<float>(deviation), static_cast<float>(bandwidth),
+                                     stated, by_ratio};
+        return &law;
+    }
+
     const selfcal_grid_t *add(const std::optional<GridTuple> &t) {
         if (!t)
             return nullptr;
@@ -314,6 +326,7 @@ private:
 
     std::vector<selfcal_axis_t> axes_;
     std::vector<selfcal_hypothesis_t> hypotheses_;
+    std::vector<std::unique_ptr<selfcal_law_t>> laws_;
     std::vector<std::unique_ptr<Grid>> grids_;
     std::vector<std::unique_ptr<std::vector<selfcal_prior_t>>> priors_;
     size_t term_nodes_ = 0;

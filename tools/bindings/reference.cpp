@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -75,45 +76,77 @@ sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, 
     return out;
 }
 
-sr::Node node(int law, double drift, double alpha, double sigma_v, double walk) {
-    if (law < 0 || law >= static_cast<int>(sr::laws))
-        throw std::invalid_argument("law must be 0 to " + std::to_string(sr::laws - 1));
-    const sr::Node out{static_cast<sr::Law>(law), drift, alpha, sigma_v, walk};
-    const bool free = out.law == sr::Law::constant;
-    const bool needs_alpha = !free && out.law != sr::Law::random_walk;
-    if (!(sigma_v > 0.0) || (!free && !(drift >= 0.0)) || (needs_alpha && !(alpha > 0.0)) || !(walk >= 0.0))
-        throw std::invalid_argument("sigma_v and alpha must be positive, drift and walk at least 0");
+// (walk, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured.
+using LawTuple = std::tuple<std::vector<std::tuple<bool, double, double, bool, bool>>, bool>;
+
+sr::Law law_of(const LawTuple &t) {
+    sr::Law law;
+    law.coloured_noise = std::get<1>(t);
+    for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : std::get<0>(t)) {
+        if (!(deviation > 0.0) || !std::isfinite(deviation) || (!walk && !(bandwidth > 0.0 && std::isfinite(bandwidth))))
+            throw std::invalid_argument("deviations and bandwidths of a law must be positive");
+        law.terms.push_back({walk, deviation, bandwidth, stated, by_ratio});
+    }
+    if (law.terms.size() > sr::terms_max)
+        throw std::invalid_argument("a law has at most " + std::to_string(sr::terms_max) + " terms");
+    return law;
+}
+
+LawTuple tuple_of(const sr::Law &law) {
+    LawTuple t;
+    std::get<1>(t) = law.coloured_noise;
+    for (const sr::Term &term : law.terms)
+        std::get<0>(t).emplace_back(term.walk, term.deviation, term.bandwidth, term.stated, term.by_ratio);
+    return t;
+}
+
+std::vector<sr::Law> laws_of(const std::vector<LawTuple> &tuples) {
+    std::vector<sr::Law> laws;
+    std::transform(tuples.begin(), tuples.end(), std::back_inserter(laws), law_of);
+    return laws;
+}
+
+sr::Node node(const std::vector<sr::Law> &laws, int hypothesis, double drift, double second, double sigma_v) {
+    if (hypothesis < 0 || hypothesis >= static_cast<int>(laws.size()))
+        throw std::invalid_argument("hypothesis must be 0 to " + std::to_string(laws.size() - 1) + ", an index into the laws");
+    const sr::Node out{static_cast<std::size_t>(hypothesis), drift, second, sigma_v};
+    const sr::Law &law = laws[out.hypothesis];
+    const bool has_second = law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), [](const sr::Term &term) {
+                                return term.by_ratio || (!term.walk && !term.stated);
+                            });
+    if (!(sigma_v > 0.0) || (!law.terms.empty() && !(drift >= 0.0)) || (has_second && !(second > 0.0)))
+        throw std::invalid_argument("sigma_v and alpha or a ratio must be positive, drift at least 0");
     return out;
 }
 
-std::vector<sr::Node> node_list(const Laws &law, const Vector &drift, const Vector &alpha, const Vector &sigma_v,
-                                const std::optional<Vector> &walk) {
-    const std::size_t m = law.shape(0);
-    if (drift.shape(0) != m || alpha.shape(0) != m || sigma_v.shape(0) != m || (walk && walk->shape(0) != m))
-        throw std::invalid_argument("law, drift, alpha, sigma_v and walk must have one length");
+std::vector<sr::Node> node_list(const std::vector<sr::Law> &laws, const Laws &hypothesis, const Vector &drift, const Vector &second,
+                                const Vector &sigma_v) {
+    const std::size_t m = hypothesis.shape(0);
+    if (drift.shape(0) != m || second.shape(0) != m || sigma_v.shape(0) != m)
+        throw std::invalid_argument("hypothesis, drift, second and sigma_v must have one length");
     std::vector<sr::Node> nodes;
     for (std::size_t j = 0; j < m; j++)
-        nodes.push_back(node(law(j), drift(j), alpha(j), sigma_v(j), walk ? (*walk)(j) : 0.0));
+        nodes.push_back(node(laws, hypothesis(j), drift(j), second(j), sigma_v(j)));
     return nodes;
 }
 
 std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, double bias_mean, double bias_sd,
-                                               const Laws &law, const Vector &drift, const Vector &alpha,
-                                               const Vector &sigma_v, const std::optional<Vector> &r,
-                                               const std::optional<Columns> &z,
-                                               const std::optional<Vector> &coefficient_sd,
-                                               const std::optional<Vector> &walk) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk);
+                                               const std::vector<LawTuple> &law_tuples, const Laws &hypothesis,
+                                               const Vector &drift, const Vector &second, const Vector &sigma_v,
+                                               const std::optional<Vector> &r, const std::optional<Columns> &z,
+                                               const std::optional<Vector> &coefficient_sd) {
+    const std::vector<sr::Law> laws = laws_of(law_tuples);
+    const std::vector<sr::Node> nodes = node_list(laws, hypothesis, drift, second, sigma_v);
     for (const sr::Node &one : nodes)
-        if (sr::order(one.law) != sr::order(nodes[0].law))
+        if (sr::order(laws[one.hypothesis]) != sr::order(laws[nodes[0].hypothesis]))
             throw std::invalid_argument("the laws of one call must have as many states each");
     const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     std::vector<sr::Filtered> filtered;
     {
         nb::gil_scoped_release release;
-        filtered = sr::run_filters(rec, nodes);
+        filtered = sr::run_filters(rec, laws, nodes);
     }
-    const std::size_t size = (nodes.empty() ? 1 : sr::order(nodes[0].law)) + 1 + rec.regressors;
+    const std::size_t size = (nodes.empty() ? 1 : sr::order(laws[nodes[0].hypothesis])) + 1 + rec.regressors;
     const Array<double> ln_p({nodes.size()}), mean({nodes.size(), size}), covariance({nodes.size(), size, size});
     for (std::size_t j = 0; j < nodes.size(); j++) {
         ln_p.data()[j] = filtered[j].ln_p;
@@ -124,11 +157,12 @@ std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, dou
 }
 
 std::tuple<Output, Output, Output, Output, Output, Output>
-run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const Laws &law, const Vector &drift,
-         const Vector &alpha, const Vector &sigma_v, const std::vector<double> &ln_prior,
-         const std::vector<std::size_t> &after, const std::optional<Vector> &r, const std::optional<Columns> &z,
-         const std::optional<Vector> &coefficient_sd, const std::optional<Vector> &walk) {
-    const std::vector<sr::Node> nodes = node_list(law, drift, alpha, sigma_v, walk);
+run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const std::vector<LawTuple> &law_tuples,
+         const Laws &hypothesis, const Vector &drift, const Vector &second, const Vector &sigma_v,
+         const std::vector<double> &ln_prior, const std::vector<std::size_t> &after, const std::optional<Vector> &r,
+         const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd) {
+    const std::vector<sr::Law> laws = laws_of(law_tuples);
+    const std::vector<sr::Node> nodes = node_list(laws, hypothesis, drift, second, sigma_v);
     if (ln_prior.size() != nodes.size())
         throw std::invalid_argument("ln_prior must have one value a node");
     for (std::size_t m = 0; m < after.size(); m++)
@@ -138,9 +172,9 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const L
     std::vector<sr::Posterior> posterior;
     {
         nb::gil_scoped_release release;
-        posterior = sr::run_bank(rec, nodes, ln_prior, after);
+        posterior = sr::run_bank(rec, laws, nodes, ln_prior, after);
     }
-    const std::size_t t = posterior.size(), k = sr::laws;
+    const std::size_t t = posterior.size(), k = laws.size();
     const Array<double> weight({t, nodes.size()}), probability({t, k}), mean({t, k, 3}), covariance({t, k, 3, 3}),
         bias_mean_now({t, k}), bias_var_now({t, k});
     for (std::size_t m = 0; m < t; m++) {
@@ -158,15 +192,16 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const L
             bias_var_now.numpy()};
 }
 
-Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, int law, double drift, double alpha,
-                   double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
-                   const std::optional<Vector> &coefficient_sd, double walk) {
-    const sr::Node one = node(law, drift, alpha, sigma_v, walk);
+Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, const LawTuple &law, double drift,
+                   double second, double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
+                   const std::optional<Vector> &coefficient_sd) {
+    const std::vector<sr::Law> laws = laws_of({law});
+    const sr::Node one = node(laws, 0, drift, second, sigma_v);
     const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
     const Array<double> out({rec.n});
     {
         nb::gil_scoped_release release;
-        sr::run_filter(rec, one, out.data());
+        sr::run_filter(rec, laws[0], one, out.data());
     }
     return out.numpy();
 }
@@ -200,12 +235,12 @@ std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<dou
 NB_MODULE(_reference, m) {
     using namespace nb::literals;
     m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
-    m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = nb::none());
-    m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = nb::none());
-    m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "alpha"_a,
-          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "walk"_a = 0.0);
+    m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a,
+          "second"_a, "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+    m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a, "second"_a,
+          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+    m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "second"_a,
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
 
     nb::class_<sr::Scene>(m, "Scene")
         .def(nb::init<>())
@@ -220,21 +255,12 @@ NB_MODULE(_reference, m) {
     nb::class_<sr::Axis>(m, "Axis")
         .def(nb::init<>())
         .def_prop_rw(
-            "law", [](const sr::Axis &axis) { return static_cast<int>(axis.law); },
-            [](sr::Axis &axis, int law) {
-                if (law < 0 || law >= static_cast<int>(sr::laws))
-                    throw std::invalid_argument("law must be 0 to 5");
-                axis.law = static_cast<sr::Law>(law);
-            })
+            "law", [](const sr::Axis &axis) { return tuple_of(axis.law); },
+            [](sr::Axis &axis, const LawTuple &law) { axis.law = law_of(law); })
         .def_rw("bias", &sr::Axis::bias)
         .def_rw("N", &sr::Axis::N)
-        .def_rw("K", &sr::Axis::K)
-        .def_rw("sigma_m", &sr::Axis::sigma_m)
-        .def_rw("alpha", &sr::Axis::alpha)
-        .def_rw("B", &sr::Axis::B)
-        .def_rw("spectral_ratio", &sr::Axis::spectral_ratio)
-        .def_rw("markov_ratio", &sr::Axis::markov_ratio)
-        .def_rw("correlation_time_s", &sr::Axis::correlation_time_s)
+        .def_rw("drift", &sr::Axis::drift)
+        .def_rw("second", &sr::Axis::second)
         .def_rw("range", &sr::Axis::range)
         .def_rw("lsb", &sr::Axis::lsb)
         .def_rw("temperature_coefficient", &sr::Axis::temperature_coefficient)

@@ -1,10 +1,10 @@
 """The textbook bank of Stepanov & Motorin (2017) and the recording simulator: host_sim/ compiled
 (bindings/reference.cpp).
 
-Nodes are arrays of one length m: `law` int32 (0 constant, 1 random walk, 2 Gauss-Markov: the order of model.LAWS;
-beyond the paper's 3 flicker, 4 moving average, 5 random walk and Gauss-Markov: host_sim/textbook_bank.hpp), `drift`
-(K in unit/s/sqrt(Hz), sigma_m or the flicker coefficient B in unit; not used by law 0), `alpha` (1/s, laws 2, 3 and
-5; law 4: the spectral ratio), `sigma_v` (unit, per sample: N / sqrt(dt_s)), and `walk` (K of law 5, default 0). A
+A law is a tuple (`laws.Law.as_tuple`). Nodes are arrays of one length m: `hypothesis` int32 (index into the laws),
+`drift` (K in unit/s/sqrt(Hz) if the law has a walk, else sigma_m or B in unit; not used without terms), `second` (alpha
+in 1/s, or the law's ratio), and `sigma_v` (unit, per sample: N / sqrt(dt_s)). The states of a drift are its terms in
+order (one that stays 0 without any), and e_i, e_(i-1) of coloured noise. A
 record is `y` float64[n] in its unit, NaN where a sample is missing, every `dt_s`; `r` float64[n] multiplies sigma_v^2,
 None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where
 y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in the unit of y per unit of each column.
@@ -16,6 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.laws import LawTuple
+
 _Floats = NDArray[np.float64]
 
 TEMPERATURE_LSB: float
@@ -26,41 +28,41 @@ def run_filters(
     dt_s: float,
     bias_mean: float,
     bias_sd: float,
-    law: NDArray[np.int32],
+    laws: Sequence[LawTuple],
+    hypothesis: NDArray[np.int32],
     drift: _Floats,
-    alpha: _Floats,
+    second: _Floats,
     sigma_v: _Floats,
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
-    walk: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats]:
     """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, d + 1 + p] and
-    covariance [m, d + 1 + p, d + 1 + p] of the state (drift, x0, c), where a drift has d = 1 state, under laws 3 to 5
-    three, three and two. The laws of one call must agree in d."""
+    covariance [m, d + 1 + p, d + 1 + p] of the state (drift, x0, c), where a drift has d states. The laws of
+    one call must agree in d."""
 
 def run_bank(
     y: _Floats,
     dt_s: float,
     bias_mean: float,
     bias_sd: float,
-    law: NDArray[np.int32],
+    laws: Sequence[LawTuple],
+    hypothesis: NDArray[np.int32],
     drift: _Floats,
-    alpha: _Floats,
+    second: _Floats,
     sigma_v: _Floats,
     ln_prior: Sequence[float],
     after: Sequence[int],
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
-    walk: _Floats | None = None,
 ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
     """The bank at t instants, `after` so many samples (ascending). `ln_prior`: ln of each node's prior probability, up
     to a constant.
 
-    Returns weight [t, m] (equations 11 and 13: they sum to 1 over all nodes), probability [t, 6] of the laws (13), mean
-    [t, 6, 3] and covariance [t, 6, 3, 3] of (drift, alpha, sigma_v) under each law (12, 14), and mean and variance [t,
-    6] of x0 + drift + c z now under each law. A law of probability 0 has NaN moments.
+    Returns weight [t, m] (equations 11 and 13: they sum to 1 over all nodes), probability [t, h] of the laws (13), mean
+    [t, h, 3] and covariance [t, h, 3, 3] of (drift, second, sigma_v) under each law (12, 14), and mean and variance
+    [t, h] of x0 + drift + c z now under each law. A law of probability 0 has NaN moments.
     """
 
 def innovations(
@@ -68,14 +70,13 @@ def innovations(
     dt_s: float,
     bias_mean: float,
     bias_sd: float,
-    law: int,
+    law: LawTuple,
     drift: float,
-    alpha: float,
+    second: float,
     sigma_v: float,
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
-    walk: float = 0.0,
 ) -> _Floats:
     """Standardised innovations nu / sqrt(s) [n] of one node's filter, NaN where a sample is missing."""
 
@@ -93,16 +94,11 @@ class Scene:
     def __init__(self) -> None: ...
 
 class Axis:
-    law: int
+    law: LawTuple
     bias: float
     N: float
-    K: float
-    sigma_m: float
-    alpha: float
-    B: float
-    spectral_ratio: float
-    markov_ratio: float
-    correlation_time_s: float
+    drift: float
+    second: float
     range: float
     lsb: float
     temperature_coefficient: float

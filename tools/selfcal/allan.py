@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from selfcal.engines.reference import textbook_node
-from selfcal.model import LAWS, Group
+from selfcal.laws import Law
+from selfcal.model import Group
 from selfcal.result import Estimate
 
 _Floats = NDArray[np.float64]
@@ -90,22 +90,21 @@ class Terms:
         return np.asarray(found)
 
 
-def terms_of(law: str, parameters: Mapping[str, float], dt_s: float, correlation_time_s: float = math.nan) -> Terms:
-    """A law of the model at `parameters` (continuous time, units.py), for readings every `dt_s`."""
-    at = {name: np.array([value]) for name, value in parameters.items()}
-    drift, second, walk = (float(value[0]) for value in textbook_node(law, at, correlation_time_s))
-    variance = parameters["N"] ** 2 / dt_s
-    if law == "constant":
-        return Terms(variance)
-    if law == "random_walk":
-        return Terms(variance, step=drift**2 * dt_s)
-    if law == "moving_average":
+def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float) -> Terms:
+    """A law at `parameters` (continuous time, units.py), for readings every `dt_s`."""
+    drift, second = law.node(parameters)
+    variance, lag1 = parameters["N"] ** 2 / dt_s, 0.0
+    if law.coloured_noise:
         theta = (second - 1.0) / (second + 1.0)
-        return Terms(variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2), step=drift**2 * dt_s)
-    if law == "flicker":
-        one = drift**2 * math.log(10.0) / math.pi
-        return Terms(variance, markov=tuple((one, second * dt_s * ratio) for ratio in (0.1, 1.0, 10.0)))
-    return Terms(variance, step=walk**2 * dt_s, markov=((drift**2, second * dt_s),))
+        variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
+    step = sum((term.deviation * drift) ** 2 * dt_s for term in law.terms if term.kind == "walk")
+    markov = []
+    for term in law.terms:
+        if term.kind == "markov":
+            alpha = term.bandwidth * (1.0 if term.stated else second)
+            sigma = term.deviation * drift * (second if term.by_ratio else 1.0)
+            markov.append((sigma**2 / (alpha if law.has_walk else 1.0), alpha * dt_s))
+    return Terms(variance, lag1, step, tuple(markov))
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
@@ -159,12 +158,13 @@ def fit_of(
     """The curve at `parameters` that `n` readings have determined, beside the group's priors. The information in them
     is Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum. `white` multiplies
     the white noise's variance."""
-    names = LAWS[law]
+    of = group.laws[law]
+    names = of.parameters
     ln_estimate = np.log([parameters[name] for name in names])
 
     def at(ln_theta: _Floats) -> Terms:
         theta = dict(zip(names, np.exp(ln_theta).tolist(), strict=True))
-        terms = terms_of(law, theta, dt_s, group.correlation_time_s)
+        terms = terms_of(of, theta, dt_s)
         return replace(terms, variance=terms.variance * white)
 
     k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
@@ -295,7 +295,7 @@ def _band(
     draws = np.exp(middle + z * np.where(z > 0.0, up, down))
     curves = []
     for draw in draws.tolist():
-        terms = terms_of(law, dict(zip(estimates, draw, strict=True)), dt_s, group.correlation_time_s)
+        terms = terms_of(group.laws[law], dict(zip(estimates, draw, strict=True)), dt_s)
         curves.append(replace(terms, variance=terms.variance * white).allan_variance(m))
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
     return low, high

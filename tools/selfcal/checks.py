@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 from selfcal.allan import Curve, curve_of, ratio_at
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out
 from selfcal.lattice import BELOW_LATTICE, lattice_of
-from selfcal.model import LAWS, Group
+from selfcal.model import Group
 from selfcal.recording import Recording, as_float
 from selfcal.result import AxisResult
 from selfcal.tables import Tables
@@ -109,11 +109,9 @@ def innovation_checks(
     """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a
     ramp that a random walk follows leaves one), white, normal and of one variance?"""
     from selfcal import _reference
-    from selfcal.engines.reference import textbook_node
 
-    law = result.best
-    at = {name: np.array([estimate.median]) for name, estimate in result.parameters[law].items()}
-    drift, alpha, walk = (float(value[0]) for value in textbook_node(law, at, group.correlation_time_s))
+    law = group.laws[result.best]
+    at = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
     offset = float(np.nanmean(blocks.mean))
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
@@ -122,14 +120,12 @@ def innovation_checks(
         tables.dt_s,
         -offset,
         group.priors["bias"].sd,
-        list(LAWS).index(law),
-        drift,
-        alpha,
-        float(at["N"][0]) / math.sqrt(tables.dt_s),
+        law.as_tuple,
+        *law.node(at),
+        at["N"] / math.sqrt(tables.dt_s),
         blocks.r,
         np.ascontiguousarray(z[:, used]) if used else None,
         sd[used] if used else None,
-        walk,
     )[1 + len(used) :]  # the first ones are the bias and the coefficients
     pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
     whole = nu[np.isfinite(nu)]

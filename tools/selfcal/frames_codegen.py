@@ -15,7 +15,7 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from selfcal.errors import UserError
-from selfcal.model import PARAMETERS
+from selfcal.laws import PARAMETERS
 from selfcal.units import parameter_unit
 from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATUS, load_dbc
 

@@ -13,7 +13,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from selfcal.model import LAWS, PLAIN
+from selfcal.laws import NAMED, PLAIN
 from selfcal.units import typeset
 from selfcal.wire import OFF_GRID, AxisReport, Decoder, signal_unit, status_text
 
@@ -160,7 +160,7 @@ class View:
         last = dict(self._last)  # Live asks from a thread of its own
         if last:
             laws = [
-                law for law in LAWS if law in PLAIN or any(f"{law}_probability" in r.values for r, _ in last.values())
+                law for law in NAMED if law in PLAIN or any(f"{law}_probability" in r.values for r, _ in last.values())
             ]
             parts.append(_line(_heading(laws, _bar_cells(laws, width))))
             blocks = self._blocks(last, laws, width)
@@ -236,7 +236,7 @@ def frame_counts(decoder: Decoder, source: Source) -> str:
 
 def most_probable(report: AxisReport) -> str | None:
     """The law with the greatest probability; None if one that did not arrive, or is no number, could be greater."""
-    known = {law: report.values[f"{law}_probability"] for law in LAWS if f"{law}_probability" in report.values}
+    known = {law: report.values[f"{law}_probability"] for law in NAMED if f"{law}_probability" in report.values}
     if not known or not (report.complete or known.keys() >= set(PLAIN)):
         return None
     if len({math.isnan(probability) for probability in known.values()}) > 1:
@@ -330,13 +330,13 @@ def _parameters(report: AxisReport) -> list[str]:
     if math.isnan(report.values[f"{law}_probability"]):
         return ["outside the priors"]
     said = []
-    for parameter in LAWS[law]:
+    for parameter in NAMED[law].parameters:
         name, inverse = f"{law}_{parameter}", parameter == "alpha"  # as a time, like the table
         keys = ("median", "q95", "q05") if inverse else ("median", "q05", "q95")
         middle, low, high = (_number(report, f"{name}_{key}", "%.3g", inverse=inverse) for key in keys)
         label = "1/alpha" if inverse else parameter
         unit = "s" if inverse else typeset(signal_unit(report.axis, f"{name}_median"))
         said.append(f"{label} {middle} [{low}, {high}] {unit}")
-    if any(int(report.values.get(f"{law}_{parameter}_flags", 0)) & OFF_GRID for parameter in LAWS[law]):
+    if any(int(report.values.get(f"{law}_{parameter}_flags", 0)) & OFF_GRID for parameter in NAMED[law].parameters):
         said.append("not borne by the grid of nodes")
     return said

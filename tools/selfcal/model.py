@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,31 +15,14 @@ import yaml
 
 from selfcal import units
 from selfcal.errors import UserError, short, shown
+from selfcal.laws import FACTORS, MOST_TERMS, NAMED, PARAMETERS, PLACES, RATIO_LIMITS, RATIOS, Law, Term
 from selfcal.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 
 SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 
-#: Hypothesis names in the order of `selfcal_law_t` (lib/selfcal.h), with the parameters of each.
-LAWS: dict[str, tuple[str, ...]] = {
-    "constant": ("N",),
-    "random_walk": ("N", "K"),
-    "gauss_markov": ("N", "sigma_m", "alpha"),
-    "flicker": ("N", "B", "alpha"),
-    "moving_average": ("N", "K", "spectral_ratio"),
-    "walk_and_markov": ("N", "K", "markov_ratio"),
-}
-#: Those that are sums of several terms: SELFCAL_TERMS_MAX of 3.
-SUMS = ("flicker", "moving_average", "walk_and_markov")
-#: The others: the paper's.
-PLAIN = tuple(law for law in LAWS if law not in SUMS)
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
-#: Parameter names in the order of `selfcal_parameter_t`.
-PARAMETERS = ("N", "K", "sigma_m", "alpha")
-#: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
-RATIOS = ("spectral_ratio", "markov_ratio")
-RATIO_LIMITS = (1e-3, 1e3)
 #: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/posterior.c).
 WIDEST_BIAS = 1e8
 #: Characters of a name or another text.
@@ -52,8 +35,6 @@ LARGEST = 1e18
 SMALLEST = 1e-20
 #: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
-#: Place of each parameter there; two share one where no law has both.
-PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
@@ -62,6 +43,8 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
 }
+#: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
+MOST_HYPOTHESES = 8
 #: Columns of all regressors together: SELFCAL_REGRESSORS_MAX.
 MOST_COLUMNS = 6
 
@@ -79,7 +62,7 @@ class Prior:
 @dataclass(frozen=True)
 class Group:
     """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and the ratios if a
-    hypothesis has them; units of `units.py`). `correlation_time_s`: the model's, of walk_and_markov."""
+    hypothesis has them; units of `units.py`). `laws`: the model's, by the names of its hypotheses."""
 
     name: str
     axes: tuple[str, ...]
@@ -88,7 +71,7 @@ class Group:
     lsb: float
     stuck_limit: int
     priors: Mapping[str, Prior]
-    correlation_time_s: float = math.nan
+    laws: Mapping[str, Law] = field(default_factory=lambda: NAMED)
 
 
 @dataclass(frozen=True)
@@ -132,16 +115,15 @@ class Gate:
 
 @dataclass(frozen=True)
 class GridNodes:
-    """Filter nodes of one target: random walk (rho) and by law (rho, alpha or a ratio)."""
+    """Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one."""
 
-    random_walk: int
-    pairs: Mapping[str, tuple[int, int]]
+    of: Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class Model:
-    """A checked model file. `hypotheses` holds prior probabilities that sum to 1; `simulate` the entry of that name,
-    its `axes` and `effects` always."""
+    """A checked model file. `hypotheses` holds prior probabilities that sum to 1, `laws` the law of each; `simulate`
+    the entry of that name, its `axes` and `effects` always."""
 
     name: str
     path: Path
@@ -151,6 +133,7 @@ class Model:
     filter_taps: int
     groups: tuple[Group, ...]
     hypotheses: Mapping[str, float]
+    laws: Mapping[str, Law]
     nodes: Mapping[str, GridNodes]
     simulate: Mapping[str, Any]
     regressors: tuple[Regressor, ...] = ()
@@ -329,7 +312,7 @@ class _Reader:
             raise self.fail(where, f"min and max must differ, within {reach}, not {low!r} to {high!r}")
         return Prior(law, min=low, max=high)
 
-    def group(self, name: str, tree: Any, laws: Collection[str], correlation_time_s: float) -> Group:
+    def group(self, name: str, tree: Any, laws: Mapping[str, Law]) -> Group:
         where = f"groups.{name}"
         fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors"), where)
         axes = self.entry(fields, "axes", where)
@@ -339,7 +322,11 @@ class _Reader:
             raise self.fail(f"{where}.axes", f"has {len(axes)} axes, {MOST_AXES} are the most")
         if not all(re.fullmatch(r"\w[\w.-]*", axis) and len(axis) <= LONGEST_TEXT for axis in axes):
             raise self.fail(f"{where}.axes", "a name is of letters, digits, '_', '.' and '-': the tables have it")
-        names = ("bias", *PARAMETERS, *(name for law in laws for name in LAWS[law] if name not in PARAMETERS))
+        names = (
+            "bias",
+            *PARAMETERS,
+            *(key for law in laws.values() for key in law.parameters if key not in PARAMETERS),
+        )
         known = ("bias", *PLACES)
         trees = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")
         priors = {
@@ -357,7 +344,7 @@ class _Reader:
             lsb=self.number(fields.get("lsb", 0.0), f"{where}.lsb", strict=False),
             stuck_limit=self.count(fields.get("stuck_limit", 0), f"{where}.stuck_limit", 0),
             priors=priors,
-            correlation_time_s=correlation_time_s,
+            laws=laws,
         )
 
     def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
@@ -425,23 +412,96 @@ class _Reader:
             N={name: self.number(value, f"gate.N.{name}") for name, value in noise.items()},
         )
 
-    def nodes(self, tree: Any, where: str, laws: Collection[str]) -> GridNodes:
-        known = ("gauss_markov", *SUMS)
-        fields = self.only(tree, ("random_walk", *known), where)
-        pairs = {}
-        for law in known:
-            if law != "gauss_markov" and law not in laws:
+    def nodes(self, tree: Any, where: str, laws: Mapping[str, Law]) -> GridNodes:
+        fields = self.only(tree, tuple(dict.fromkeys((*NAMED, *laws))), where)
+        found: dict[str, tuple[int, ...]] = {}
+        for name, law in laws.items():
+            what = [f"{key} nodes" for key in ("rho", *law.parameters[2:])] if law.terms else []
+            if not what:
                 continue
-            pair = self.entry(fields, law, where)
-            if not isinstance(pair, list) or len(pair) != 2:
-                raise self.fail(f"{where}.{law}", f"must be [rho nodes, {LAWS[law][2]} nodes]")
-            pairs[law] = (
-                self.count(pair[0], f"{where}.{law}", *NODES),
-                self.count(pair[1], f"{where}.{law}", *NODES),
-            )
-        return GridNodes(self.count(self.entry(fields, "random_walk", where), f"{where}.random_walk", *NODES), pairs)
+            given = self.entry(fields, name, where)
+            counts = given if isinstance(given, list) else [given]
+            if len(counts) != len(what) or isinstance(given, list) != (len(what) > 1):
+                shape = f"[{', '.join(what)}]" if len(what) > 1 else f"a number of {what[0]}"
+                raise self.fail(f"{where}.{name}", f"must be {shape}")
+            found[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
+        return GridNodes(found)
 
-    def simulate(self, tree: Any, axes: Collection[str]) -> dict[str, Any]:
+    def term(self, tree: Any, where: str) -> Term:
+        fields = {"kind": tree} if isinstance(tree, str) else tree
+        if not isinstance(fields, dict) or fields.get("kind") not in ("walk", "markov"):
+            raise self.fail(where, f"must be walk, markov, or a mapping with one of these as kind, not {shown(tree)}")
+        walk = fields["kind"] == "walk"
+        self.only(fields, ("kind", "deviation", *(() if walk else ("bandwidth", "correlation_time_s"))), where)
+        if "bandwidth" in fields and "correlation_time_s" in fields:
+            raise self.fail(where, "states bandwidth (times alpha) or correlation_time_s, not both")
+        by_ratio = fields.get("deviation") == "ratio"
+        if by_ratio and walk:
+            raise self.fail(f"{where}.deviation", "of a walk must be a number")
+        stated = "correlation_time_s" in fields
+        time_s = self.number(fields["correlation_time_s"], f"{where}.correlation_time_s") if stated else 1.0
+        numbers = {
+            key: self.number(fields.get(key, 1.0), f"{where}.{key}")
+            for key in ("deviation", "bandwidth")
+            if not (key == "deviation" and by_ratio)
+        }
+        for key, value in numbers.items():
+            if not FACTORS[0] <= value <= FACTORS[1]:
+                raise self.fail(f"{where}.{key}", f"must be {FACTORS[0]:g} to {FACTORS[1]:g}, not {value:g}")
+        bandwidth = 1.0 / time_s if stated else numbers["bandwidth"]
+        return Term(fields["kind"], numbers.get("deviation", 1.0), bandwidth, stated, by_ratio)
+
+    def law(self, tree: Any, where: str) -> Law:
+        terms = self.entry(tree, "terms", where)
+        coloured = tree.get("coloured_noise", False)
+        if not isinstance(coloured, bool):
+            raise self.fail(f"{where}.coloured_noise", f"must be true or false, not {shown(coloured)}")
+        if not isinstance(terms, list):
+            raise self.fail(f"{where}.terms", f"must be a list of terms, not {shown(terms)}")
+        most = MOST_TERMS - (1 if coloured else 0)
+        if len(terms) > most:
+            raise self.fail(
+                f"{where}.terms", f"has {len(terms)}, {most} are the most{' beside coloured noise' * coloured}"
+            )
+        law = Law(tuple(self.term(one, f"{where}.terms[{i}]") for i, one in enumerate(terms)), coloured)
+        by_ratio = sum(term.by_ratio for term in law.terms)
+        if coloured and not terms:
+            raise self.fail(where, "coloured noise needs a drift: give at least one term")
+        if by_ratio and by_ratio == len(terms):
+            raise self.fail(where, "a ratio needs a term without one: the drift parameter is that term's")
+        if (coloured + (by_ratio > 0) + law.has_alpha) > 1:
+            what = "alpha (a bandwidth that is not stated), a ratio, and coloured noise"
+            raise self.fail(where, f"has more than one of {what}: a law has one second parameter")
+        return law
+
+    def hypotheses(self, tree: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Law]]:
+        """Prior odds and law of each, named laws in their own order first."""
+        odds = self.entry(tree, "hypotheses", "")
+        if not isinstance(odds, dict) or not odds:
+            raise self.fail("hypotheses", f"must name at least one of {', '.join(NAMED)}, or state a law by its terms")
+        if len(odds) > MOST_HYPOTHESES:
+            raise self.fail("hypotheses", f"{len(odds)} are more than {MOST_HYPOTHESES}")
+        weights: dict[str, float] = {}
+        laws: dict[str, Law] = {}
+        for name in (*(name for name in NAMED if name in odds), *(name for name in odds if name not in NAMED)):
+            where, entry = f"hypotheses.{name}", odds[name]
+            if name in NAMED:
+                weights[name], laws[name] = self.number(entry, where), NAMED[name]
+                continue
+            if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w{0,31}", name, re.ASCII):
+                raise self.fail("hypotheses", f"{shown(name)}: a name is of letters, digits and '_', 32 at most")
+            if not isinstance(entry, dict):
+                known = ", ".join(NAMED)
+                raise self.fail(where, f"is no named law ({known}): state its probability and its terms")
+            self.only(entry, ("probability", "terms", "coloured_noise"), where)
+            weights[name] = self.number(entry.get("probability", 1.0), f"{where}.probability")
+            laws[name] = self.law(entry, where)
+        if "walk_and_markov" in laws:
+            time_s = self.number(self.entry(tree, "correlation_time_s", ""), "correlation_time_s")
+            laws["walk_and_markov"] = laws["walk_and_markov"].with_time(time_s)
+        return weights, laws
+
+    def simulate(self, tree: Any, axes: Collection[str], laws: Mapping[str, Law]) -> dict[str, Any]:
         fields = dict(self.only(tree, ("rate_hz", "duration_s", "axes", "effects"), "simulate"))
         if "rate_hz" in fields:
             fields["rate_hz"] = self.rate(fields["rate_hz"], "simulate.rate_hz")
@@ -457,12 +517,13 @@ class _Reader:
             if name not in axes:
                 raise self.fail("simulate.axes", f"the model has no axis {shown(name)} (it has {', '.join(axes)})")
         known = ("hypothesis", "bias", *PLACES)
+        known_laws = dict.fromkeys((*NAMED, *laws))
         truths = {name: dict(self.only(one or {}, known, f"simulate.axes.{name}")) for name, one in stated.items()}
         for name, truth in truths.items():
             where = f"simulate.axes.{name}"
             law = truth.get("hypothesis", "constant")
-            if not isinstance(law, str) or law not in LAWS:
-                raise self.fail(f"{where}.hypothesis", f"unknown {shown(law)} (known: {', '.join(LAWS)})")
+            if not isinstance(law, str) or law not in known_laws:
+                raise self.fail(f"{where}.hypothesis", f"unknown {shown(law)} (known: {', '.join(known_laws)})")
             for key in truth.keys() - {"hypothesis"}:
                 truth[key] = self.number(truth[key], f"{where}.{key}", low=-math.inf if key == "bias" else 0.0)
         return {**fields, "axes": truths, "effects": texts}
@@ -475,20 +536,14 @@ class _Reader:
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
         name = self.text(tree, "name", "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
-        odds = self.only(self.entry(tree, "hypotheses", ""), tuple(LAWS), "hypotheses")
-        weights = {law: self.number(odds[law], f"hypotheses.{law}") for law in LAWS if law in odds}
-        if not weights:
-            raise self.fail("hypotheses", f"must name at least one of {', '.join(LAWS)}")
-        time = math.nan
-        if "walk_and_markov" in weights:
-            time = self.number(self.entry(tree, "correlation_time_s", ""), "correlation_time_s")
+        weights, laws = self.hypotheses(tree)
         groups_tree = self.entry(tree, "groups", "")
         if not isinstance(groups_tree, dict) or not groups_tree:
             raise self.fail("groups", "must be a mapping of at least one group")
         for key in groups_tree:
             if not isinstance(key, str) or not key.isprintable() or len(key) > LONGEST_TEXT:
                 raise self.fail("groups", f"a group's name must be text, not {shown(key)}")
-        groups = tuple(self.group(name, fields, weights, time) for name, fields in groups_tree.items())
+        groups = tuple(self.group(name, fields, laws) for name, fields in groups_tree.items())
         axes = [axis for group in groups for axis in group.axes]
         if len(axes) > MOST_AXES:
             raise self.fail("groups", f"have {len(axes)} axes, {MOST_AXES} are the most")
@@ -507,8 +562,9 @@ class _Reader:
             filter_taps=self.count(sensor.get("filter_taps", 1), "sensor.filter_taps", 1, MOST_TAPS),
             groups=groups,
             hypotheses={law: weight / sum(weights.values()) for law, weight in weights.items()},
-            nodes={name: self.nodes(fields, f"nodes.{name}", weights) for name, fields in targets.items()},
-            simulate=self.simulate(tree.get("simulate") or {}, axes),
+            laws=laws,
+            nodes={name: self.nodes(fields, f"nodes.{name}", laws) for name, fields in targets.items()},
+            simulate=self.simulate(tree.get("simulate") or {}, axes, laws),
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,

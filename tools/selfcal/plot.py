@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.errors import UserError, printable
-from selfcal.model import LAWS
+from selfcal.laws import NAMED
 from selfcal.output import whole
 from selfcal.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire import AxisReport, axis_unit
@@ -98,7 +98,7 @@ def plot_run(
         time = np.array([report.time_s for report in reports])
         late = int(SETTLING * len(time))
         told = (truth or {}).get(axis)
-        laws = [law for law in LAWS if f"{law}_probability" in reports[-1].values]
+        laws = [law for law in NAMED if f"{law}_probability" in reports[-1].values]
         last = {law: reports[-1].value(f"{law}_probability") for law in laws}
         shown = {law: 1.0 if probability >= FAINT else 0.2 for law, probability in last.items()}
         for law in laws:
@@ -141,7 +141,7 @@ def plot_run(
     headings = ("P", *("1/alpha" if parameter == "alpha" else parameter for parameter in PANELS))
     for panel, heading in zip(grid[0], headings, strict=True):
         panel.set_title(heading, loc="left", fontweight="bold")
-    drawn = [law for law in LAWS if any(f"{law}_probability" in reports[-1].values for reports in history.values())]
+    drawn = [law for law in NAMED if any(f"{law}_probability" in reports[-1].values for reports in history.values())]
     handles = [Line2D([], [], color=COLORS[law], label=law.replace("_", " ")) for law in drawn]
     handles += [Line2D([], [], color="black", linestyle="--", label="truth")] if truth else []
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
@@ -161,7 +161,7 @@ def _verdict(last: Mapping[str, float], told: Any) -> tuple[str, str]:
         return "outside the priors", "black"
     best = max(finite, key=lambda law: finite[law])
     said = f"{best.replace('_', ' ')} {finite[best]:.3f}"
-    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(LAWS):
+    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(NAMED):
         said += f" (truth: {told['hypothesis'].replace('_', ' ')})"
     return said, COLORS[best]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from selfcal import units
-from selfcal.model import RATIOS
+from selfcal.laws import RATIOS
 
 
 @dataclass(frozen=True)

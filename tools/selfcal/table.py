@@ -13,7 +13,7 @@ from rich.table import Table
 
 from selfcal import units
 from selfcal.errors import printable
-from selfcal.model import LAWS, RATIOS, SUMS
+from selfcal.laws import RATIOS
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
 TABLE_WIDTH = 140
@@ -60,9 +60,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         caption_justify="left",
     )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
-    laws = {law for axis in axes.values() for law in axis["hypotheses"]}
-    drift = "K or sigma_m" if "flicker" not in laws else "K, sigma_m or B"
-    second = "1/alpha, s" + (", or ratio" if laws & {law for law in SUMS if LAWS[law][2] in RATIOS} else "")
+    known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
+    drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
+    second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
     for heading in ("law", "P", "N", drift, second):
         table.add_column(heading, no_wrap=True)
     failed = [

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PARAMETERS, PLACES, SUMS, Group, Model, Regressor
+from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
+from selfcal.model import Group, Model, Regressor
 from selfcal.units import same_kind
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
@@ -78,16 +79,15 @@ class RegressorTable:
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """One hypothesis: its law (index into LAWS), prior probability and grids; of a sum also each axis's priors (ln
-    limits, whether uniform) in the order of PARAMETERS, and the correlation time that it states."""
+    """One hypothesis: its law, prior probability and grids; of a sum also each axis's priors (ln limits, whether
+    uniform) in the order of PARAMETERS."""
 
     name: str
-    law: int
+    law: Law
     ln_probability: float
     rho: Grid | None
     alpha: Grid | None
     priors: tuple[tuple[tuple[float, float, bool], ...], ...] = ()
-    correlation_time_s: float = 0.0  # of walk_and_markov
 
     @property
     def nodes(self) -> int:
@@ -133,7 +133,7 @@ class Tables:
     @property
     def term_nodes(self) -> int:
         """Filters of the laws that are sums."""
-        return sum(h.nodes for h in self.hypotheses if h.name in SUMS)
+        return sum(h.nodes for h in self.hypotheses if h.law.is_sum)
 
     @property
     def id(self) -> int:
@@ -145,7 +145,7 @@ class Tables:
                 h.rho.nodes if h.rho else 0,
                 h.alpha.nodes if h.alpha else 0,
                 *h.priors,
-                *([h.correlation_time_s] if h.correlation_time_s else []),
+                *([h.law.as_tuple] if h.law.is_sum else []),
             )
             for h in self.hypotheses
         ]
@@ -221,17 +221,21 @@ def make_tables(
             f"{model.path}: half_life_s: {model.half_life_s:g} s are less than {_library32.BATCH} bank intervals "
             f"({_library32.BATCH * block / rate_hz:g} s)"
         )
-    time, dt = model.groups[0].correlation_time_s, block / rate_hz
-    if not math.isnan(time) and not dt / ALPHA_DT_MAX <= time <= TIME_MAX * dt:
-        raise UserError(
-            f"{model.path}: correlation_time_s: must be from {dt / ALPHA_DT_MAX:.3g} to {TIME_MAX * dt:.3g} s at bank "
-            f"intervals of {dt:g} s, not {time:g}"
-        )
-    grids: dict[str, tuple[Grid | None, Grid | None]] = {
-        "constant": (None, None),
-        "random_walk": (make_grid(nodes.random_walk), None),
-        **{law: (make_grid(rho), make_grid(alpha)) for law, (rho, alpha) in nodes.pairs.items()},
-    }
+    dt = block / rate_hz
+    for name, law in model.laws.items():
+        for time_s in (1.0 / term.bandwidth for term in law.terms if term.stated):
+            if not dt / ALPHA_DT_MAX <= time_s <= TIME_MAX * dt:
+                where = "correlation_time_s" if name in NAMED else f"hypotheses.{name}: correlation_time_s"
+                raise UserError(
+                    f"{model.path}: {where}: must be from {dt / ALPHA_DT_MAX:.3g} to {TIME_MAX * dt:.3g} s at bank "
+                    f"intervals of {dt:g} s, not {time_s:g}"
+                )
+
+    def grids(name: str) -> tuple[Grid | None, Grid | None]:
+        counts = nodes.of.get(name, ())
+        rho, alpha = (*(make_grid(count) for count in counts), None, None)[:2]
+        return rho, alpha
+
     return Tables(
         dt_s=float(np.float32(block / rate_hz)),
         block=block,
@@ -239,11 +243,10 @@ def make_tables(
         hypotheses=tuple(
             HypothesisTable(
                 name,
-                list(LAWS).index(name),
+                model.laws[name],
                 math.log(probability),
-                *grids[name],
-                priors=tuple(_priors(model.group_of(axis), name) for axis in names) if name in SUMS else (),
-                correlation_time_s=model.groups[0].correlation_time_s if name == "walk_and_markov" else 0.0,
+                *grids(name),
+                priors=tuple(_priors(model.group_of(axis), name) for axis in names) if model.laws[name].is_sum else (),
             )
             for name, probability in model.hypotheses.items()
         ),
@@ -258,7 +261,7 @@ def make_tables(
 
 def _priors(group: Group, law: str) -> tuple[tuple[float, float, bool], ...]:
     """In each place the prior of the parameter that the law has there, else that of the axis."""
-    of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in LAWS[law]}
+    of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
     chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
     return tuple((math.log(p.min), math.log(p.max), p.law == "uniform") for p in chosen)
 

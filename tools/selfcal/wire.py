@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from selfcal.errors import UserError
-from selfcal.model import LAWS
+from selfcal.laws import NAMED
 from selfcal.result import AxisResult, Estimate
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class AxisReport:
     def result(self) -> AxisResult:
         """The report as the engines give it. For complete reports only (KeyError otherwise)."""
         v = self.values
-        laws = [law for law in LAWS if f"{law}_probability" in v]
+        laws = [law for law in NAMED if f"{law}_probability" in v]
 
         def estimate(name: str) -> Estimate:
             numbers = {statistic: v[f"{name}_{statistic}"] for statistic in STATISTICS}
@@ -156,7 +156,7 @@ class AxisReport:
             n=int(v["count"]),
             log_evidence={law: evidence(law) for law in laws},
             probability={law: v[f"{law}_probability"] for law in laws},
-            parameters={law: {p: estimate(f"{law}_{p}") for p in LAWS[law]} for law in laws},
+            parameters={law: {p: estimate(f"{law}_{p}") for p in NAMED[law].parameters} for law in laws},
             bias_mean=v["bias_mean"],
             bias_sd=v["bias_sd"],
         )

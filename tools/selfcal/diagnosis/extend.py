@@ -14,7 +14,8 @@ import yaml
 from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
-from selfcal.model import MOST_COLUMNS, RATIO_LIMITS, Model
+from selfcal.laws import RATIO_LIMITS
+from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from selfcal import _coarse, _dense, _fixed16, _fixed32, _library32, _library64
 from selfcal.errors import UserError
-from selfcal.model import LAWS, PLACES
+from selfcal.laws import PLACES
 from selfcal.result import AxisResult, Estimate
 from selfcal.tables import AxisTable, Grid, Tables
 
@@ -53,14 +53,8 @@ class Bank:
         self.raw: Any = build.Bank(
             tables.dt_s,
             tables.block,
-            [
-                (list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit)
-                for a in tables.axes
-            ],
-            [
-                (h.law, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors, h.correlation_time_s)
-                for h in tables.hypotheses
-            ],
+            [(list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit) for a in tables.axes],
+            [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
             tables.id,
             _regressors(tables),
             tables.half_life_s,
@@ -109,7 +103,7 @@ class Bank:
             probability[table.name] = entry["probability"]
             coefficients[table.name] = tuple(entry["coefficients"][k] for k in used)
             parameters[table.name] = {
-                name: _estimate(entry["parameters"][PLACES[name]]) for name in LAWS[table.name]
+                name: _estimate(entry["parameters"][PLACES[name]]) for name in table.law.parameters
             }
         if not self.tables.regressors and not any(math.isfinite(p) for p in probability.values()):
             raise UserError(outside_priors(self.tables.axes[axis]))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from selfcal import _reference
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Group, Prior
+from selfcal.model import Group, Prior
 from selfcal.result import AxisResult, Estimate
 
 _Floats = NDArray[np.float64]
@@ -37,8 +37,6 @@ _LN_EVIDENCE, _MOMENT = 4e-4, 5e-3
 _MOST = 1_000_000
 #: Scan for modes: points in each drift parameter, by the number of those.
 _SCAN = {0: (), 1: (25,), 2: (11, 9)}
-#: What of a law's states is drift, where that is not the one it has.
-_DRIFT = {"flicker": (1.0, 1.0, 1.0), "moving_average": (1.0, 0.0, 0.0), "walk_and_markov": (1.0, 1.0)}
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -59,18 +57,6 @@ class _Posterior:
     parameters: dict[str, Estimate]
     mean: _Floats
     var: _Floats
-
-
-def textbook_node(
-    law: str, parameters: Mapping[str, _Floats], correlation_time_s: float = math.nan
-) -> tuple[_Floats, _Floats, _Floats]:
-    """`drift`, `alpha` and `walk` of the textbook's nodes (_reference.pyi) from a law's `parameters`, [m] each."""
-    none = np.zeros_like(parameters["N"])
-    second = [parameters[name] for name in LAWS[law][1:]]
-    if law != "walk_and_markov":
-        return second[0] if second else none, second[1] if len(second) > 1 else none + 1.0, none
-    walk, ratio = second
-    return ratio * walk * math.sqrt(correlation_time_s), none + 1.0 / correlation_time_s, walk
 
 
 def identify_axis(
@@ -125,32 +111,34 @@ def _posterior(
     columns: tuple[_Floats, _Floats] | None,
 ) -> _Posterior:
     z, sd = (None, None) if columns is None else columns
-    drift = _DRIFT.get(law, (1.0,))
+    of = group.laws[law]
+    states = max(1, len(of.terms))
+    drift = [*[1.0] * states, *[0.0] * (2 if of.coloured_noise else 0)]  # e_i and e_(i-1) are noise
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     now = np.concatenate([drift, [1.0], columns_now])
-    names = LAWS[law]
+    names = of.parameters
     priors = [group.priors[name] for name in names]
     low = np.log([prior.min for prior in priors])
     high = np.log([prior.max for prior in priors])
-    index = list(LAWS).index(law)
 
     def filtered(x: _Floats) -> _Filtered:
         """x [m, parameters]: ln of each parameter."""
         theta = {name: np.ascontiguousarray(column) for name, column in zip(names, np.exp(x).T, strict=True)}
-        drift_of, alpha, walk = textbook_node(law, theta, group.correlation_time_s)
+        none = np.ones(len(x))
+        drift_of, second = (*(theta[name] for name in names[1:]), none, none)[:2]
         ln_p, mean, covariance = _reference.run_filters(
             y,
             dt,
             -offset,
             group.priors["bias"].sd,
-            np.full(len(x), index, np.int32),
+            [of.as_tuple],
+            np.zeros(len(x), np.int32),
             drift_of,
-            alpha,
+            second,
             theta["N"] / math.sqrt(dt),
             r,
             z,
             sd,
-            walk,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
         own = np.diagonal(covariance, axis1=1, axis2=2)[:, len(drift) + 1 :]

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model
+from selfcal.model import Model
 from selfcal.output import whole
 from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
@@ -149,6 +149,7 @@ def _source(model: Model, tables: Tables) -> str:
             named = zip(h.priors, tables.axes, strict=True)
             rows = (f"    {_priors(priors)}, /* {axis.name} */" for priors, axis in named)
             parts += [f"static const selfcal_prior_t priors_of_{h.name}[] = {{", *rows, "};", ""]
+    parts += [line for h in tables.hypotheses for line in _law(h)]
     hypotheses = (_hypothesis(h) for h in tables.hypotheses)
     parts += ["static const selfcal_hypothesis_t hypotheses[] = {", *hypotheses, "};", ""]
     parts += _regressors(tables)
@@ -232,11 +233,21 @@ def _gate(model: Model, tables: Tables) -> list[str]:
     ]
 
 
+def _law(hypothesis: HypothesisTable) -> list[str]:
+    terms, coloured = hypothesis.law.as_tuple
+    flag = ("false", "true")
+    rows = [
+        f"    {{{'SELFCAL_WALK' if walk else 'SELFCAL_MARKOV'}, {_f(deviation)}, {_f(bandwidth)}, {flag[stated]}, "
+        f"{flag[by_ratio]}}},"
+        for walk, deviation, bandwidth, stated, by_ratio in terms
+    ]
+    head = f"static const selfcal_law_t law_{hypothesis.name} = {{{len(terms)}U, {flag[coloured]}, {{"
+    return [head, *rows, "}};", ""] if rows else [f"{head}{{SELFCAL_WALK, 0.0F, 0.0F, false, false}}}}}};", ""]
+
+
 def _hypothesis(hypothesis: HypothesisTable) -> str:
-    law = f"SELFCAL_{list(LAWS)[hypothesis.law].upper()}"
     rho, alpha = (f"&grid_{grid.nodes}" if grid else "NULL" for grid in (hypothesis.rho, hypothesis.alpha))
     prior = f", .prior = priors_of_{hypothesis.name}" if hypothesis.priors else ""
-    if hypothesis.correlation_time_s:
-        prior += f", .correlation_time_s = {_f(hypothesis.correlation_time_s)}"
     chance = _f(hypothesis.ln_probability)
+    law = f"&law_{hypothesis.name}"
     return f"    {{.law = {law}, .ln_probability = {chance}, .rho = {rho}, .alpha = {alpha}{prior}}},"

@@ -24,7 +24,8 @@ from rich.table import Table
 
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Group, Model, Prior
+from selfcal.laws import Law, named
+from selfcal.model import Group, Model, Prior
 from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
 
@@ -89,10 +90,9 @@ def montecarlo(
 
 
 def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of a law and the bias, drawn from the group's priors; the correlation time where the law states it."""
-    truth = {name: _draw(group.priors[name], rng) for name in LAWS[law]}
-    stated = {"correlation_time_s": group.correlation_time_s} if law == "walk_and_markov" else {}
-    return {**truth, **stated, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
+    """Parameters of a law and the bias, drawn from the group's priors."""
+    truth = {name: _draw(group.priors[name], rng) for name in group.laws[law].parameters}
+    return {**truth, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> float:
@@ -102,17 +102,20 @@ def _draw(prior: Prior, rng: np.random.Generator) -> float:
 
 
 def simulate_bank_samples(
-    law: str, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int
+    law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int
 ) -> tuple[NDArray[np.float64], float]:
-    """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample."""
+    """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
+
+    A law by its name takes a stated correlation time from the truth's `correlation_time_s`.
+    """
     from selfcal import _reference
 
     scene = _reference.Scene()
     scene.seed, scene.rate_hz, scene.samples, scene.block, scene.filter_taps = seed, rate_hz, samples, 1, 1
     axis = _reference.Axis()
-    axis.law = list(LAWS).index(law)
-    for name, value in truth.items():
-        setattr(axis, name, value)
+    of = named(law, truth.get("correlation_time_s", math.nan)) if isinstance(law, str) else law
+    axis.law, axis.N, axis.bias = of.as_tuple, truth["N"], truth.get("bias", 0.0)
+    axis.drift, axis.second = of.node(truth)
     values, _, _, _, bias_now = _reference.simulate(scene, [axis])
     return values[0], float(bias_now[0])
 
@@ -122,8 +125,11 @@ def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
 
     law, seed = job
     tables = make_tables(model, model.bank_rate_hz, (axis,))
-    truth = draw(model.group_of(axis), law, np.random.default_rng([seed, list(LAWS).index(law)]))
-    y, bias_now = simulate_bank_samples(law, truth, model.bank_rate_hz, round(duration_s * model.bank_rate_hz), seed)
+    place = list(model.hypotheses).index(law)
+    truth = draw(model.group_of(axis), law, np.random.default_rng([seed, place]))
+    y, bias_now = simulate_bank_samples(
+        model.laws[law], truth, model.bank_rate_hz, round(duration_s * model.bank_rate_hz), seed
+    )
     bank = Bank(tables)
     bank.push(y[:, None])
     result = bank.report(0)
@@ -141,7 +147,7 @@ def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str
     for law in dict.fromkeys(record.law for record in found):
         mine = [record for record in found if record.law == law]
         parameters = {}
-        for name in LAWS[law]:
+        for name in mine[0].estimates:
             truth = np.array([record.truth[name] for record in mine])
             mean, sd, q05, q95 = np.array([record.estimates[name] for record in mine]).T
             parameters[name] = {

@@ -26,8 +26,9 @@ from selfcal.checks import Judged, judge, with_lattice
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError, note
+from selfcal.laws import SUMS
 from selfcal.live import View, frame_counts
-from selfcal.model import SUMS, Model
+from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.result import in_unit

@@ -14,7 +14,8 @@ from rich.console import Console
 
 from selfcal import _reference, recording, units
 from selfcal.errors import UserError, printable
-from selfcal.model import LAWS, PARAMETERS, Group, Model, Prior
+from selfcal.laws import NAMED, PARAMETERS, PLACES
+from selfcal.model import Group, Model, Prior
 from selfcal.output import check_place
 from selfcal.tables import bank_block
 
@@ -140,7 +141,7 @@ def show(meta: Mapping[str, Any], output: Path | str) -> None:
     within = output.suffix.lower() == ".npz"
     print("the truth, in its member `meta`:" if within else printable(f"{recording.meta_place(output)}: the truth:"))
     for axis, truth in meta["truth"].items():
-        values = (f"{key} {truth[key]:.4g} {truth['units'][key]}" for key in ("bias", *LAWS[truth["hypothesis"]]))
+        values = (f"{key} {truth[key]:.4g} {truth['units'][key]}" for key in ("bias", *PLACES) if key in truth)
         print(f"  {axis}: {truth['hypothesis']}, {', '.join(values)}")
 
 
@@ -181,14 +182,16 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         law = fields.get("hypothesis", law)
         drawn |= {key: value for key, value in fields.items() if key != "hypothesis"}
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
-        for parameter in LAWS[law]:
+        of = model.laws.get(law, NAMED.get(law))
+        if of is None or any(math.isnan(term.bandwidth) for term in of.terms):
+            raise UserError(f"{model.path}: simulate.{where}.hypothesis: the model has no hypothesis '{law}'")
+        for parameter in of.parameters:
             if parameter not in drawn:
                 raise UserError(f"{model.path}: simulate.{where}: '{parameter}' is missing and has no prior")
             truth[name][parameter] = drawn[parameter]
-        if law == "walk_and_markov":
-            if law not in model.hypotheses:
-                raise UserError(f"{model.path}: simulate.{where}.hypothesis: the model has no hypothesis '{law}'")
-            truth[name]["correlation_time_s"] = model.group_of(name).correlation_time_s
+        times = [1.0 / term.bandwidth for term in of.terms if term.stated]
+        if times:
+            truth[name]["correlation_time_s"] = times[0] if len(times) == 1 else times
     return truth
 
 
@@ -209,9 +212,9 @@ def _draw(prior: Prior, u: float) -> float:
 
 def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
     axis = _reference.Axis()
-    axis.law = list(LAWS).index(truth["hypothesis"])
-    for key in truth.keys() - {"hypothesis", "unit"}:
-        setattr(axis, key, truth[key])
+    law = {**NAMED, **group.laws}[truth["hypothesis"]]
+    axis.law, axis.bias, axis.N = law.as_tuple, truth["bias"], truth["N"]
+    axis.drift, axis.second = law.node(truth)
     axis.range, axis.lsb = group.range, group.lsb
     return axis
 

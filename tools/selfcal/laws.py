@@ -1,0 +1,131 @@
+"""Laws as data: a law is the terms of its drift and the kind of its white noise (`selfcal_law_t` in lib/selfcal.h).
+
+`NAMED` holds the laws that a model file may give by name alone. A model file states any other law as a list of terms.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+#: Terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
+MOST_TERMS = 3
+#: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank.c.
+FACTORS = (1e-3, 1e3)
+#: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
+PARAMETERS = ("N", "K", "sigma_m", "alpha")
+#: Place of each parameter there. No law has two of one place.
+PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
+#: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
+RATIOS = ("spectral_ratio", "markov_ratio")
+RATIO_LIMITS = (1e-3, 1e3)
+
+#: (walk, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
+LawTuple = tuple[list[tuple[bool, float, float, bool, bool]], bool]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term of a drift. `deviation` multiplies the law's drift parameter, with `by_ratio` the law's ratio does too.
+
+    `bandwidth` of a Gauss-Markov term multiplies alpha; if `stated` it is the bandwidth itself, 1/s.
+    """
+
+    kind: str  # "walk" or "markov"
+    deviation: float = 1.0
+    bandwidth: float = 1.0
+    stated: bool = False
+    by_ratio: bool = False
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law by its terms. `drift_name` is the drift parameter's name where it is neither K nor sigma_m."""
+
+    terms: tuple[Term, ...] = ()
+    coloured_noise: bool = False
+    drift_name: str = ""
+
+    @property
+    def has_walk(self) -> bool:
+        """Its drift parameter is K."""
+        return any(term.kind == "walk" for term in self.terms)
+
+    @property
+    def has_alpha(self) -> bool:
+        """A bandwidth is unknown."""
+        return any(term.kind == "markov" and not term.stated for term in self.terms)
+
+    @property
+    def second(self) -> str:
+        """Name of the second parameter: alpha, a ratio, or "" if the law has neither."""
+        if self.coloured_noise:
+            return "spectral_ratio"
+        if any(term.by_ratio for term in self.terms):
+            return "markov_ratio"
+        return "alpha" if self.has_alpha else ""
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of its parameters: N, the drift parameter, the second one; those it has."""
+        drift = self.drift_name or ("K" if self.has_walk else "sigma_m") if self.terms else ""
+        return tuple(name for name in ("N", drift, self.second) if name)
+
+    @cached_property
+    def is_sum(self) -> bool:
+        """It needs the filters for several states: `selfcal_law_is_sum()`."""
+        plain = (Term("walk"), Term("markov"))
+        return self.coloured_noise or len(self.terms) > 1 or any(term not in plain for term in self.terms)
+
+    @cached_property
+    def as_tuple(self) -> LawTuple:
+        """For the bindings."""
+        terms = [(t.kind == "walk", t.deviation, self.bandwidth(t), t.stated, t.by_ratio) for t in self.terms]
+        return terms, self.coloured_noise
+
+    @staticmethod
+    def bandwidth(term: Term) -> float:
+        """As lib/selfcal.h has it: 0 of a walk."""
+        return 0.0 if term.kind == "walk" else term.bandwidth
+
+    def node(self, parameters: Mapping[str, float]) -> tuple[float, float]:
+        """Drift and second parameter from values by name; 0 and 1 where the law has none."""
+        drift, second = (*self.parameters[1:], "", "")[:2]
+        return parameters[drift] if drift else 0.0, parameters[second] if second else 1.0
+
+    def with_time(self, correlation_time_s: float) -> Law:
+        """The same with a correlation time for the term whose stated bandwidth is left open (NaN)."""
+        open_terms = (t.stated and math.isnan(t.bandwidth) for t in self.terms)
+        terms = (
+            replace(t, bandwidth=1.0 / correlation_time_s) if is_open else t
+            for t, is_open in zip(self.terms, open_terms, strict=True)
+        )
+        return replace(self, terms=tuple(terms))
+
+
+def _flicker() -> Law:
+    """Three Gauss-Markov terms of one deviation, a decade apart. With the deviation B sqrt(ln(10)/pi) their two-sided
+    spectrum is B^2 / (2 pi f) within 12 % where 2 pi f is between the outer bandwidths."""
+    deviation = math.sqrt(math.log(10.0) / math.pi)
+    return Law(tuple(Term("markov", deviation, ratio) for ratio in (0.1, 1.0, 10.0)), drift_name="B")
+
+
+#: Laws that a model file may give by name. `walk_and_markov` takes its time from the model's correlation_time_s.
+NAMED: dict[str, Law] = {
+    "constant": Law(),
+    "random_walk": Law((Term("walk"),)),
+    "gauss_markov": Law((Term("markov"),)),
+    "flicker": _flicker(),
+    "moving_average": Law((Term("walk"),), coloured_noise=True),
+    "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
+}
+#: Those that are sums of several terms, and the others, which are the paper's.
+SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
+PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
+
+
+def named(name: str, correlation_time_s: float = math.nan) -> Law:
+    """A named law; `correlation_time_s` is for walk_and_markov."""
+    return NAMED[name].with_time(correlation_time_s)
