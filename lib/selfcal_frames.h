@@ -1,12 +1,12 @@
-/* The telemetry frame format in numbers. Generated from selfcal.dbc, which describes every item:
- * python -m selfcal.frames_codegen. Do not edit. */
+/* The telemetry frame format in numbers. selfcal.dbc describes every item.
+ * Generated: python -m selfcal.frames_codegen. Do not edit. */
 #ifndef SELFCAL_FRAMES_H
 #define SELFCAL_FRAMES_H
 
-#define SELFCAL_FRAMES_VERSION 3U
+#define SELFCAL_FRAMES_VERSION 4U
 
-/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number; the
- * value of the item is in bits 0 to 31. */
+/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number.
+ * The value of the item is in bits 0 to 31. */
 #define SELFCAL_FRAME_ITEM_SHIFT 32U
 #define SELFCAL_FRAME_ITEM_MASK 0x3FU
 #define SELFCAL_FRAME_COUNTER_SHIFT 38U
@@ -16,24 +16,29 @@
 #define SELFCAL_FRAME_CRC_SHIFT 52U
 #define SELFCAL_FRAME_CRC_MASK 0xFFFU
 
+/* Identifiers of node 0. Those of node n are SELFCAL_FRAME_NODE_IDS n higher. */
+#define SELFCAL_FRAME_NODES 12U
+#define SELFCAL_FRAME_NODE_IDS 128U
 #define SELFCAL_FRAME_STATUS_ID 0x200U
 #define SELFCAL_FRAME_CORRECTED_ID 0x207U
 #define SELFCAL_FRAME_COMMAND_ID 0x208U
 #define SELFCAL_FRAME_ANSWER_ID 0x209U
 
-/* Axis name and id of each axis message. */
-#define SELFCAL_FRAME_AXES 6U
-#define SELFCAL_FRAME_AXIS_TABLE \
-    { \
-        {"gx", 0x201U}, \
-        {"gy", 0x202U}, \
-        {"gz", 0x203U}, \
-        {"ax", 0x204U}, \
-        {"ay", 0x205U}, \
-        {"az", 0x206U}, \
-    }
+/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */
+#define SELFCAL_FRAME_AXIS_ID 0x201U
+#define SELFCAL_FRAME_HYPOTHESIS_ID 0x220U
+#define SELFCAL_FRAME_COEFFICIENTS_ID 0x20AU
+#define SELFCAL_FRAME_ADEQUACY_ID 0x210U
 
-/* Items of an axis message; units of a gyro axis, those of an accelerometer are alike in m/s^2. */
+/* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */
+#define SELFCAL_FRAME_AXES 6U
+#define SELFCAL_FRAME_AXIS_NAMES {"gx", "gy", "gz", "ax", "ay", "az"}
+#define SELFCAL_FRAME_HYPOTHESES 8U
+#define SELFCAL_FRAME_PLACES 3U
+#define SELFCAL_FRAME_STATISTICS 5U
+
+/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */
+/* Items of the message GX. */
 enum {
     SELFCAL_AXIS_TIME_MS = 0, /* uint32, ms */
     SELFCAL_AXIS_COUNT = 1, /* uint32 */
@@ -42,51 +47,11 @@ enum {
     SELFCAL_AXIS_STUCK = 2, /* uint1, bit 2 */
     SELFCAL_AXIS_GAPS = 2, /* uint1, bit 3 */
     SELFCAL_AXIS_BLOCKS_LOST = 2, /* uint1, bit 4 */
+    SELFCAL_AXIS_HYPOTHESES = 2, /* uint4, bits 8 to 11 */
+    SELFCAL_AXIS_COLUMNS = 2, /* uint3, bits 12 to 14 */
     SELFCAL_AXIS_LN_EVIDENCE = 3, /* float32, nat */
     SELFCAL_AXIS_BIAS_MEAN = 4, /* float32, deg/s */
     SELFCAL_AXIS_BIAS_SD = 5, /* float32, deg/s */
-    SELFCAL_AXIS_CONSTANT_PROBABILITY = 6, /* float32 */
-    SELFCAL_AXIS_RANDOM_WALK_PROBABILITY = 7, /* float32 */
-    SELFCAL_AXIS_GAUSS_MARKOV_PROBABILITY = 8, /* float32 */
-    SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF = 9, /* int32 x 0.001, nat */
-    SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF = 10, /* int32 x 0.001, nat */
-    SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF = 11, /* int32 x 0.001, nat */
-    SELFCAL_AXIS_CONSTANT_N_FLAGS = 12, /* uint4, bits 0 to 3 */
-    SELFCAL_AXIS_RANDOM_WALK_N_FLAGS = 12, /* uint4, bits 4 to 7 */
-    SELFCAL_AXIS_RANDOM_WALK_K_FLAGS = 12, /* uint4, bits 8 to 11 */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS = 12, /* uint4, bits 12 to 15 */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS = 12, /* uint4, bits 16 to 19 */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS = 12, /* uint4, bits 20 to 23 */
-    SELFCAL_AXIS_CONSTANT_N_MEAN = 13, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_CONSTANT_N_MEDIAN = 14, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_CONSTANT_N_SD = 15, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_CONSTANT_N_Q05 = 16, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_CONSTANT_N_Q95 = 17, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_N_MEAN = 18, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_N_MEDIAN = 19, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_N_SD = 20, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_N_Q05 = 21, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_N_Q95 = 22, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_K_MEAN = 23, /* float32, deg/s^2/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_K_MEDIAN = 24, /* float32, deg/s^2/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_K_SD = 25, /* float32, deg/s^2/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_K_Q05 = 26, /* float32, deg/s^2/sqrt(Hz) */
-    SELFCAL_AXIS_RANDOM_WALK_K_Q95 = 27, /* float32, deg/s^2/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_MEAN = 28, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_MEDIAN = 29, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_SD = 30, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_Q05 = 31, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_N_Q95 = 32, /* float32, deg/s/sqrt(Hz) */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEAN = 33, /* float32, deg/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEDIAN = 34, /* float32, deg/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_SD = 35, /* float32, deg/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_Q05 = 36, /* float32, deg/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_Q95 = 37, /* float32, deg/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEAN = 38, /* float32, 1/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEDIAN = 39, /* float32, 1/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_SD = 40, /* float32, 1/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_Q05 = 41, /* float32, 1/s */
-    SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_Q95 = 42, /* float32, 1/s */
     SELFCAL_AXIS_END_TIME_MS = 43, /* uint24, bits 0 to 23, ms */
     SELFCAL_AXIS_END_ITEMS = 43, /* uint8, bits 24 to 31 */
 };
@@ -101,27 +66,84 @@ enum {
 #define SELFCAL_AXIS_GAPS_MASK 0x1U
 #define SELFCAL_AXIS_BLOCKS_LOST_SHIFT 4U
 #define SELFCAL_AXIS_BLOCKS_LOST_MASK 0x1U
-#define SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF_PER_UNIT 1000.0
-#define SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF_PER_UNIT 1000.0
-#define SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF_PER_UNIT 1000.0
-#define SELFCAL_AXIS_CONSTANT_N_FLAGS_SHIFT 0U
-#define SELFCAL_AXIS_CONSTANT_N_FLAGS_MASK 0xFU
-#define SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_SHIFT 4U
-#define SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_MASK 0xFU
-#define SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_SHIFT 8U
-#define SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_MASK 0xFU
-#define SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_SHIFT 12U
-#define SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_MASK 0xFU
-#define SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS_SHIFT 16U
-#define SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS_MASK 0xFU
-#define SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS_SHIFT 20U
-#define SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS_MASK 0xFU
+#define SELFCAL_AXIS_HYPOTHESES_SHIFT 8U
+#define SELFCAL_AXIS_HYPOTHESES_MASK 0xFU
+#define SELFCAL_AXIS_COLUMNS_SHIFT 12U
+#define SELFCAL_AXIS_COLUMNS_MASK 0x7U
 #define SELFCAL_AXIS_END_TIME_MS_SHIFT 0U
 #define SELFCAL_AXIS_END_TIME_MS_MASK 0xFFFFFFU
 #define SELFCAL_AXIS_END_ITEMS_SHIFT 24U
 #define SELFCAL_AXIS_END_ITEMS_MASK 0xFFU
 
-/* Items of the status message. */
+/* Items of the message GX_H0. */
+enum {
+    SELFCAL_HYPOTHESIS_PROBABILITY = 0, /* float32 */
+    SELFCAL_HYPOTHESIS_LN_EVIDENCE_DIFF = 1, /* int32 x 0.001, nat */
+    SELFCAL_HYPOTHESIS_N_FLAGS = 2, /* uint4, bits 0 to 3 */
+    SELFCAL_HYPOTHESIS_P1_FLAGS = 2, /* uint4, bits 4 to 7 */
+    SELFCAL_HYPOTHESIS_P2_FLAGS = 2, /* uint4, bits 8 to 11 */
+    SELFCAL_HYPOTHESIS_N_MEAN = 3, /* float32, deg/s/sqrt(Hz) */
+    SELFCAL_HYPOTHESIS_N_MEDIAN = 4, /* float32, deg/s/sqrt(Hz) */
+    SELFCAL_HYPOTHESIS_N_SD = 5, /* float32, deg/s/sqrt(Hz) */
+    SELFCAL_HYPOTHESIS_N_Q05 = 6, /* float32, deg/s/sqrt(Hz) */
+    SELFCAL_HYPOTHESIS_N_Q95 = 7, /* float32, deg/s/sqrt(Hz) */
+    SELFCAL_HYPOTHESIS_P1_MEAN = 8, /* float32 */
+    SELFCAL_HYPOTHESIS_P1_MEDIAN = 9, /* float32 */
+    SELFCAL_HYPOTHESIS_P1_SD = 10, /* float32 */
+    SELFCAL_HYPOTHESIS_P1_Q05 = 11, /* float32 */
+    SELFCAL_HYPOTHESIS_P1_Q95 = 12, /* float32 */
+    SELFCAL_HYPOTHESIS_P2_MEAN = 13, /* float32 */
+    SELFCAL_HYPOTHESIS_P2_MEDIAN = 14, /* float32 */
+    SELFCAL_HYPOTHESIS_P2_SD = 15, /* float32 */
+    SELFCAL_HYPOTHESIS_P2_Q05 = 16, /* float32 */
+    SELFCAL_HYPOTHESIS_P2_Q95 = 17, /* float32 */
+};
+
+#define SELFCAL_HYPOTHESIS_LN_EVIDENCE_DIFF_PER_UNIT 1000.0
+#define SELFCAL_HYPOTHESIS_N_FLAGS_SHIFT 0U
+#define SELFCAL_HYPOTHESIS_N_FLAGS_MASK 0xFU
+#define SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT 4U
+#define SELFCAL_HYPOTHESIS_P1_FLAGS_MASK 0xFU
+#define SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT 8U
+#define SELFCAL_HYPOTHESIS_P2_FLAGS_MASK 0xFU
+
+/* Items of the message GX_COEFFICIENTS. */
+enum {
+    SELFCAL_COEFFICIENTS_C0_MEAN = 0, /* float32 */
+    SELFCAL_COEFFICIENTS_C0_SD = 1, /* float32 */
+    SELFCAL_COEFFICIENTS_C0_PROBABILITY = 2, /* float32 */
+    SELFCAL_COEFFICIENTS_C1_MEAN = 3, /* float32 */
+    SELFCAL_COEFFICIENTS_C1_SD = 4, /* float32 */
+    SELFCAL_COEFFICIENTS_C1_PROBABILITY = 5, /* float32 */
+    SELFCAL_COEFFICIENTS_C2_MEAN = 6, /* float32 */
+    SELFCAL_COEFFICIENTS_C2_SD = 7, /* float32 */
+    SELFCAL_COEFFICIENTS_C2_PROBABILITY = 8, /* float32 */
+    SELFCAL_COEFFICIENTS_C3_MEAN = 9, /* float32 */
+    SELFCAL_COEFFICIENTS_C3_SD = 10, /* float32 */
+    SELFCAL_COEFFICIENTS_C3_PROBABILITY = 11, /* float32 */
+    SELFCAL_COEFFICIENTS_C4_MEAN = 12, /* float32 */
+    SELFCAL_COEFFICIENTS_C4_SD = 13, /* float32 */
+    SELFCAL_COEFFICIENTS_C4_PROBABILITY = 14, /* float32 */
+    SELFCAL_COEFFICIENTS_C5_MEAN = 15, /* float32 */
+    SELFCAL_COEFFICIENTS_C5_SD = 16, /* float32 */
+    SELFCAL_COEFFICIENTS_C5_PROBABILITY = 17, /* float32 */
+};
+
+
+/* Items of the message GX_ADEQUACY. */
+enum {
+    SELFCAL_ADEQUACY_ADEQUACY = 0, /* uint32 */
+    SELFCAL_ADEQUACY_SUSPICION = 1, /* uint32 */
+    SELFCAL_ADEQUACY_SUSPICION_SCORE = 2, /* float32 */
+    SELFCAL_ADEQUACY_REASON = 3, /* uint32 */
+};
+
+
+#define SELFCAL_ADEQUACY_ADEQUACY_NOT_JUDGED 0U
+#define SELFCAL_ADEQUACY_ADEQUACY_ADEQUATE 1U
+#define SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE 2U
+
+/* Items of the message STATUS. */
 enum {
     SELFCAL_STATUS_TIME_MS = 0, /* uint32, ms */
     SELFCAL_STATUS_WIRE_VERSION = 1, /* uint32 */
@@ -203,7 +225,8 @@ enum {
 #define SELFCAL_STATUS_MOTION_NOT_WATCHED 0U
 #define SELFCAL_STATUS_MOTION_MOVING 1U
 #define SELFCAL_STATUS_MOTION_RESTING 2U
-/* Items of the corrected message. */
+
+/* Items of the message CORRECTED. */
 enum {
     SELFCAL_CORRECTED_TIME_MS = 0, /* uint32, ms */
     SELFCAL_CORRECTED_CORRECTED_GX = 1, /* float32, deg/s */
@@ -225,7 +248,8 @@ enum {
 #define SELFCAL_CORRECTED_MOTION_NOT_WATCHED 0U
 #define SELFCAL_CORRECTED_MOTION_MOVING 1U
 #define SELFCAL_CORRECTED_MOTION_RESTING 2U
-/* Items of the answer message. */
+
+/* Items of the message ANSWER. */
 enum {
     SELFCAL_ANSWER_CHALLENGE = 0, /* uint32 */
     SELFCAL_ANSWER_COMMAND = 1, /* uint8, bits 0 to 7 */

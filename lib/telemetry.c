@@ -1,33 +1,22 @@
 /* Reports and status as frames. Items, bits and scales: selfcal_frames.h, made from selfcal.dbc. */
-#include "selfcal.h"
+#include "internal.h"
 #include "selfcal_frames.h"
 
 #include <math.h>
 #include <string.h>
 
-enum { CONSTANT, RANDOM_WALK, GAUSS_MARKOV }; /* laws that have items */
-enum { STATISTICS = 5 }; /* mean, median, sd, q05, q95: items in this order */
 enum { STATUS, REPORT, CORRECTED, ANSWER }; /* what the frames under way are of */
+enum { NO_PARAMETER = SELFCAL_PARAMETERS };
 
-static const struct {
-    const char *name;
-    uint16_t id;
-} message_table[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_TABLE;
+static const char *const axis_names[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_NAMES;
 
-/* The estimates on the wire: whose they are, the item of the mean, and the place of the flags. */
-static const struct {
-    uint8_t law, parameter, first_item, flags_shift;
-} estimate_table[] = {
-    {CONSTANT, SELFCAL_N, SELFCAL_AXIS_CONSTANT_N_MEAN, SELFCAL_AXIS_CONSTANT_N_FLAGS_SHIFT},
-    {RANDOM_WALK, SELFCAL_N, SELFCAL_AXIS_RANDOM_WALK_N_MEAN, SELFCAL_AXIS_RANDOM_WALK_N_FLAGS_SHIFT},
-    {RANDOM_WALK, SELFCAL_K, SELFCAL_AXIS_RANDOM_WALK_K_MEAN, SELFCAL_AXIS_RANDOM_WALK_K_FLAGS_SHIFT},
-    {GAUSS_MARKOV, SELFCAL_N, SELFCAL_AXIS_GAUSS_MARKOV_N_MEAN, SELFCAL_AXIS_GAUSS_MARKOV_N_FLAGS_SHIFT},
-    {GAUSS_MARKOV, SELFCAL_SIGMA_M, SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_MEAN,
-     SELFCAL_AXIS_GAUSS_MARKOV_SIGMA_M_FLAGS_SHIFT},
-    {GAUSS_MARKOV, SELFCAL_ALPHA, SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_MEAN,
-     SELFCAL_AXIS_GAUSS_MARKOV_ALPHA_FLAGS_SHIFT},
-};
-enum { ESTIMATES = sizeof estimate_table / sizeof estimate_table[0] };
+/* Items of the places lie evenly, so that loops reach them. */
+SELFCAL_STATIC_ASSERT(places_are_even,
+                      SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
+                          SELFCAL_HYPOTHESIS_P2_Q95 + 1 == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_PLACES * SELFCAL_FRAME_STATISTICS &&
+                          SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
+SELFCAL_STATIC_ASSERT(columns_are_even, SELFCAL_COEFFICIENTS_C1_MEAN == SELFCAL_COEFFICIENTS_C0_MEAN + 3 &&
+                                            SELFCAL_COEFFICIENTS_C5_PROBABILITY + 1 == 3 * 6);
 
 uint16_t selfcal_crc12(const uint8_t *data, size_t length)
 {
@@ -40,13 +29,6 @@ uint16_t selfcal_crc12(const uint8_t *data, size_t length)
         crc &= 0xFFFU;
     }
     return (uint16_t)crc;
-}
-
-static uint32_t float_bits(float value)
-{
-    uint32_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    return bits;
 }
 
 /* `value` in steps of 1 / `per_unit` as a 32-bit two's complement number, held at its ends. NaN: the lower end. */
@@ -75,17 +57,19 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
     if (self == NULL || model == NULL || axis_name == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (model->axes > SELFCAL_AXES_MAX || model->hypotheses > SELFCAL_HYPOTHESES_MAX) {
+    if (model->axes > SELFCAL_AXES_MAX || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
+        model->hypotheses > SELFCAL_FRAME_HYPOTHESES) {
         return SELFCAL_BAD_MODEL;
     }
     memset(self, 0, sizeof *self);
     self->model = model;
+    self->first_id = SELFCAL_FRAME_STATUS_ID;
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         uint8_t found = 0;
         if (axis_name[axis] == NULL) {
             return SELFCAL_BAD_ARGUMENT;
         }
-        while (found < SELFCAL_FRAME_AXES && strcmp(axis_name[axis], message_table[found].name) != 0) {
+        while (found < SELFCAL_FRAME_AXES && strcmp(axis_name[axis], axis_names[found]) != 0) {
             found++;
         }
         if (found == SELFCAL_FRAME_AXES) {
@@ -98,29 +82,69 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
         }
         self->message[axis] = found;
     }
-    memset(self->of_law, SELFCAL_HYPOTHESES_MAX, sizeof self->of_law);
-    for (uint8_t k = 0; k < model->hypotheses; k++) {
-        const selfcal_law_t *of = model->hypothesis[k].law;
-        const unsigned law = of->terms == 0U ? CONSTANT : of->term[0].kind == SELFCAL_WALK ? RANDOM_WALK : GAUSS_MARKOV;
-        if (of->terms > 1U || of->coloured_noise || self->of_law[law] != SELFCAL_HYPOTHESES_MAX) {
-            return SELFCAL_BAD_MODEL;
-        }
-        self->of_law[law] = k;
-    }
     return SELFCAL_OK;
 }
 
-/* Frames of `source` next, up to the item `last`; false while others are under way. */
-static bool begin(selfcal_telemetry_t *self, uint8_t source, uint8_t last, uint32_t time_ms)
+selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node)
+{
+    if (self == NULL || node >= SELFCAL_FRAME_NODES) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    self->first_id = (uint16_t)(SELFCAL_FRAME_STATUS_ID + SELFCAL_FRAME_NODE_IDS * node);
+    return SELFCAL_OK;
+}
+
+void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[])
+{
+    self->coefficient = column;
+}
+
+/* Frames of the message that node 0 sends as `id` next, its items `first` to `last`. */
+static void begin_message(selfcal_telemetry_t *self, uint32_t id, uint32_t first, uint32_t last)
+{
+    self->id = (uint16_t)(id - SELFCAL_FRAME_STATUS_ID + self->first_id);
+    self->item = (uint8_t)first;
+    self->items = (uint8_t)(last + 1U);
+}
+
+/* Frames of `source` next, of one message; false while others are under way. */
+static bool begin(selfcal_telemetry_t *self, uint8_t source, uint32_t id, uint32_t last, uint32_t time_ms)
 {
     if (self->items != 0) {
         return false;
     }
     self->source = source;
     self->time_ms = time_ms;
-    self->item = 0;
+    self->part = 0;
     self->made = 0;
-    self->items = (uint8_t)(last + 1U);
+    begin_message(self, id, 0, last);
+    return true;
+}
+
+/* Columns whose coefficients are sent. */
+static uint8_t columns(const selfcal_telemetry_t *self)
+{
+    return self->coefficient != NULL && self->model->regressors != NULL ? self->model->regressors->count : 0U;
+}
+
+/* A report is its opening, a part for each hypothesis, the coefficients and the end. Goes to the next part; false after the
+ * last, and in what is no report. */
+static bool next_part(selfcal_telemetry_t *self)
+{
+    const uint32_t hypotheses = self->model->hypotheses;
+    if (self->source != REPORT || self->part > hypotheses + 1U) {
+        return false;
+    }
+    const uint32_t axis = self->message[self->report->axis], k = self->part++;
+    if (k < hypotheses) {
+        const uint32_t id = SELFCAL_FRAME_HYPOTHESIS_ID + SELFCAL_FRAME_HYPOTHESES * axis + k;
+        begin_message(self, id, 0, SELFCAL_HYPOTHESIS_P2_Q95);
+    } else if (k == hypotheses && columns(self) > 0U) {
+        begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, 3U * columns(self) - 1U);
+    } else {
+        self->part = (uint8_t)(hypotheses + 2U);
+        begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
+    }
     return true;
 }
 
@@ -130,7 +154,7 @@ selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfc
     if (self == NULL || report == NULL || counters == NULL || report->axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!begin(self, REPORT, SELFCAL_AXIS_END_ITEMS, time_ms)) {
+    if (!begin(self, REPORT, SELFCAL_FRAME_AXIS_ID + self->message[report->axis], SELFCAL_AXIS_BIAS_SD, time_ms)) {
         return SELFCAL_BUSY;
     }
     self->report = report;
@@ -155,7 +179,7 @@ selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfc
     if (self == NULL || counters == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!begin(self, STATUS, SELFCAL_STATUS_FRAMES_SENT, time_ms)) {
+    if (!begin(self, STATUS, SELFCAL_FRAME_STATUS_ID, SELFCAL_STATUS_FRAMES_SENT, time_ms)) {
         return SELFCAL_BUSY;
     }
     self->counters = counters;
@@ -169,7 +193,7 @@ selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const se
     if (self == NULL || corrected == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!begin(self, CORRECTED, SELFCAL_CORRECTED_MOTION, time_ms)) {
+    if (!begin(self, CORRECTED, SELFCAL_FRAME_CORRECTED_ID, SELFCAL_CORRECTED_MOTION, time_ms)) {
         return SELFCAL_BUSY;
     }
     self->corrected = corrected;
@@ -181,7 +205,7 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
     if (self == NULL || item > SELFCAL_ANSWER_RESULT) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!begin(self, ANSWER, item, time_ms)) {
+    if (!begin(self, ANSWER, SELFCAL_FRAME_ANSWER_ID, item, time_ms)) {
         return SELFCAL_BUSY;
     }
     self->item = item;
@@ -189,31 +213,67 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
     return SELFCAL_OK;
 }
 
-/* The posterior under a law; NULL if the model has no such hypothesis. */
-static const selfcal_posterior_t *posterior(const selfcal_telemetry_t *self, uint8_t law)
+/* The parameter that a hypothesis has in a place of the wire, or NO_PARAMETER. */
+static unsigned parameter_at(const selfcal_hypothesis_t *hypothesis, unsigned place)
 {
-    const uint8_t k = self->of_law[law];
-    return k < self->model->hypotheses ? &self->report->hypothesis[k] : NULL;
+    switch (place) {
+    case 0: return SELFCAL_N;
+    case 1: return hypothesis->rho == NULL ? NO_PARAMETER : has_walk(hypothesis->law) ? SELFCAL_K : SELFCAL_SIGMA_M;
+    default: return hypothesis->alpha == NULL ? NO_PARAMETER : SELFCAL_ALPHA;
+    }
 }
 
-static bool probability_value(const selfcal_telemetry_t *self, uint8_t law, uint32_t *value)
+/* The value of an item of hypothesis `k`; false if it has none. */
+static bool hypothesis_value(const selfcal_telemetry_t *self, uint8_t k, uint8_t item, uint32_t *value)
 {
-    const selfcal_posterior_t *p = posterior(self, law);
-    if (p == NULL) {
+    const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[k];
+    const selfcal_posterior_t *p = &self->report->hypothesis[k];
+    if (item == SELFCAL_HYPOTHESIS_PROBABILITY) {
+        *value = float_bits(p->probability);
+        return true;
+    }
+    if (item == SELFCAL_HYPOTHESIS_LN_EVIDENCE_DIFF) {
+        *value = scaled_bits(p->ln_evidence - self->ln_best, SELFCAL_HYPOTHESIS_LN_EVIDENCE_DIFF_PER_UNIT);
+        return true;
+    }
+    if (item == SELFCAL_HYPOTHESIS_N_FLAGS) {
+        *value = 0;
+        for (unsigned place = 0; place < SELFCAL_FRAME_PLACES; place++) {
+            const unsigned parameter = parameter_at(hypothesis, place);
+            *value |= parameter == NO_PARAMETER
+                          ? 0U
+                          : (uint32_t)p->parameter[parameter].flags << (place * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
+        }
+        return true;
+    }
+    const unsigned at = item - (unsigned)SELFCAL_HYPOTHESIS_N_MEAN;
+    const unsigned parameter = parameter_at(hypothesis, at / SELFCAL_FRAME_STATISTICS);
+    if (parameter == NO_PARAMETER) {
         return false;
     }
-    *value = float_bits(p->probability);
+    const selfcal_estimate_t *x = &p->parameter[parameter];
+    const float statistic[SELFCAL_FRAME_STATISTICS] = {x->mean, x->median, x->sd, x->q05, x->q95};
+    *value = float_bits(statistic[at % SELFCAL_FRAME_STATISTICS]);
     return true;
 }
 
-static bool evidence_value(const selfcal_telemetry_t *self, uint8_t law, selfcal_wide_t per_unit, uint32_t *value)
+/* The value of an item of the coefficients; false if nothing is known of its column. */
+static bool coefficient_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
 {
-    const selfcal_posterior_t *p = posterior(self, law);
-    if (p == NULL) {
-        return false;
+    const selfcal_sent_coefficient_t *column = &self->coefficient[item / 3U];
+    const float number[] = {column->mean, column->sd, column->probability};
+    *value = float_bits(number[item % 3U]);
+    return !isnan(column->mean);
+}
+
+/* Columns of which something is known. */
+static uint32_t columns_told(const selfcal_telemetry_t *self)
+{
+    uint32_t told = 0;
+    for (uint8_t column = 0; column < columns(self); column++) {
+        told += isnan(self->coefficient[column].mean) ? 0U : 1U;
     }
-    *value = scaled_bits(p->ln_evidence - self->ln_best, per_unit);
-    return true;
+    return told;
 }
 
 static uint32_t health_value(const selfcal_telemetry_t *self)
@@ -224,66 +284,38 @@ static uint32_t health_value(const selfcal_telemetry_t *self)
            (c->saturated[axis] != 0 ? 1U << SELFCAL_AXIS_SATURATED_SHIFT : 0U) |
            (c->stuck[axis] != 0 ? 1U << SELFCAL_AXIS_STUCK_SHIFT : 0U) |
            (c->gaps != 0 ? 1U << SELFCAL_AXIS_GAPS_SHIFT : 0U) |
-           (c->blocks_lost != 0 ? 1U << SELFCAL_AXIS_BLOCKS_LOST_SHIFT : 0U);
+           (c->blocks_lost != 0 ? 1U << SELFCAL_AXIS_BLOCKS_LOST_SHIFT : 0U) |
+           (uint32_t)self->model->hypotheses << SELFCAL_AXIS_HYPOTHESES_SHIFT | columns_told(self) << SELFCAL_AXIS_COLUMNS_SHIFT;
 }
 
-static uint32_t estimate_flags_value(const selfcal_telemetry_t *self)
-{
-    uint32_t flags = 0;
-    for (size_t e = 0; e < ESTIMATES; e++) {
-        const selfcal_posterior_t *p = posterior(self, estimate_table[e].law);
-        if (p != NULL) {
-            flags |= (uint32_t)p->parameter[estimate_table[e].parameter].flags << estimate_table[e].flags_shift;
-        }
-    }
-    return flags;
-}
-
-static bool estimate_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
-{
-    for (size_t e = 0; e < ESTIMATES; e++) {
-        const uint8_t first = estimate_table[e].first_item;
-        if (item >= first && item < first + STATISTICS) {
-            const selfcal_posterior_t *p = posterior(self, estimate_table[e].law);
-            if (p == NULL) {
-                return false;
-            }
-            const selfcal_estimate_t *x = &p->parameter[estimate_table[e].parameter];
-            const float statistic[STATISTICS] = {x->mean, x->median, x->sd, x->q05, x->q95};
-            *value = float_bits(statistic[item - first]);
-            return true;
-        }
-    }
-    return false;
-}
-
-/* The value of an axis item; false if this model does not have it. */
-static bool axis_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
+static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)
 {
     const selfcal_report_t *r = self->report;
     switch (item) {
-    case SELFCAL_AXIS_TIME_MS: *value = self->time_ms; return true;
-    case SELFCAL_AXIS_COUNT: *value = r->n; return true;
-    case SELFCAL_AXIS_NOT_FINITE: *value = health_value(self); return true;
-    case SELFCAL_AXIS_LN_EVIDENCE: *value = float_bits((float)self->ln_best); return true;
-    case SELFCAL_AXIS_BIAS_MEAN: *value = float_bits(r->bias_mean); return true;
-    case SELFCAL_AXIS_BIAS_SD: *value = float_bits(r->bias_sd); return true;
-    case SELFCAL_AXIS_CONSTANT_PROBABILITY: return probability_value(self, CONSTANT, value);
-    case SELFCAL_AXIS_RANDOM_WALK_PROBABILITY: return probability_value(self, RANDOM_WALK, value);
-    case SELFCAL_AXIS_GAUSS_MARKOV_PROBABILITY: return probability_value(self, GAUSS_MARKOV, value);
-    case SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF:
-        return evidence_value(self, CONSTANT, SELFCAL_AXIS_CONSTANT_LN_EVIDENCE_DIFF_PER_UNIT, value);
-    case SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF:
-        return evidence_value(self, RANDOM_WALK, SELFCAL_AXIS_RANDOM_WALK_LN_EVIDENCE_DIFF_PER_UNIT, value);
-    case SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF:
-        return evidence_value(self, GAUSS_MARKOV, SELFCAL_AXIS_GAUSS_MARKOV_LN_EVIDENCE_DIFF_PER_UNIT, value);
-    case SELFCAL_AXIS_CONSTANT_N_FLAGS: *value = estimate_flags_value(self); return true;
-    case SELFCAL_AXIS_END_ITEMS:
-        *value = (self->time_ms & SELFCAL_AXIS_END_TIME_MS_MASK) << SELFCAL_AXIS_END_TIME_MS_SHIFT |
-                 (self->made + 1U) << SELFCAL_AXIS_END_ITEMS_SHIFT;
-        return true;
-    default: return estimate_value(self, item, value);
+    case SELFCAL_AXIS_TIME_MS: return self->time_ms;
+    case SELFCAL_AXIS_COUNT: return r->n;
+    case SELFCAL_AXIS_NOT_FINITE: return health_value(self);
+    case SELFCAL_AXIS_LN_EVIDENCE: return float_bits((float)self->ln_best);
+    case SELFCAL_AXIS_BIAS_MEAN: return float_bits(r->bias_mean);
+    case SELFCAL_AXIS_BIAS_SD: return float_bits(r->bias_sd);
+    default:
+        return (self->time_ms & SELFCAL_AXIS_END_TIME_MS_MASK) << SELFCAL_AXIS_END_TIME_MS_SHIFT |
+               (self->made + 1U) << SELFCAL_AXIS_END_ITEMS_SHIFT;
     }
+}
+
+/* The value of an item of the part of the report under way; false if it has none. */
+static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
+{
+    const uint8_t hypotheses = self->model->hypotheses;
+    if (self->part > 0U && self->part <= hypotheses) {
+        return hypothesis_value(self, (uint8_t)(self->part - 1U), item, value);
+    }
+    if (self->part == hypotheses + 1U) {
+        return coefficient_value(self, item, value);
+    }
+    *value = axis_value(self, item);
+    return true;
 }
 
 static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t count[])
@@ -412,31 +444,28 @@ static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t val
 
 bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame)
 {
-    while (self->item < self->items) {
-        const uint8_t item = self->item++;
-        uint16_t id = SELFCAL_FRAME_STATUS_ID;
-        uint32_t value = self->answer;
-        bool has = true;
-        switch (self->source) {
-        case STATUS: value = status_value(self, item); break;
-        case REPORT:
-            id = message_table[self->message[self->report->axis]].id;
-            has = axis_value(self, item, &value);
-            break;
-        case CORRECTED:
-            id = SELFCAL_FRAME_CORRECTED_ID;
-            has = corrected_value(self, item, &value);
-            break;
-        default: id = SELFCAL_FRAME_ANSWER_ID; break;
-        }
-        if (!has) {
-            continue;
-        }
-        pack(frame, id, item, value, self->frames, self->time_ms);
-        self->frames++;
-        self->made++;
-        return true;
+    if (self->items == 0) {
+        return false;
     }
+    do {
+        while (self->item < self->items) {
+            const uint8_t item = self->item++;
+            uint32_t value = self->answer;
+            bool has = true;
+            switch (self->source) {
+            case STATUS: value = status_value(self, item); break;
+            case REPORT: has = report_value(self, item, &value); break;
+            case CORRECTED: has = corrected_value(self, item, &value); break;
+            default: break;
+            }
+            if (has) {
+                pack(frame, self->id, item, value, self->frames, self->time_ms);
+                self->frames++;
+                self->made++;
+                return true;
+            }
+        }
+    } while (next_part(self));
     self->items = 0;
     return false;
 }

@@ -1,3 +1,6 @@
+# NODE=n on the command line: the module's number on its bus. A variable of that name in the environment means something else.
+NODE_FLAGS := $(if $(filter command%,$(origin NODE)),-DSELFCAL_NODE=$(NODE))
+
 # How the library and the application are compiled for the cores; included by whatever builds for one.
 # SELFCAL_GRID_MAX, SELFCAL_ALPHA_MAX, SELFCAL_HYPOTHESIS_NODES_MAX, SELFCAL_NODES_MAX: the largest of the core's nodes in the default model.
 CONFIG_cells := -DSELFCAL_REPORT_CELLS=24 -DSELFCAL_SIGMA_CELLS=24 -DSELFCAL_HISTOGRAM=64 -DSELFCAL_LINES=32

@@ -5,7 +5,7 @@
 include port/arm.mk
 
 $(if $(OUT),,$(error OUT=DIR is wanted))
-PROGRAM_FLAGS := $(IMAGE_CFLAGS) $(CFLAGS)
+PROGRAM_FLAGS := $(strip $(IMAGE_CFLAGS) $(CFLAGS) $(NODE_FLAGS))
 IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c)
 IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/$(TARGET)/*.h)
 

@@ -3,7 +3,7 @@
 # puts its objects, and what gcc says of their stacks (.su), into DIR.
 include port/arm.mk
 
-LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c,$(PROGRAM_FLAGS)))
+LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DSELFCAL_NODE=% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c,$(PROGRAM_FLAGS)))
 LIBRARY_SOURCES := $(wildcard lib/*.c lib/*.h) port/arm.mk
 # Named by the content of all that it is made of: no time stamp takes old objects for new ones.
 LIBRARY := build/library/$(CORE)-$(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES); } | sha256sum | cut -c1-16)

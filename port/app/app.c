@@ -42,7 +42,12 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
 #endif
     const selfcal_status_t wire = selfcal_telemetry_init(&app->telemetry, &selfcal_model, selfcal_model_axis_name);
     selfcal_telemetry_module(&app->telemetry, &app->told);
-    return wire;
+    return wire == SELFCAL_OK ? app_node(app, SELFCAL_NODE) : wire;
+}
+
+selfcal_status_t app_node(app_t *app, uint8_t node)
+{
+    return selfcal_telemetry_node(&app->telemetry, node);
 }
 
 bool app_gate(app_t *app)

@@ -13,8 +13,11 @@
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
-#if SELFCAL_MODEL_REGRESSORS > 0 || SELFCAL_MODEL_TERM_NODES > 0
-#error "this application gives its bank no regressors, and its telemetry has no items for laws that are sums"
+#if SELFCAL_MODEL_REGRESSORS > 0
+#error "this application gives its bank no regressors"
+#endif
+#if SELFCAL_MODEL_HYPOTHESES > 8
+#error "telemetry carries eight hypotheses at most"
 #endif
 #if !SELFCAL_MODEL_UNITS_SENT
 #error "each axis of the model must be one that telemetry has a message for, in the unit that it has there (lib/selfcal.dbc)"
@@ -100,13 +103,15 @@ typedef struct {
     selfcal_t bank;
     selfcal_work_t work;
     selfcal_report_t report;
-    selfcal_wide_t memory[(SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) + sizeof(selfcal_wide_t) - 1U) /
-                          sizeof(selfcal_wide_t)];
+    selfcal_wide_t memory[(SELFCAL_MODEL_BYTES + sizeof(selfcal_wide_t) - 1U) / sizeof(selfcal_wide_t)];
 } app_t;
 
 /* Starts with the model linked in; a report of all axes every `period_ms`. Fails as selfcal_init() and
  * selfcal_telemetry_init() do. `port` must stay. */
 selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms);
+
+/* After app_init(), which makes it SELFCAL_NODE: the module's number on its bus. SELFCAL_BAD_ARGUMENT beyond 11. */
+selfcal_status_t app_node(app_t *app, uint8_t node);
 
 /* After app_init(): from here on only samples of rest feed the bank; while the module moves time passes as a gap. Starts with the
  * model's noise, a bound, and goes on with what is measured at rest, once 30 windows have been. False: the model has no gate, and

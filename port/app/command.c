@@ -1,7 +1,5 @@
 #include "command.h"
 
-#include "selfcal_frames.h"
-
 static uint64_t rotate(uint64_t x, unsigned by)
 {
     return x << by | x >> (64U - by);

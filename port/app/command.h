@@ -15,6 +15,19 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "selfcal_frames.h"
+
+/* The module's number on its bus, 0 to 11: `make ... NODE=3`. It moves the identifiers of all messages. */
+#ifndef SELFCAL_NODE
+#define SELFCAL_NODE 0
+#endif
+#if SELFCAL_NODE < 0 || SELFCAL_NODE > 11
+#error "SELFCAL_NODE must be 0 to 11"
+#endif
+
+/* Identifier of this module's COMMAND message. */
+#define COMMAND_ID (SELFCAL_FRAME_COMMAND_ID + SELFCAL_FRAME_NODE_IDS * SELFCAL_NODE)
+
 #define COMMAND_CHALLENGE_MS 10000U
 #define COMMAND_PAUSE_MS 1000U
 

@@ -3,7 +3,7 @@
 #include <string.h>
 
 #ifdef APP_COMMAND_KEY
-#include "selfcal_frames.h"
+#include "command.h"
 #endif
 
 #define CR '\r'
@@ -53,7 +53,7 @@ static bool take_command(slcan_t *self)
             data[(i - 5U) / 2U] = (uint8_t)((unsigned)data[(i - 5U) / 2U] << 4 | (unsigned)value);
         }
     }
-    if (head != (SELFCAL_FRAME_COMMAND_ID << 4 | sizeof data)) {
+    if (head != (COMMAND_ID << 4 | sizeof data)) {
         return false;
     }
     memcpy(self->data, data, sizeof data);

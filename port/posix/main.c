@@ -1,14 +1,15 @@
 /* The application on a POSIX host: a recording takes the sensor's place; telemetry leaves by a pseudo-terminal with
  * SLCAN, or by a CAN bus of the host.
  *
- *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate] [--stay | --can BUS]
+ *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate] [--node N]
+ *                   [--stay | --can BUS]
  *
  * Prints `SELFCAL_PTY path`, waits for the host to open the channel, plays the recording (time stands still while the
  * channel is closed), and ends when the host closes the channel after the last frame. With --stay a host that goes away
  * has closed the channel, and another may open it.
  * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last
  * frame (port/posix/can.h).
- * With --gate motion is kept out, by the model's gate.
+ * With --gate motion is kept out, by the model's gate. --node: the module's number on its bus, which moves all identifiers.
  * Exit code: 0; 1 if the host went away or never came, or the bus failed; 2 for bad arguments or a bad recording.
  *
  * RECORDING: see port/replay/replay.h.
@@ -155,6 +156,13 @@ static bool positive(const char *text, double *value)
     return end != text && *end == '\0' && *value > 0.0 && *value < 1e6;
 }
 
+static bool node_number(const char *text, long *node)
+{
+    char *end;
+    *node = strtol(text, &end, 10);
+    return end != text && *end == '\0' && *node >= 0 && *node < (long)SELFCAL_FRAME_NODES;
+}
+
 static int fail(int code, const char *subject, const char *what)
 {
     (void)fprintf(stderr, "selfcal-posix: %s: %s\n", subject, what);
@@ -168,6 +176,7 @@ int main(int argc, char **argv)
     const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};
     const char *path = NULL, *bus = NULL;
     double report_every_s = 10.0, timeout_s = 30.0;
+    long node = SELFCAL_NODE;
     bool gate = false, stay = false;
 
     for (int i = 1; i < argc; i++) {
@@ -182,6 +191,11 @@ int main(int argc, char **argv)
             i++;
         } else if (strcmp(argv[i], "--gate") == 0) {
             gate = true;
+        } else if (strcmp(argv[i], "--node") == 0) {
+            if (i + 1 == argc || !node_number(argv[i + 1], &node)) {
+                return fail(2, argv[i], "wants a number from 0 to 11");
+            }
+            i++;
         } else if (strcmp(argv[i], "--stay") == 0) {
             stay = true;
         } else if (strcmp(argv[i], "--can") == 0 && i + 1 < argc) {
@@ -199,7 +213,8 @@ int main(int argc, char **argv)
     if (error != NULL) {
         return fail(2, path, error);
     }
-    if (app_init(&app, &port, (uint32_t)ceil(report_every_s * 1000.0)) != SELFCAL_OK) {
+    if (app_init(&app, &port, (uint32_t)ceil(report_every_s * 1000.0)) != SELFCAL_OK ||
+        app_node(&app, (uint8_t)node) != SELFCAL_OK) {
         return fail(2, "model", "refused by the library");
     }
     if (gate && !app_gate(&app)) {

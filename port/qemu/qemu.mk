@@ -1,5 +1,6 @@
 # The firmware for an emulated core: make -f port/qemu/qemu.mk qemu CORE=cortex-m4f|cortex-m0 MODEL_DIR=DIR OUT=DIR
 # MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`); makes OUT/selfcal-qemu.elf.
+# MODEL_FLAGS: sizes that the model needs beyond the configured ones.
 
 include port/arm.mk
 
@@ -16,8 +17,8 @@ qemu: $(OUT)/selfcal-qemu.elf
 
 $(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/library.mk port/arm.mk
 	@rm -rf $(OUT)/objects
-	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(QEMU_CFLAGS))'
-	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
+	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(MODEL_FLAGS) $(QEMU_CFLAGS))'
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(MODEL_FLAGS) $(NODE_FLAGS) $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
 	    -I$(MODEL_DIR),$(QEMU_SOURCES) $(filter %.c,$(QEMU_CFLAGS)),$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
 	    $(OUT)/objects/*.o -lm -o $@

@@ -2,7 +2,7 @@
  * one is, for the command's identifier alone.
  * Frames leave in the order they were taken (TXFP). Bus-off ends by itself after 128 x 11 recessive bits (ABOM). */
 #include "board.h"
-#include "selfcal_frames.h"
+#include "command.h"
 #include "stm32f405.h"
 
 enum { MAILBOXES = 3 };
@@ -73,7 +73,7 @@ bool can_init(uint32_t bit_per_s)
     CAN_FS1R |= BIT(0);   /* bank 0: one 32-bit filter ... */
     CAN_FM1R &= ~BIT(0);  /* ... of identifier and mask ... */
     CAN_FFA1R &= ~BIT(0); /* ... into FIFO 0 */
-    CAN_F0R1 = SELFCAL_FRAME_COMMAND_ID << CAN_TIR_STID_POS;
+    CAN_F0R1 = COMMAND_ID << CAN_TIR_STID_POS;
     CAN_F0R2 = 0x7FFU << CAN_TIR_STID_POS | CAN_RIR_IDE | CAN_RIR_RTR;
     CAN_FA1R |= BIT(0);
     CAN_FMR &= ~CAN_FMR_FINIT;
@@ -129,7 +129,7 @@ void can_poll(void)
     }
     const uint32_t id = CAN_RI0R, length = CAN_RDT0R & CAN_RDTR_DLC, low = CAN_RDL0R, high = CAN_RDH0R;
     CAN_RF0R = CAN_RF0R_RFOM;
-    if (length == 8U && id >> CAN_TIR_STID_POS == SELFCAL_FRAME_COMMAND_ID && (id & (CAN_RIR_IDE | CAN_RIR_RTR)) == 0U) {
+    if (length == 8U && id >> CAN_TIR_STID_POS == COMMAND_ID && (id & (CAN_RIR_IDE | CAN_RIR_RTR)) == 0U) {
         uint8_t data[8];
         for (unsigned i = 0; i < 4U; i++) {
             data[i] = (uint8_t)(low >> (8U * i));

@@ -1,9 +1,9 @@
 /* Frames of random reports, with the numbers that went in, for tests/py/test_wire.py. Not a test of its own.
  *
- *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS
+ *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS COLUMNS NODE
  *
  * As a slow module would that takes SLOW_MS for each axis: an axis's report is begun when that of the last is out, with the
- * status every STATUS_MS between. 0: all at once.
+ * status every STATUS_MS between. 0: all at once. The hypotheses are a random walk, Gauss-Markov, a constant bias, and these again.
  *
  * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
 #include "selfcal.h"
@@ -18,10 +18,11 @@
 
 enum { AXES = 6, STATUS_MS = 10000 };
 
-static const char *const law_name[] = {"constant", "random_walk", "gauss_markov"};
-static const char *const parameter_name[] = {"N", "K", "sigma_m", "alpha"};
-static const bool has[3][SELFCAL_PARAMETERS] = {
-    {true, false, false, false}, {true, true, false, false}, {true, false, true, true}};
+static const selfcal_law_t order[] = {SELFCAL_RANDOM_WALK, SELFCAL_GAUSS_MARKOV, SELFCAL_CONSTANT};
+/* Of those: the places that their parameters have on the wire; NULL: they lack that. */
+static const char *const place_name[][SELFCAL_PARAMETERS] = {
+    {"N", "p1", NULL, NULL}, {"N", NULL, "p1", "p2"}, {"N", NULL, NULL, NULL}};
+enum { LAWS = sizeof order / sizeof order[0] };
 
 static uint32_t state;
 
@@ -58,25 +59,26 @@ static uint32_t told_count(const char *message, const char *signal, uint32_t num
     return number;
 }
 
-static void random_posterior(selfcal_posterior_t *p, const char *message, int law)
+static void random_posterior(selfcal_posterior_t *p, const char *message, int k)
 {
     char signal[64];
-    (void)snprintf(signal, sizeof signal, "%s_probability", law_name[law]);
+    (void)snprintf(signal, sizeof signal, "h%d_probability", k);
     p->probability = told(message, signal, (float)random32() / 4294967296.0F);
     p->ln_evidence = -1e5 + (double)random32() / 4294967296.0 * 1e4;
-    (void)printf("V %s %s_ln_evidence %.17g\n", message, law_name[law], p->ln_evidence);
+    (void)printf("V %s h%d_ln_evidence %.17g\n", message, k, p->ln_evidence);
     for (int q = 0; q < SELFCAL_PARAMETERS; q++) {
-        if (!has[law][q]) {
+        const char *place = place_name[k % LAWS][q];
+        if (place == NULL) {
             continue;
         }
         static const char *const statistic[] = {"mean", "median", "sd", "q05", "q95"};
         float *const number[] = {&p->parameter[q].mean, &p->parameter[q].median, &p->parameter[q].sd,
                                  &p->parameter[q].q05, &p->parameter[q].q95};
         for (size_t s = 0; s < sizeof number / sizeof number[0]; s++) {
-            (void)snprintf(signal, sizeof signal, "%s_%s_%s", law_name[law], parameter_name[q], statistic[s]);
+            (void)snprintf(signal, sizeof signal, "h%d_%s_%s", k, place, statistic[s]);
             *number[s] = told(message, signal, random_float());
         }
-        (void)snprintf(signal, sizeof signal, "%s_%s_flags", law_name[law], parameter_name[q]);
+        (void)snprintf(signal, sizeof signal, "h%d_%s_flags", k, place);
         p->parameter[q].flags = (uint8_t)told_count(message, signal, random32() & 0xFU);
     }
 }
@@ -103,22 +105,29 @@ int main(int argc, char **argv)
 {
     static const char *const axis_name[AXES] = {"az", "gx", "ay", "gz", "ax", "gy"};
     static const char *const message[AXES] = {"AZ", "GX", "AY", "GZ", "AX", "GY"};
-    static const int order[] = {RANDOM_WALK, GAUSS_MARKOV, CONSTANT};
-    if (argc != 5) {
+    if (argc != 7) {
         return 2;
     }
     state = (uint32_t)strtoul(argv[1], NULL, 10) * 2654435769U + 1U;
     const unsigned long reports = strtoul(argv[2], NULL, 10);
     const uint8_t hypotheses = (uint8_t)strtoul(argv[3], NULL, 10);
     const uint32_t slow_ms = (uint32_t)strtoul(argv[4], NULL, 10);
+    const uint8_t columns = (uint8_t)strtoul(argv[5], NULL, 10);
+    const uint8_t node = (uint8_t)strtoul(argv[6], NULL, 10);
 
     selfcal_axis_t axis[AXES];
     memset(axis, 0, sizeof axis);
-    selfcal_hypothesis_t hypothesis[3];
+    static const selfcal_grid_t grid;
+    selfcal_hypothesis_t hypothesis[SELFCAL_HYPOTHESES_MAX];
     memset(hypothesis, 0, sizeof hypothesis);
-    for (int k = 0; k < 3; k++) {
-        hypothesis[k].law = &named_law[order[k]];
+    for (int k = 0; k < SELFCAL_HYPOTHESES_MAX; k++) {
+        hypothesis[k].law = order[k % LAWS];
+        hypothesis[k].rho = hypothesis[k].law == SELFCAL_CONSTANT ? NULL : &grid;
+        hypothesis[k].alpha = hypothesis[k].law == SELFCAL_GAUSS_MARKOV ? &grid : NULL;
     }
+    selfcal_regressors_t regressors;
+    memset(&regressors, 0, sizeof regressors);
+    regressors.count = columns;
     selfcal_model_t model;
     memset(&model, 0, sizeof model);
     model.id = random32();
@@ -128,9 +137,11 @@ int main(int argc, char **argv)
     model.hypotheses = hypotheses;
     model.axis = axis;
     model.hypothesis = hypothesis;
+    model.regressors = columns > 0U ? &regressors : NULL;
 
     static selfcal_telemetry_t telemetry;
     require(selfcal_telemetry_init(&telemetry, &model, axis_name));
+    require(selfcal_telemetry_node(&telemetry, node));
     for (unsigned long number = 1; number <= reports; number++) {
         const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U + (number - 1U) * AXES * slow_ms); /* wraps within the stream */
         selfcal_counters_t counters;
@@ -204,8 +215,21 @@ int main(int argc, char **argv)
             report.bias_mean = told(message[a], "bias_mean", random_float());
             report.bias_sd = told(message[a], "bias_sd", random_float());
             for (uint8_t k = 0; k < hypotheses; k++) {
-                random_posterior(&report.hypothesis[k], message[a], order[k]);
+                random_posterior(&report.hypothesis[k], message[a], k);
             }
+            selfcal_sent_coefficient_t coefficient[SELFCAL_REGRESSORS_MAX];
+            for (uint8_t c = 0; c < columns; c++) {
+                char signal[] = "c0_probability";
+                signal[1] = (char)('0' + c);
+                coefficient[c].probability = told(message[a], signal, (float)random32() / 4294967296.0F);
+                memcpy(signal + 3, "mean", sizeof "mean");
+                coefficient[c].mean = told(message[a], signal, random_float());
+                memcpy(signal + 3, "sd", sizeof "sd");
+                coefficient[c].sd = told(message[a], signal, random_float());
+            }
+            (void)told_count(message[a], "hypotheses", hypotheses);
+            (void)told_count(message[a], "columns", columns);
+            selfcal_telemetry_coefficients(&telemetry, coefficient);
             for (uint32_t after = (a * slow_ms / STATUS_MS + 1U) * STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
                 require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));
                 send_all(&telemetry);

@@ -33,15 +33,24 @@ class Sent:
 def _program() -> Path:
     program = Path(_folder.name) / "telemetry_stream"
     sources = ["tests/c/telemetry_stream.c", "lib/telemetry.c", "port/app/slcan.c"]
-    command = [os.environ.get("CC", "cc"), "-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-o", str(program)]
+    command = [os.environ.get("CC", "cc"), "-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-DSELFCAL_HYPOTHESES_MAX=8", "-o", str(program)]
     subprocess.run([*command, *sources, "-lm"], cwd=ROOT, check=True)
     return program
 
 
-@lru_cache(maxsize=4)
-def stream(seed: int, reports: int, hypotheses: int = 3, slow_ms: int = 0) -> tuple[Sent, ...]:
+#: Messages by the offset of their identifiers from the node's first one: the status, then by axis.
+AXES = ("GX", "GY", "GZ", "AX", "AY", "AZ")
+MESSAGES = {0: "STATUS"} | {1 + axis: name for axis, name in enumerate(AXES)}
+MESSAGES |= {10 + axis: name for axis, name in enumerate(AXES)}
+MESSAGES |= {32 + 8 * axis + k: name for axis, name in enumerate(AXES) for k in range(8)}
+
+
+@lru_cache(maxsize=8)
+def stream(
+    seed: int, reports: int, hypotheses: int = 3, slow_ms: int = 0, columns: int = 0, node: int = 0
+) -> tuple[Sent, ...]:
     """All that the C code sends for `reports` random reports of six axes, of which each takes `slow_ms`."""
-    command = [str(_program()), str(seed), str(reports), str(hypotheses), str(slow_ms)]
+    command = [str(_program()), *map(str, (seed, reports, hypotheses, slow_ms, columns, node))]
     text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     sent: list[Sent] = []
     truth: dict[str, dict[str, float]] = {}
@@ -52,9 +61,7 @@ def stream(seed: int, reports: int, hypotheses: int = 3, slow_ms: int = 0) -> tu
             message, signal, number = rest.split(" ")
             truth.setdefault(message, {})[signal] = float(number)
         else:
-            message = {0x200: "STATUS", 0x201: "GX", 0x202: "GY", 0x203: "GZ", 0x204: "AX", 0x205: "AY", 0x206: "AZ"}[
-                int(rest[1:4], 16)
-            ]
+            message = MESSAGES[int(rest[1:4], 16) - 0x200 - 128 * node]
             if message != last:
                 sent.append(Sent(message, truth.pop(message, {}), []))  # none: a status between the reports
                 last = message

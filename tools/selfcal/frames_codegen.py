@@ -1,6 +1,6 @@
-"""The frame format for C and for the docs, from its one source, `lib/selfcal.dbc`.
+"""The frame format for standard tools, for C and for the docs, from its one source, `frames.dbc`.
 
-python -m selfcal.frames_codegen            write lib/selfcal_frames.h
+python -m selfcal.frames_codegen            write lib/selfcal.dbc and lib/selfcal_frames.h
 python -m selfcal.frames_codegen --table    print the telemetry table (Markdown)
 """
 
@@ -9,20 +9,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
+from selfcal.dbc import AXIS_UNITS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
 from selfcal.errors import UserError
-from selfcal.laws import PARAMETERS
 from selfcal.units import parameter_unit
-from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATUS, load_dbc
+from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
-#: Unit of the sensor reading by the first letter of the axis message.
-UNITS = {"G": "deg/s", "A": "m/s^2"}
+#: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
+OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
 
 
 @dataclass(frozen=True)
@@ -95,23 +94,31 @@ def _shape(field: Field) -> tuple[object, ...]:
     return (field.name, field.item, field.start, field.length, field.kind, field.scale)
 
 
+def _first(database: Database, suffix: str) -> Message:
+    return database.get_message_by_name(AXES[0].upper() + suffix)
+
+
 def check(database: Database) -> None:
-    """Raise UserError unless the six axis messages are alike and carry the units of their group."""
-    first = fields(database.get_message_by_name(AXES[0].upper()))
-    for axis in AXES:
-        message = database.get_message_by_name(axis.upper())
-        mine = fields(message)
-        if [_shape(field) for field in mine] != [_shape(field) for field in first]:
-            raise UserError(f"selfcal.dbc: {message.name}: differs from {AXES[0].upper()}")
-        for field in mine:
-            parameter = next(
-                (p for p in PARAMETERS if f"_{p}_" in field.name and not field.name.endswith("_flags")), None
-            )
-            if field.name.startswith("bias_"):
-                parameter = "bias"
-            unit = parameter_unit(parameter, UNITS[message.name[0]]) if parameter else None
-            if unit is not None and field.unit != unit:
-                raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
+    """Raise UserError unless the messages of all axes and hypotheses are alike, have the identifiers that C works out,
+    and are in the units of their axes."""
+    suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
+    for place, axis in enumerate(AXES):
+        for suffix in suffixes:
+            pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
+            message = database.get_message_by_name(axis.upper() + suffix)
+            k = int(suffix[2:]) if suffix.startswith("_H") else None
+            if message.frame_id != pattern.frame_id + (place if k is None else HYPOTHESES * place + k):
+                raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
+            mine = fields(message)
+            if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:
+                raise UserError(f"selfcal.dbc: {message.name}: differs from {pattern.name}")
+            for field in mine:
+                parameter = "bias" if field.name.startswith("bias_") else field.name.partition("_")[0]
+                if parameter not in ("bias", PLACE_NAMES[0]) or field.name.endswith("_flags"):
+                    continue
+                unit = parameter_unit(parameter, AXIS_UNITS[axis])
+                if field.unit != unit:
+                    raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
 
 
 def _items(prefix: str, members: Iterable[Field]) -> list[str]:
@@ -140,65 +147,90 @@ def _items(prefix: str, members: Iterable[Field]) -> list[str]:
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
     check(database)
-    axis = fields(database.get_message_by_name(AXES[0].upper()))
     lines = [
-        "/* The telemetry frame format in numbers. Generated from selfcal.dbc, which describes every item:",
-        " * python -m selfcal.frames_codegen. Do not edit. */",
+        "/* The telemetry frame format in numbers. selfcal.dbc describes every item.",
+        " * Generated: python -m selfcal.frames_codegen. Do not edit. */",
         "#ifndef SELFCAL_FRAMES_H",
         "#define SELFCAL_FRAMES_H",
         "",
         f"#define SELFCAL_FRAMES_VERSION {int(database.version or 0)}U",
         "",
-        "/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number; the",
-        " * value of the item is in bits 0 to 31. */",
+        "/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number.",
+        " * The value of the item is in bits 0 to 31. */",
     ]
     for name, (start, length) in COMMON.items():
         lines.append(f"#define SELFCAL_FRAME_{name.upper()}_SHIFT {start}U")
         lines.append(f"#define SELFCAL_FRAME_{name.upper()}_MASK 0x{(1 << length) - 1:X}U")
-    lines.append("")
+    lines += [
+        "",
+        "/* Identifiers of node 0. Those of node n are SELFCAL_FRAME_NODE_IDS n higher. */",
+        f"#define SELFCAL_FRAME_NODES {NODES}U",
+        f"#define SELFCAL_FRAME_NODE_IDS {NODE_IDS}U",
+    ]
     for name in (STATUS, CORRECTED, COMMAND, ANSWER):
         lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{database.get_message_by_name(name).frame_id:X}U")
-    lines.append("")
-    lines.append("/* Axis name and id of each axis message. */")
-    lines.append(f"#define SELFCAL_FRAME_AXES {len(AXES)}U")
-    pairs = [f'{{"{name}", 0x{database.get_message_by_name(name.upper()).frame_id:X}U}}' for name in AXES]
-    lines += ["#define SELFCAL_FRAME_AXIS_TABLE \\", "    { \\"]
-    lines += [f"        {pair}, \\" for pair in pairs]
-    lines += ["    }", ""]
-    lines.append("/* Items of an axis message; units of a gyro axis, those of an accelerometer are alike in m/s^2. */")
-    lines += _items("SELFCAL_AXIS", axis)
+    lines += [
+        "",
+        "/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */",
+    ]
+    for suffix, name in OF_AXIS.items():
+        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{_first(database, suffix).frame_id:X}U")
+    names = ", ".join(f'"{name}"' for name in AXES)
+    lines += [
+        "",
+        "/* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */",
+        f"#define SELFCAL_FRAME_AXES {len(AXES)}U",
+        f"#define SELFCAL_FRAME_AXIS_NAMES {{{names}}}",
+        f"#define SELFCAL_FRAME_HYPOTHESES {HYPOTHESES}U",
+        f"#define SELFCAL_FRAME_PLACES {PLACES}U",
+        f"#define SELFCAL_FRAME_STATISTICS {len(STATISTICS)}U",
+        "",
+        "/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */",
+    ]
+    for suffix, name in OF_AXIS.items():
+        lines += _of_message(_first(database, suffix), name)
     for name in (STATUS, CORRECTED, ANSWER):
-        message = database.get_message_by_name(name)
-        lines.append(f"/* Items of the {name.lower()} message. */")
-        lines += _items(f"SELFCAL_{name}", fields(message))
-        for signal in message.signals:
-            for number, word in (signal.choices or {}).items():
-                lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
-    lines += ["", "#endif", ""]
+        lines += _of_message(database.get_message_by_name(name), name)
+    lines += ["#endif", ""]
     return "\n".join(lines)
+
+
+def _of_message(message: Message, name: str) -> list[str]:
+    """Items of a message, and the numbers of their choices."""
+    lines = [f"/* Items of the message {message.name}. */", *_items(f"SELFCAL_{name}", fields(message))]
+    for signal in message.signals:
+        for number, word in (signal.choices or {}).items():
+            lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
+    return lines if lines[-1] == "" else [*lines, ""]
 
 
 def table(database: Database) -> str:
     """The telemetry table for the docs, as Markdown."""
     check(database)
-    accel = {field.name: field.unit for field in fields(database.get_message_by_name("AX"))}
-    ids = ", ".join(f"`0x{database.get_message_by_name(a.upper()).frame_id:X}` {a.upper()}" for a in AXES)
     lines = ["| field of every frame | bits | meaning |", "|---|---|---|", "| `value` | 0 to 31 | by item, see below |"]
     status = database.get_message_by_name(STATUS)
     for name, (start, length) in COMMON.items():
         comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
         lines.append(f"| `{name}` | {start} to {start + length - 1} | {comment} |")
-    titles = {AXES[0].upper(): f"Axis messages: {ids}"}
+    titles = {}
+    for suffix in OF_AXIS:
+        ids = [database.get_message_by_name(a.upper() + suffix).frame_id for a in AXES]
+        said = ", ".join(f"`0x{id_:X}` {a.upper()}{suffix}" for id_, a in zip(ids, AXES, strict=True))
+        more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
+        titles[AXES[0].upper() + suffix] = said + more
     titles |= {
         name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
     }
     for name, title in titles.items():
         lines += ["", title, "", "| item | signal | type | unit | meaning |", "|---|---|---|---|---|"]
+        suffix = name.removeprefix(AXES[0].upper())
+        theirs = [database.get_message_by_name(AXES[-1].upper() + suffix)] if suffix in OF_AXIS else []
+        accel = {field.name: field.unit for message in theirs for field in fields(message)}
         for field in fields(database.get_message_by_name(name)):
             kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
             kind += _bits(field)
             unit = field.unit
-            if name.lower() in AXES and accel[field.name] != unit:
+            if accel.get(field.name, unit) != unit:
                 unit += f"; {accel[field.name]}"
             meaning = field.comment + (f": {field.choices}" if field.choices else "")
             lines.append(f"| {field.item} | `{field.name}` | {kind} | {unit} | {meaning} |")
@@ -213,19 +245,16 @@ def table(database: Database) -> str:
 
 
 def main() -> None:
-    """Write the header, or print the table."""
+    """Write DBC file and header, or print the table."""
     parser = argparse.ArgumentParser(prog="python -m selfcal.frames_codegen", description=__doc__)
-    parser.add_argument("--table", action="store_true", help="print the telemetry table instead of writing the header")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=None, help="where to write (default: lib/selfcal_frames.h)"
-    )
+    parser.add_argument("--table", action="store_true", help="print the telemetry table instead of writing the files")
     arguments = parser.parse_args()
     try:
         if arguments.table:
             print(table(load_dbc()), end="")
         else:
-            output = arguments.output or ROOT / "lib" / "selfcal_frames.h"
-            output.write_text(header(load_dbc()), encoding="utf-8")
+            (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")
+            (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
     except UserError as error:
         parser.exit(2, f"selfcal: error: {error}\n")
 

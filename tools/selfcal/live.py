@@ -1,4 +1,4 @@
-"""The live view of a module's telemetry, for the terminal."""
+"""The live view of the telemetry of one module or several, for the terminal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol
 
@@ -13,25 +14,17 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from selfcal.laws import NAMED, PLAIN
-from selfcal.units import typeset
-from selfcal.wire import OFF_GRID, AxisReport, Decoder, signal_unit, status_text
+from selfcal.dbc import BY_PLACE, PLACE_NAMES, Names
+from selfcal.units import parameter_unit, typeset
+from selfcal.wire import OFF_GRID, AxisReport, Decoder, Statistics, Streams, axis_unit, status_text
 
-SHORT = {
-    "constant": "constant",
-    "random_walk": "random walk",
-    "gauss_markov": "Gauss-Markov",
-    "flicker": "flicker",
-    "moving_average": "walk + MA",
-    "walk_and_markov": "walk + G-M",
-}
 #: Of the status, what is told elsewhere or to programs alone.
 UNTOLD = ("time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent")
 #: What the user has to do something about.
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
-#: Cells of a probability bar and of the bias's sparkline, at least and at most.
-BAR, SPARK = (12, 30), (8, 40)
+#: Cells of a probability bar and of the bias's sparkline, at least and at most. Many hypotheses leave no room for bars.
+BAR, SPARK = (4, 30), (8, 40)
 #: Of an axis's lines after the first.
 INDENT = 2
 #: Lines of the status, at most.
@@ -64,12 +57,12 @@ class Contact:
         self._since = clock()
         self._longest = 0.0
         self.ever = False
-        self._paced = False
+        self.paced = False
 
     def heard(self, *, in_a_row: bool, paced: bool) -> None:
         """Something came. `in_a_row`: a frame, and no other was lost before it. `paced`: a second status has come,
         more than SILENT_S of module time after the first."""
-        self._paced = paced
+        self.paced = paced
         if in_a_row and self.ever:
             self._longest = max(self._longest, self.silent_s)
         self._since = self._clock()
@@ -88,46 +81,77 @@ class Contact:
     @property
     def waiting(self) -> bool:
         """Silent, and it is not known yet how often the module speaks."""
-        return self.ever and not self._paced and self.silent_s > SILENT_S
+        return self.ever and not self.paced and self.silent_s > SILENT_S
+
+
+@dataclass
+class Module:
+    """One module that is heard: its last report of each axis with the last biases, and the module time then, s."""
+
+    decoder: Decoder
+    last: dict[str, tuple[AxisReport, deque[float]]] = field(default_factory=dict)
+    time_s: float = 0.0
+
+    def now(self) -> float:
+        """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
+        time_s = self.decoder.time_ms / 1000.0
+        if time_s < self.time_s:
+            self.last.clear()
+        self.time_s = time_s
+        return time_s
 
 
 class View:
-    """The last report of each axis, the module's status and the frame counts, fitted to the terminal.
+    """The last report of each axis, the status and the frame counts of each module, fitted to the terminal.
 
     A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value, and
     what the module has no number for as `-`. A module that has started anew has reported nothing yet. With `contact`
-    silence counts: reports age, and a module that is not heard is not shown as running. `axes`: those to show; default
-    all.
+    silence counts: reports age, and a module that is not heard is not shown as running. `contacts`: that of each node.
+    `axes`: those to show; default all. `names` gives the names of a module by its status, `advice` what to do where
+    there are none.
     """
 
     def __init__(
         self,
-        decoder: Decoder,
+        streams: Streams | Decoder,
         source: Source,
         title: str,
         total_s: float | None = None,
         contact: Contact | None = None,
         axes: Sequence[str] = (),
+        contacts: Mapping[int, Contact] | None = None,
+        names: Callable[[Mapping[str, float]], Names] = lambda status: BY_PLACE,
+        advice: Callable[[Mapping[str, float]], str] = lambda status: "",
     ) -> None:
-        self._decoder = decoder
+        self._streams = Streams.of(streams) if isinstance(streams, Decoder) else streams
         self._source = source
         self._title = title
         self._total_s = total_s
         self._contact = contact
+        self._contacts = contacts or {}
         self._axes = axes
-        self._last: dict[str, tuple[AxisReport, deque[float]]] = {}  # with the last biases
-        self._time_s = 0.0  # of the module, when it was looked at last
+        self._names = names
+        self._advice = advice
+        self._modules: dict[int, Module] = {}
         self._console = Console(stderr=True)
         self._live = Live(get_renderable=self.renderable, console=self._console, refresh_per_second=4, transient=True)
 
     def show(self, reports: Sequence[AxisReport]) -> None:
         """Take new reports."""
-        self._now()
+        for node in list(self._streams.decoders):
+            self._module(node).now()
         for report in reports:
             if not self._axes or report.axis in self._axes:
-                _, trend = self._last.get(report.axis, (report, deque(maxlen=SPARK[1])))
+                last = self._module(report.node).last
+                _, trend = last.get(report.axis, (report, deque(maxlen=SPARK[1])))
                 trend.append(report.value("bias_mean"))
-                self._last[report.axis] = report, trend
+                last[report.axis] = report, trend
+
+    def _module(self, node: int) -> Module:
+        return self._modules.setdefault(node, Module(self._streams.decoders[node]))
+
+    def _contact_of(self, module: Module | None) -> Contact | None:
+        return self._contact if module is None else self._contacts.get(module.decoder.node, self._contact)
 
     def __enter__(self) -> View:
         try:
@@ -148,51 +172,77 @@ class View:
 
     def renderable(self, *, whole: bool = False) -> RenderableType:
         """What is to be seen now; unless `whole`, no higher than the terminal."""
-        time_s = self._now()
         width = self._console.width
-        title = Text.assemble((f"{self._title}   module time {time_s:.1f} s   ", "bold"), self._state())
+        modules = {node: self._module(node) for node in self._streams.known}
+        first = next(iter(modules.values()), None)
+        numbered = not set(modules) <= {0}  # a bus of which node 0 is not the only one
+        title = Text(self._title, "bold") if numbered else self._title_of(self._title, first)
         parts: list[RenderableType] = [_line(title)]
         if self._total_s is not None and not whole:
-            done = round(min(1.0, time_s / self._total_s) * (width // 2))
+            done = round(min(1.0, (first.now() if first else 0.0) / self._total_s) * (width // 2))
             parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
-        parts += self._status(width)
-        parts.append(_line(Text(frame_counts(self._decoder, self._source), "dim")))
-        last = dict(self._last)  # Live asks from a thread of its own
-        if last:
-            laws = [
-                law for law in NAMED if law in PLAIN or any(f"{law}_probability" in r.values for r, _ in last.values())
-            ]
-            parts.append(_line(_heading(laws, _bar_cells(laws, width))))
-            blocks = self._blocks(last, laws, width)
-            parts += _fitted(blocks, None if whole else self._console.height - len(parts))
+        height = None if whole else self._console.height - len(parts) - (len(modules) > 1)
+        for place, (node, module) in enumerate(modules.items()):
+            share = None if height is None else height // (len(modules) - place)
+            lines = [_line(self._title_of(f"node {node}", module))] if numbered else []
+            lines += self._lines(module, width, None if share is None else share - len(lines))
+            height = None if height is None else height - len(lines)
+            parts += lines
+        if len(modules) != 1:
+            said = frame_counts(self._streams, self._source)
+            parts.append(_line(Text(f"all {said}" if modules else said, "dim")))
         return Group(*parts)
 
-    def _state(self) -> Text:
+    def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
+        """What is to be seen of one module, below its title; `height` lines at most."""
+        foreign = module.decoder.foreign
+        if foreign:
+            return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
+        lines = self._status(module, width)
+        lines.append(self._counts(module))
+        advice = self._advice(module.decoder.status)
+        if advice:
+            lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
+        last = dict(module.last)  # Live asks from a thread of its own
+        if last:
+            names = self._names(module.decoder.status)
+            count = max((report.hypotheses or told_of(report) for report, _ in last.values()), default=0)
+            named = (names.hypotheses if count <= len(names.hypotheses) else BY_PLACE.hypotheses)[:count]
+            lines.append(_line(_heading(named, _bar_cells(len(named), width))))
+            blocks = self._blocks(module, last, names, len(named), width)
+            lines += _fitted(blocks, None if height is None else height - len(lines))
+        return lines
+
+    def _counts(self, module: Module) -> Text:
+        """The frames of one module, and, if it is the only one, of strangers."""
+        whole = len(self._streams.known) == 1
+        said = frame_counts(self._streams, self._source) if whole else counted(module.decoder.statistics)
+        return _line(Text(said, "dim"))
+
+    def _title_of(self, name: str, module: Module | None) -> Text:
+        time_s = module.now() if module is not None else 0.0
+        return Text.assemble((f"{name}   module time {time_s:.1f} s   ", "bold"), self._state(module))
+
+    def _state(self, module: Module | None) -> Text:
         """What the module is doing, as far as it is heard."""
-        contact = self._contact
-        said = {1.0: "running", 2.0: "finished"}.get(self._decoder.status.get("state", 0.0), "waiting for the module")
+        contact = self._contact_of(module)
+        status = module.decoder.status if module is not None else {}
+        finished = module is not None and module.decoder.finished
+        said = {1.0: "running", 2.0: "finished"}.get(status.get("state", 0.0), "waiting for the module")
         if contact is not None and self._source.closed:
             return Text(f"port gone for {contact.silent_s:.0f} s, waiting for it", "bold red")
-        if contact is not None and contact.lost and not self._decoder.finished:
+        if contact is not None and contact.lost and not finished:
             word = "lost contact: no word" if contact.ever else "no word"
             return Text(f"{word} for {contact.silent_s:.0f} s", "bold red")
-        if contact is not None and contact.waiting and not self._decoder.finished:
+        if contact is not None and contact.waiting and not finished:
             return Text(f"waiting: no word for {contact.silent_s:.0f} s, a status comes every 10 s", "yellow")
         end = contact is None and self._total_s is None and self._source.closed
         return Text(f"{said}, end of the log" if end else said, "bold")
 
-    def _now(self) -> float:
-        """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
-        time_s = self._decoder.time_ms / 1000.0
-        if time_s < self._time_s:
-            self._last.clear()
-        self._time_s = time_s
-        return time_s
-
-    def _status(self, width: int) -> list[Text]:
+    def _status(self, module: Module, width: int) -> list[Text]:
         """What the status says that is not 0, by its signals' names (GUIDE.md, What the status says); trouble first."""
         said: list[Text] = []
-        for name, value in self._decoder.status.items():
+        for name, value in list(module.decoder.status.items()):
             if name not in UNTOLD and value != 0.0:
                 text = status_text(name, value)
                 trouble = TROUBLE.get(name) == text or name in ("sensor_fault", "axes_retired", "state_refused")
@@ -200,56 +250,75 @@ class View:
         return _flow(said, width, 3)[:STATUS_LINES]
 
     def _blocks(
-        self, last: Mapping[str, tuple[AxisReport, Sequence[float]]], laws: Sequence[str], width: int
+        self,
+        module: Module,
+        last: Mapping[str, tuple[AxisReport, Sequence[float]]],
+        names: Names,
+        hypotheses: int,
+        width: int,
     ) -> list[list[Text]]:
         """An axis's lines: the probabilities; bias, its course and N; what else there is."""
-        cells = _bar_cells(laws, width)
+        cells, contact = _bar_cells(hypotheses, width), self._contact_of(module)
         bias = {axis: _bias(report) for axis, (report, _) in last.items()}
-        parameters = {axis: _parameters(report) for axis, (report, _) in last.items()}
+        parameters = {axis: _parameters(report, names) for axis, (report, _) in last.items()}
         bias_width = max(map(len, bias.values()))
         spark = min(SPARK[1], width - INDENT - bias_width - 2 - max(len(texts[0]) for texts in parameters.values()))
         blocks = []
         for axis, (report, trend) in last.items():
-            age_s = max(0.0, self._time_s - report.time_s)
-            age_s += self._contact.silent_s if self._contact is not None else 0.0
+            age_s = max(0.0, module.time_s - report.time_s)
+            age_s += contact.silent_s if contact is not None else 0.0
             best = most_probable(report)
             head = Text(f"{axis:<5}{_number(report, 'count', '%.0f'):>8}")
-            for law in laws:
-                head.append("  ").append(_bar(report, law, cells), "bold green" if law == best else "")
+            for k in range(hypotheses):
+                head.append("  ").append(_bar(report, k, cells), "bold green" if k == best else "")
             head.append(f"{age_s:.0f} s".rjust(7), "dim")
             course = Text(_spark(trend, report.value("bias_sd"), spark), "cyan") if spark >= SPARK[0] else ""
             chunks = [Text.assemble(bias[axis].ljust(bias_width), " ", course, " ", parameters[axis][0])]
             chunks += [Text(text) for text in parameters[axis][1:]]
+            chunks += [Text(text) for text in _coefficients(report, names)]
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks
 
 
-def frame_counts(decoder: Decoder, source: Source) -> str:
-    """One line that says what became of the frames."""
-    s = decoder.statistics
-    return (
-        f"frames: {s.received} received, {s.lost} lost; "
-        f"{s.damaged} bad checksum, {s.refused} refused, {source.malformed} malformed"
-    )
+def counted(s: Statistics) -> str:
+    """What became of the frames of one stream."""
+    return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused"
 
 
-def most_probable(report: AxisReport) -> str | None:
-    """The law with the greatest probability; None if one that did not arrive, or is no number, could be greater."""
-    known = {law: report.values[f"{law}_probability"] for law in NAMED if f"{law}_probability" in report.values}
-    if not known or not (report.complete or known.keys() >= set(PLAIN)):
+def frame_counts(streams: Streams | Decoder, source: Source) -> str:
+    """One line that says what became of all frames."""
+    return f"{counted(streams.statistics)}, {source.malformed} malformed"
+
+
+def told_of(report: AxisReport) -> int:
+    """How many hypotheses a report tells of, at least."""
+    return max((k + 1 for k in range(len(BY_PLACE.hypotheses)) if f"h{k}_probability" in report.values), default=0)
+
+
+def most_probable(report: AxisReport) -> int | None:
+    """The hypothesis with the greatest probability; None if one that did not arrive, or is no number, could be
+    greater."""
+    signals = {k: f"h{k}_probability" for k in range(told_of(report))}
+    known = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
+    if not known or len(known) != report.hypotheses:
         return None
     if len({math.isnan(probability) for probability in known.values()}) > 1:
         return None  # all of them NaN is a report outside the priors: the view says that
-    return max(known, key=lambda law: known[law])
+    return max(known, key=lambda k: known[k])
 
 
-def _bar_cells(laws: Sequence[str], width: int) -> int:
-    return min(BAR[1], max(BAR[0], (width - 20) // len(laws) - 8))
+def _bar_cells(hypotheses: int, width: int) -> int:
+    """Cells of a bar; 0 where there is no room for one."""
+    cells = min(BAR[1], (width - 20) // max(1, hypotheses) - 8)
+    return cells if cells >= BAR[0] else 0
 
 
-def _heading(laws: Sequence[str], cells: int) -> Text:
-    named = "  ".join(f"{'P ' + SHORT[law]:<{6 + cells}}" for law in laws)
+def _heading(names: Sequence[str], cells: int) -> Text:
+    """Columns of a line. A name has the width of its number and bar."""
+    width = 6 + cells if cells else 5
+    said = ("P " if cells else "") + "{}"
+    named = "  ".join(said.format(name.replace("_", " "))[:width].ljust(width) for name in names)
     return Text(f"axis {'averages':>8}  {named}{'age':>7}", "dim")
 
 
@@ -295,13 +364,15 @@ def _number(report: AxisReport, signal: str, form: str, *, inverse: bool = False
 
 def _bias(report: AxisReport) -> str:
     mean, sd = _number(report, "bias_mean", "%.5g"), _number(report, "bias_sd", "%.2g")
-    return f"bias {mean} ± {sd} {typeset(signal_unit(report.axis, 'bias_mean'))}"
+    return f"bias {mean} ± {sd} {typeset(axis_unit(report.axis))}"
 
 
-def _bar(report: AxisReport, law: str, cells: int) -> str:
-    probability = report.value(f"{law}_probability")
+def _bar(report: AxisReport, k: int, cells: int) -> str:
+    probability = report.value(f"h{k}_probability")
     if math.isnan(probability):
-        return _number(report, f"{law}_probability", "").ljust(6 + cells)
+        return _number(report, f"h{k}_probability", "").ljust(6 + cells if cells else 5)
+    if not cells:
+        return f"{probability:.3f}"
     filled = round(min(1.0, max(0.0, probability)) * cells)
     return f"{probability:.3f} {'█' * filled}{'·' * (cells - filled)}"
 
@@ -322,21 +393,36 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
     return "".join(heights).ljust(cells)
 
 
-def _parameters(report: AxisReport) -> list[str]:
-    """The most probable law's parameters, medians with their intervals; first N, or why there is none."""
-    law = most_probable(report)
-    if law is None:
+def _parameters(report: AxisReport, names: Names) -> list[str]:
+    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none."""
+    k = most_probable(report)
+    if k is None:
         return ["most probable law: ? (not all probabilities came)"]
-    if math.isnan(report.values[f"{law}_probability"]):
+    if math.isnan(report.values[f"h{k}_probability"]):
         return ["outside the priors"]
     said = []
-    for parameter in NAMED[law].parameters:
-        name, inverse = f"{law}_{parameter}", parameter == "alpha"  # as a time, like the table
+    given = names.parameters[k] if k < len(names.parameters) else BY_PLACE.parameters[k]
+    for place, parameter in zip(PLACE_NAMES, given, strict=False):
+        if not names.known and not any(key.startswith(f"h{k}_{place}_m") for key in report.values):
+            continue  # a place that the law lacks
+        signal, inverse = f"h{k}_{place}", parameter == "alpha"  # as a time, like the table
         keys = ("median", "q95", "q05") if inverse else ("median", "q05", "q95")
-        middle, low, high = (_number(report, f"{name}_{key}", "%.3g", inverse=inverse) for key in keys)
+        middle, low, high = (_number(report, f"{signal}_{key}", "%.3g", inverse=inverse) for key in keys)
         label = "1/alpha" if inverse else parameter
-        unit = "s" if inverse else typeset(signal_unit(report.axis, f"{name}_median"))
-        said.append(f"{label} {middle} [{low}, {high}] {unit}")
-    if any(int(report.values.get(f"{law}_{parameter}_flags", 0)) & OFF_GRID for parameter in NAMED[law].parameters):
+        unit = "s" if inverse else typeset(parameter_unit(parameter, axis_unit(report.axis)))
+        said.append(f"{label} {middle} [{low}, {high}] {unit if unit != '1' else ''}".rstrip())
+    if any(int(report.values.get(f"h{k}_{place}_flags", 0)) & OFF_GRID for place in PLACE_NAMES[: len(given)]):
         said.append("not borne by the grid of nodes")
+    if not names.known:
+        said[:1] = [f"{BY_PLACE.hypotheses[k]}: {said[0] if said else 'no number'}"]
+    return said
+
+
+def _coefficients(report: AxisReport, names: Names) -> list[str]:
+    """Coefficients of the regressor columns that were told, with the probability that each is in use."""
+    reading, units = axis_unit(report.axis), dict(names.columns)
+    said = []
+    for name, (mean, sd, probability) in report.coefficients(names).items():
+        unit = f" {typeset(f'{reading}/{units[name]}')}" if units[name] else ""
+        said.append(f"{name} {mean:.3g} ± {sd:.2g}{unit} (P {probability:.2f})")
     return said

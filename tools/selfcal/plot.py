@@ -10,27 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.dbc import BY_PLACE, PLACE_NAMES, Names
 from selfcal.errors import UserError, printable
-from selfcal.laws import NAMED
 from selfcal.output import whole
 from selfcal.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire import AxisReport, axis_unit
 
-COLORS = {
-    "constant": "tab:green",
-    "random_walk": "tab:blue",
-    "gauss_markov": "tab:red",
-    "flicker": "tab:purple",
-    "moving_average": "tab:orange",
-    "walk_and_markov": "tab:olive",
-}
-#: Columns after the probabilities: parameter, and the laws whose estimates of it are drawn.
-PANELS = {
-    "N": ("constant", "random_walk", "gauss_markov"),
-    "K": ("random_walk",),
-    "sigma_m": ("gauss_markov",),
-    "alpha": ("gauss_markov",),
-}
+#: Of the hypotheses, in the model's order.
+COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
 #: A law whose last probability is below this is drawn faint, and its values are not written.
 FAINT = 0.01
 #: A true value beyond this is none: an integer may have any number of digits.
@@ -66,8 +53,10 @@ def plot_run(
     title: str,
     truth: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
+    names: Names = BY_PLACE,
 ) -> None:
-    """Save the picture of complete reports by axis; the suffix of `path` chooses the format.
+    """Save the picture of complete reports by axis; the suffix of `path` chooses the format. `names`: of hypotheses and
+    parameters; each parameter has a panel.
 
     Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
     as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
@@ -81,13 +70,17 @@ def plot_run(
     from matplotlib.lines import Line2D
 
     axes = list(history)
+    count = max((reports[-1].hypotheses or 0 for reports in history.values()), default=0)
+    names = names if count <= len(names.hypotheses) else BY_PLACE
+    hypotheses = names.hypotheses[:count]
+    panels = _panels(history, names, count)
     unit = {axis: (units or {}).get(axis, axis_unit(axis)) for axis in axes}
     rows = {name: [axis for axis in axes if unit[axis] == name] for name in unit.values()}
     spans: dict[tuple[str, str], list[float]] = {}  # what a panel's scale has to hold
     figure, grid = pyplot.subplots(
         len(axes),
-        1 + len(PANELS),
-        figsize=(19, 2.3 * len(axes) + 1.4),
+        1 + len(panels),
+        figsize=(3.8 * (1 + len(panels)), 2.3 * len(axes) + 1.4),
         squeeze=False,
         sharex=True,
         layout="constrained",
@@ -98,31 +91,30 @@ def plot_run(
         time = np.array([report.time_s for report in reports])
         late = int(SETTLING * len(time))
         told = (truth or {}).get(axis)
-        laws = [law for law in NAMED if f"{law}_probability" in reports[-1].values]
-        last = {law: reports[-1].value(f"{law}_probability") for law in laws}
-        shown = {law: 1.0 if probability >= FAINT else 0.2 for law, probability in last.items()}
-        for law in laws:
-            row[0].plot(time, _values(reports, f"{law}_probability"), color=COLORS[law], alpha=shown[law])
+        newest = reports[-1].values
+        last = {k: newest[f"h{k}_probability"] for k in range(count) if f"h{k}_probability" in newest}
+        shown = {k: 1.0 if probability >= FAINT else 0.2 for k, probability in last.items()}
+        for k in last:
+            row[0].plot(time, _values(reports, f"h{k}_probability"), color=COLORS[k], alpha=shown[k])
         row[0].set_ylim(-0.03, 1.03)
         row[0].set_ylabel(axis, rotation=0, fontweight="bold", labelpad=15)
-        _write(row[0], *_verdict(last, told))
-        for panel, (parameter, candidates) in zip(row[1:], PANELS.items(), strict=True):
-            scale = 1.0 if parameter == "alpha" else factor(axis_unit(axis), unit[axis])
+        _write(row[0], *_verdict(last, told, hypotheses))
+        for panel, (parameter, candidates) in zip(row[1:], panels.items(), strict=True):
+            scale = factor(axis_unit(axis), unit[axis]) if _scales(parameter) else 1.0
             spans[axis, parameter] = []
-            best = ""
-            for law in (law for law in candidates if law in laws):
-                low, middle, high = (
-                    _values(reports, f"{law}_{parameter}_{key}") * scale for key in ("q05", "median", "q95")
-                )
+            best = -1
+            for k, place in ((k, place) for k, place in candidates.items() if k in last):
+                signals = (f"h{k}_{place}_{key}" for key in ("q05", "median", "q95"))
+                low, middle, high = (_values(reports, signal) * scale for signal in signals)
                 if parameter == "alpha":
                     low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
-                panel.fill_between(time, low, high, color=COLORS[law], alpha=0.25 * shown[law], linewidth=0)
-                panel.plot(time, middle, color=COLORS[law], alpha=shown[law])
-                if last[law] >= FAINT and math.isfinite(middle[-1]):
+                panel.fill_between(time, low, high, color=COLORS[k], alpha=0.25 * shown[k], linewidth=0)
+                panel.plot(time, middle, color=COLORS[k], alpha=shown[k])
+                if last[k] >= FAINT and math.isfinite(middle[-1]):
                     spans[axis, parameter] += [*low[late:], *high[late:]]
-                    if last[law] > last.get(best, 0.0):
-                        best = law
-                        _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[law])
+                    if last[k] > last.get(best, 0.0):
+                        best = k
+                        _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[k])
                 elif len(candidates) == 1:  # nothing else in this panel
                     spans[axis, parameter] += middle[late:].tolist()
             value = _true(told, parameter, unit[axis])
@@ -130,19 +122,18 @@ def plot_run(
                 spans[axis, parameter].append(value)
                 panel.axhline(value, color="black", linestyle="--", linewidth=1.0)
             panel.set_yscale("log")
-            panel.set_ylabel(typeset("s" if parameter == "alpha" else parameter_unit(parameter, unit[axis])))
+            panel.set_ylabel(_label(parameter, unit[axis]))
             panel.grid(True, alpha=0.3)
         row[0].grid(True, alpha=0.3)
-    for column, parameter in enumerate(PANELS, start=1):
+    for column, parameter in enumerate(panels, start=1):
         for group in rows.values():
             span = [value for axis in group for value in spans[axis, parameter] if math.isfinite(value) and value > 0.0]
             for axis in group if span else ():
                 grid[axes.index(axis)][column].set_ylim(min(span) / 1.2, max(span) * 1.2)
-    headings = ("P", *("1/alpha" if parameter == "alpha" else parameter for parameter in PANELS))
+    headings = ("P", *("1/alpha" if parameter == "alpha" else parameter for parameter in panels))
     for panel, heading in zip(grid[0], headings, strict=True):
         panel.set_title(heading, loc="left", fontweight="bold")
-    drawn = [law for law in NAMED if any(f"{law}_probability" in reports[-1].values for reports in history.values())]
-    handles = [Line2D([], [], color=COLORS[law], label=law.replace("_", " ")) for law in drawn]
+    handles = [Line2D([], [], color=COLORS[k], label=name.replace("_", " ")) for k, name in enumerate(hypotheses)]
     handles += [Line2D([], [], color="black", linestyle="--", label="truth")] if truth else []
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     for panel in grid[-1]:
@@ -150,18 +141,33 @@ def plot_run(
     save_picture(figure, path, dpi=100)
 
 
+def _panels(history: Mapping[str, Sequence[AxisReport]], names: Names, count: int) -> dict[str, dict[int, str]]:
+    """The parameters, in the order in which the hypotheses have them; of each the hypotheses, with its place there."""
+    panels: dict[str, dict[int, str]] = {}
+    for k, parameters in enumerate(names.parameters[:count]):
+        for place, parameter in zip(PLACE_NAMES, parameters, strict=False):
+            if any(f"h{k}_{place}_median" in reports[-1].values for reports in history.values()):
+                panels.setdefault(parameter, {})[k] = place
+    return panels
+
+
+def _scales(parameter: str) -> bool:
+    """Whether a parameter is in the reading's unit, so that another unit changes its number."""
+    return parameter_unit(parameter, "deg/s") not in ("1", "1/s", "")
+
+
 def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
     return np.array([report.value(signal) for report in reports])
 
 
-def _verdict(last: Mapping[str, float], told: Any) -> tuple[str, str]:
-    """The most probable law with its probability and the true law, if there is one; and its colour."""
-    finite = {law: probability for law, probability in last.items() if math.isfinite(probability)}
+def _verdict(last: Mapping[int, float], told: Any, hypotheses: Sequence[str]) -> tuple[str, str]:
+    """The most probable hypothesis with its probability and the true one, if there is one; and its colour."""
+    finite = {k: probability for k, probability in last.items() if math.isfinite(probability)}
     if not finite:
         return "outside the priors", "black"
-    best = max(finite, key=lambda law: finite[law])
-    said = f"{best.replace('_', ' ')} {finite[best]:.3f}"
-    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(NAMED):
+    best = max(finite, key=lambda k: finite[k])
+    said = f"{hypotheses[best].replace('_', ' ')} {finite[best]:.3f}"
+    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(hypotheses):
         said += f" (truth: {told['hypothesis'].replace('_', ' ')})"
     return said, COLORS[best]
 
@@ -176,9 +182,17 @@ def _true(told: Any, parameter: str, unit: str) -> float | None:
     if parameter == "alpha":
         return 1.0 / value
     stated = told.get("unit", unit)
+    if not _scales(parameter):
+        return float(value)
     if not isinstance(stated, str) or not known(stated) or not same_kind(stated, unit):
         return None
     return float(value) * factor(stated, unit)
+
+
+def _label(parameter: str, reading: str) -> str:
+    """The unit of a panel, as print has it."""
+    unit = "s" if parameter == "alpha" else parameter_unit(parameter, reading)
+    return "" if unit == "1" else typeset(unit)
 
 
 def _write(panel: Any, text: str, color: str) -> None:

@@ -178,6 +178,8 @@ def parameter_unit(parameter: str, unit: str) -> str:
             return "1/s"
         case "spectral_ratio" | "markov_ratio":
             return "1"
+        case "p1" | "p2":  # places of the wire that no model names
+            return ""
     raise ValueError(f"no such parameter: {parameter}")
 
 

@@ -1,7 +1,7 @@
-"""The wire: telemetry frames in, reports out. Format: `lib/selfcal.dbc`, the one source of ids, items and units.
+"""The wire: telemetry frames in, reports out. `lib/selfcal.dbc` describes identifiers, items and units.
 
-A frame is believed only if its form, checksum and counter are right; what is lost is counted, and a report with frames
-missing stays incomplete: it is never filled up with older values.
+A frame is believed only if its form, checksum and counter are right. What is lost is counted. A report with frames
+missing stays incomplete: it is never filled up with older values. Reports are by place; a model gives the names.
 """
 
 from __future__ import annotations
@@ -18,24 +18,30 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from selfcal.dbc import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 from selfcal.errors import UserError
-from selfcal.laws import NAMED
+from selfcal.model import LAWS, Model
 from selfcal.result import AxisResult, Estimate
 
 if TYPE_CHECKING:
     import can
-    from cantools.database.can import Database
+    from cantools.database.can import Database, Message
 
+#: Version of the wire that this module reads.
+VERSION = 4
 #: Axis messages are named after the axis, in capitals.
-AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+AXES = tuple(AXIS_UNITS)
 STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
+#: nat; the item of an evidence difference ends there: so much less, or none at all.
+LEAST_EVIDENCE = -(2**31) * 0.001
+
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
-RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter
+RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
 
 
 #: Root of the source tree: the package is used in place.
@@ -57,17 +63,20 @@ def axis_unit(axis: str) -> str:
     """Unit of an axis's readings on the wire. Raises UserError for an axis that has no message."""
     if axis not in AXES:
         raise UserError(f"axis '{axis}' has no telemetry message (there are {', '.join(AXES)})")
-    return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name("bias_mean").unit or ""
+    return AXIS_UNITS[axis]
+
+
+def names_of(model: Model) -> Names:
+    """The model's names of hypotheses, of their parameters by place, and of regressor columns.
+
+    Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
+    columns = tuple((column, one.unit) for one in model.regressors for column in one.columns)
+    return Names(tuple(model.hypotheses), tuple(LAWS[name] for name in model.hypotheses), columns)
 
 
 def carries(axis: str, unit: str) -> bool:
     """Whether telemetry has a message for the axis, in this unit."""
     return axis in AXES and axis_unit(axis) == unit
-
-
-def signal_unit(axis: str, signal: str) -> str:
-    """Unit of one signal of an axis message."""
-    return load_dbc().get_message_by_name(axis.upper()).get_signal_by_name(signal).unit or ""
 
 
 def status_text(signal: str, value: float) -> str:
@@ -124,66 +133,123 @@ class Statistics:
 class AxisReport:
     """What arrived of one axis's report.
 
-    `values` by signal name, units as in the DBC. `time_s`: module time when it was begun, to the second below if the
-    opening frame is missing.
+    `values` by signal name, units as in the DBC; those of hypothesis k begin with `hk_`. `time_s`: module time when it
+    was begun, to the second below if the opening frame is missing.
     """
 
     axis: str
     time_s: float
     complete: bool
     values: dict[str, float]
+    node: int = 0
 
     def value(self, signal: str) -> float:
         """One value, NaN if it did not arrive."""
         return self.values.get(signal, math.nan)
 
-    def result(self) -> AxisResult:
-        """The report as the engines give it. For complete reports only (KeyError otherwise)."""
-        v = self.values
-        laws = [law for law in NAMED if f"{law}_probability" in v]
+    @property
+    def hypotheses(self) -> int | None:
+        """How many the module's model has; None if that did not arrive."""
+        return int(self.values["hypotheses"]) if "hypotheses" in self.values else None
 
-        def estimate(name: str) -> Estimate:
-            numbers = {statistic: v[f"{name}_{statistic}"] for statistic in STATISTICS}
-            flags = int(v[f"{name}_flags"])
+    def result(self, names: Names = BY_PLACE) -> AxisResult:
+        """The report as the engines give it. For complete reports only (KeyError otherwise), whose hypotheses `names`
+        has."""
+        v = self.values
+        best = v["ln_evidence"]
+        named = list(enumerate(names.hypotheses[: self.hypotheses]))
+
+        def estimate(k: int, place: str) -> Estimate:
+            numbers = {statistic: v[f"h{k}_{place}_{statistic}"] for statistic in STATISTICS}
+            flags = int(v[f"h{k}_{place}_flags"])
             return Estimate(**numbers, identified=bool(flags & IDENTIFIED), off_grid=bool(flags & OFF_GRID))
 
-        def evidence(law: str) -> float:
-            signal = load_dbc().get_message_by_name(self.axis.upper()).get_signal_by_name(f"{law}_ln_evidence_diff")
-            least = -(1 << signal.length - 1) * signal.scale  # the item ends there: so much less, or none at all
-            return v["ln_evidence"] + (v[signal.name] if v[signal.name] > least else -math.inf)
+        def evidence(k: int) -> float:
+            difference = v[f"h{k}_ln_evidence_diff"]
+            return best + (difference if difference > LEAST_EVIDENCE else -math.inf)
+
+        def parameters(k: int) -> dict[str, Estimate]:
+            there = [place for place in PLACE_NAMES if f"h{k}_{place}_mean" in v]
+            return {name: estimate(k, place) for name, place in zip(names.parameters[k], there, strict=False)}
 
         return AxisResult(
             n=int(v["count"]),
-            log_evidence={law: evidence(law) for law in laws},
-            probability={law: v[f"{law}_probability"] for law in laws},
-            parameters={law: {p: estimate(f"{law}_{p}") for p in NAMED[law].parameters} for law in laws},
+            log_evidence={name: evidence(k) for k, name in named},
+            probability={name: v[f"h{k}_probability"] for k, name in named},
+            parameters={name: parameters(k) for k, name in named},
             bias_mean=v["bias_mean"],
             bias_sd=v["bias_sd"],
         )
 
+    def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
+        """Mean, sd and probability of use of each regressor column that was told."""
+        return {
+            name: (self.value(f"c{c}_mean"), self.value(f"c{c}_sd"), self.value(f"c{c}_probability"))
+            for c, (name, _) in enumerate(names.columns)
+            if f"c{c}_mean" in self.values
+        }
+
 
 @dataclass
 class _Open:
-    """A report under way."""
+    """A report under way. `order`: of its last frame."""
 
     axis: str
     second: int
     time_s: float
-    item: int
+    order: int
     frames: int = 0
     values: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """A message of the DBC: its axis (or ""), what the names of its values begin with, and its place in a report."""
+
+    message: Message
+    axis: str
+    prefix: str
+    part: int
+
+
+#: Places in a report: opening, hypotheses, coefficients, adequacy, end.
+_COEFFICIENTS, _ADEQUACY, _END = HYPOTHESES + 1, HYPOTHESES + 2, HYPOTHESES + 3
+#: Item of an axis message that closes a report.
+_END_ITEM = 43
+
+
+@lru_cache(maxsize=1)
+def _kinds() -> dict[int, _Kind]:
+    """Messages that modules send, by their offset within a node's identifiers."""
+    kinds = {}
+    for message in load_dbc().messages:
+        axis, _, rest = message.name.lower().partition("_")
+        hypothesis = int(rest[1:]) if rest.startswith("h") else None
+        part = {"": 0, "coefficients": _COEFFICIENTS, "adequacy": _ADEQUACY}.get(rest)
+        if message.name in (STATUS, CORRECTED, ANSWER):
+            kinds[message.frame_id - BASE] = _Kind(message, "", "", 0)
+        elif hypothesis is not None:
+            kinds[message.frame_id - BASE] = _Kind(message, axis, f"h{hypothesis}_", 1 + hypothesis)
+        elif axis in AXES and part is not None:
+            kinds[message.frame_id - BASE] = _Kind(message, axis, "", part)
+    return kinds
+
+
+def node_of(identifier: int) -> int | None:
+    """Node that a frame with this identifier comes from; None: no module sends it."""
+    node, offset = divmod(identifier - BASE, NODE_IDS)
+    return node if 0 <= node < NODES and offset in _kinds() else None
+
+
 class Decoder:
-    """Turns frames into reports and keeps the count of what went wrong.
+    """Turns the frames of one node into reports and keeps the count of what went wrong.
 
     `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
     count too.
     """
 
-    def __init__(self, *, from_start: bool = False) -> None:
-        database = load_dbc()
-        self._messages = {message.frame_id: message for message in database.messages if message.name != COMMAND}
+    def __init__(self, *, node: int = 0, from_start: bool = False) -> None:
+        self.node = node
         self.statistics = Statistics()
         #: Last value of each status signal.
         self.status: dict[str, float] = {}
@@ -203,12 +269,27 @@ class Decoder:
         self._sent = 0  # frames sent since then, as far as known
         self._run: list[int] = []  # counters of good frames refused in a row
         self._open: _Open | None = None
+        self._foreign_ends = False  # a status of another version has come to its end
+
+    @property
+    def foreign(self) -> str:
+        """What is wrong if the module speaks another version of the wire; empty if it does not."""
+        told = self.status.get("wire_version", VERSION)
+        if told == VERSION:
+            return ""
+        older = "load the firmware of this release into it" if told < VERSION else "take the tools of its release"
+        return f"the module speaks wire version {told:.0f}, this tool reads version {VERSION}: {older}"
+
+    @property
+    def surely_foreign(self) -> bool:
+        """A whole status has said so, no lone frame."""
+        return bool(self.foreign) and self._foreign_ends
 
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take one frame; return the reports that it closes (none, one or two)."""
-        definition = self._messages.get(message.arbitration_id)
+        kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
         if (
-            definition is None
+            kind is None
             or message.is_extended_id
             or message.is_remote_frame
             or message.is_error_frame
@@ -225,14 +306,15 @@ class Decoder:
             return []
         item, counter, second = bits >> 32 & 0x3F, bits >> 38 & 0x3F, bits >> 44 & 0xFF
         try:
-            decoded: dict[str, Any] = dict(definition.decode(data, decode_choices=False))  # type: ignore[arg-type]
+            decoded: dict[str, Any] = dict(kind.message.decode(data, decode_choices=False))  # type: ignore[arg-type]
         except Exception:  # cantools has a class of its own for an item that the DBC does not have
             self.statistics.refused += 1
             return []
         values = {
             name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")
         }
-        if not all(_possible(definition.name, name, value) for name, value in values.items()):
+        name = kind.message.name
+        if not all(_possible(kind, signal, value) for signal, value in values.items()):
             self.statistics.refused += 1
             return []
         if "time_ms" in values and int(values["time_ms"]) // 1000 % 256 != second:
@@ -249,32 +331,49 @@ class Decoder:
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
-            told_ms = self._advance(int(values["time_ms"]), 0 if definition.name == STATUS else BACK_MS)
+            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else BACK_MS)
         else:
             told_ms = self._begun(second)
-        if definition.name == STATUS:
-            self.status.update(values)
-            if "frames_sent" in values:
-                self._exact(int(values["frames_sent"]))
-                self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
-                self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
+        if name == STATUS:
+            self._take_status(values)
             return self.flush()
-        if definition.name == CORRECTED:
+        if self.foreign:
+            return []
+        if name == CORRECTED:
             if "time_ms" in values:
                 self.corrected = {}  # an axis that is no longer sent has no part in it
                 self._corrects = True
             if self._corrects:
                 self.corrected.update(values)
             return self.flush()
-        if definition.name == ANSWER:
+        if name == ANSWER:
             self.answer.update(values)
             return self.flush()
-        return self._assemble(definition.name.lower(), item, jump, second, told_ms / 1000.0, values)
+        order = _order(kind, item)
+        named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
+        return self._assemble(kind.axis, order, jump, second, told_ms / 1000.0, named)
+
+    def _take_status(self, values: Mapping[str, float]) -> None:
+        """Take an item of the status. Of another version nothing is believed but the version."""
+        if values.get("wire_version", VERSION) != VERSION:
+            self.status = dict(values)
+            self._open = None
+            self._foreign_ends = False
+        elif not self.foreign or "wire_version" in values:
+            self.status.update(values)
+        if "frames_sent" in values:
+            self._exact(int(values["frames_sent"]))
+            self._foreign_ends = bool(self.foreign)
+            self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+            self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
     def flush(self) -> list[AxisReport]:
         """Close the report under way, incomplete, for the end of a stream."""
         report, self._open = self._open, None
-        return [] if report is None else [_report(report, complete=False)]
+        return [] if report is None else [self._report(report, complete=False)]
+
+    def _report(self, report: _Open, *, complete: bool) -> AxisReport:
+        return AxisReport(report.axis, report.time_s, complete, report.values, self.node)
 
     def _accept(self, counter: int) -> int:
         """How far the counter went ahead; 0 if the frame is to be refused."""
@@ -315,26 +414,28 @@ class Decoder:
         return self.time_ms + min(0, ahead)
 
     def _assemble(
-        self, axis: str, item: int, jump: int, second: int, begun_s: float, values: dict[str, float]
+        self, axis: str, order: int, jump: int, second: int, begun_s: float, values: dict[str, float]
     ) -> list[AxisReport]:
-        """Add a frame to its report. Frames of a report follow each other in ascending item order, so a jump of the
-        counter must not exceed that of the item."""
+        """Add a frame to its report. Frames of a report follow each other in ascending order, so a jump of the counter
+        must not exceed that of the order."""
         closed: list[AxisReport] = []
         report = self._open
-        if report is not None and not (axis == report.axis and second == report.second and jump <= item - report.item):
-            closed = self.flush()
-            report = None
+        if report is not None:
+            goes_on = axis == report.axis and second == report.second and jump <= order - report.order
+            if not goes_on:
+                closed = self.flush()
+                report = None
         if report is None:
-            report = self._open = _Open(axis, second, begun_s, item)
-        report.item = item
+            report = self._open = _Open(axis, second, begun_s, order)
+        report.order = order
         report.frames += 1
         report.values.update(values)
         if "end_items" in values:
             self._open = None
             opened = report.values.get("time_ms")
             if opened is None or int(opened) % 2**24 == int(values["end_time_ms"]):
-                complete = opened is not None and report.frames == int(values["end_items"])
-                closed.append(_report(report, complete=complete))
+                complete = opened is not None and report.frames == int(values["end_items"]) and _whole(report.values)
+                closed.append(self._report(report, complete=complete))
         return closed
 
     def _begun(self, second: int) -> int:
@@ -349,21 +450,108 @@ def _ahead(told: int, known: int, modulus: int) -> int:
     return (told - known + modulus // 2) % modulus - modulus // 2
 
 
-def _possible(message: str, signal: str, value: float) -> bool:
+@lru_cache(maxsize=1)
+def _starts() -> tuple[int, ...]:
+    """Place of the first frame of each part of a report."""
+    items = dict.fromkeys(range(_END + 1), 1)
+    for kind in _kinds().values():
+        if kind.axis == AXES[0]:
+            ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
+            items[kind.part] = 1 + max(one for one in ids if one != _END_ITEM)
+    return tuple(sum(items[before] for before in range(part)) for part in range(_END + 1))
+
+
+def _order(kind: _Kind, item: int) -> int:
+    """Place of a frame among all that a report may have. No more frames lie between two than their places tell."""
+    return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
+
+
+def _possible(kind: _Kind, signal: str, value: float) -> bool:
     """Whether a module can mean this value.
 
-    In axis messages a value that is not a number says that the module has none. A law without any evidence has minus
-    infinity; a hair beyond 1 is a probability's rounding in float32.
+    In an axis's messages a value that is not a number says that the module has none. A law without any evidence has
+    minus infinity; a hair beyond 1 is a probability's rounding in float32.
     """
     if math.isnan(value):
-        return message.lower() in AXES
-    if signal.endswith("_probability"):
+        return kind.axis != ""
+    if signal.endswith("probability"):
         return 0.0 <= value <= 1.0 + 1e-6
+    if signal == "hypotheses":
+        return 1.0 <= value <= HYPOTHESES
     return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)
 
 
-def _report(report: _Open, *, complete: bool) -> AxisReport:
-    return AxisReport(report.axis, report.time_s, complete, report.values)
+def _whole(values: Mapping[str, float]) -> bool:
+    """Whether all hypotheses that the module has are there, and no other, with a place N each."""
+    there = {k for k in range(HYPOTHESES) if f"h{k}_probability" in values}
+    wanted = ("h{}_ln_evidence_diff", "h{}_N_flags", "h{}_N_mean")
+    all_there = there == set(range(int(values["hypotheses"])))
+    return all_there and all(name.format(k) in values for k in there for name in wanted)
+
+
+class Streams:
+    """The decoders of all nodes that are heard, one each.
+
+    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this one alone.
+    """
+
+    def __init__(self, *, node: int | None = None) -> None:
+        self.decoders: dict[int, Decoder] = {}
+        self.strangers = Statistics()  # what belongs to no node
+        self._node = node
+
+    @staticmethod
+    def of(decoder: Decoder) -> Streams:
+        """Those of one decoder that is there already."""
+        streams = Streams(node=decoder.node)
+        streams.decoders[decoder.node] = decoder
+        return streams
+
+    def feed(self, message: can.Message) -> list[AxisReport]:
+        """Take one frame of any node; return the reports that it closes."""
+        node = node_of(message.arbitration_id)
+        if node is None:
+            self.strangers.refused += 1
+            return []
+        if self._node is not None and node != self._node:
+            return []
+        decoder = self.decoders.get(node)
+        if decoder is not None:
+            return decoder.feed(message)
+        decoder = Decoder(node=node)
+        reports = decoder.feed(message)
+        if decoder.statistics.received > 0:
+            self.decoders[node] = decoder
+        else:
+            self.strangers.damaged += decoder.statistics.damaged
+            self.strangers.refused += decoder.statistics.refused
+        return reports
+
+    def flush(self) -> list[AxisReport]:
+        """Close the reports under way, incomplete, for the end of the streams."""
+        return [report for decoder in self.decoders.values() for report in decoder.flush()]
+
+    @property
+    def known(self) -> dict[int, Decoder]:
+        """The nodes that are no passing stranger, by number. Until there is one: whatever is heard."""
+        heard = dict(sorted(self.decoders.items()))  # the view asks from a thread of its own
+        sure = {node: one for node, one in heard.items() if one.statistics.received >= RESYNC or self._node == node}
+        return sure or heard
+
+    @property
+    def statistics(self) -> Statistics:
+        """Of all together. Frames of a passing stranger count as refused."""
+        known = self.known
+        total = Statistics(**vars(self.strangers))
+        for node, decoder in list(self.decoders.items()):
+            one = decoder.statistics
+            total.damaged += one.damaged
+            if node in known:
+                total.received, total.lost = total.received + one.received, total.lost + one.lost
+                total.refused += one.refused
+            else:
+                total.refused += one.refused + one.received
+        return total
 
 
 #: Bytes of a serial line without an end that are kept: a frame's line has 22.

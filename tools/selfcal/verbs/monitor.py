@@ -1,4 +1,4 @@
-"""`selfcal monitor`: live view of a module's telemetry on any python-can interface, or of a log of its frames."""
+"""`selfcal monitor`: live view of the telemetry of one module or several on any python-can interface, or of a log."""
 
 from __future__ import annotations
 
@@ -9,24 +9,31 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
 from selfcal.checks import Judged
+from selfcal.dbc import NODES, Names
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError
 from selfcal.framelog import WRITTEN, FrameLog
+from selfcal.known_models import KnownModels
 from selfcal.live import SILENT_S, Contact, View
 from selfcal.plot import check_picture, plot_run
-from selfcal.wire import AXES, AxisReport, Decoder, Link, Statistics, axis_unit, open_bus, serial_ports
+from selfcal.wire import AXES, AxisReport, Link, Statistics, Streams, axis_unit, node_of, open_bus, serial_ports
+
+if TYPE_CHECKING:
+    import can
 
 #: s without a frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s, and one
 #: that has restarted says nothing until then.
 REOPEN_S = 3.0
 #: s between looks for a port that has gone.
 LOOK_S = 0.5
+#: Schema of the document of several modules.
+MODULES = "selfcal.modules/1"
 #: Reports of an axis that are kept for the plot: beyond it every other one goes.
 KEPT = 2000
 
@@ -48,6 +55,8 @@ def monitor(
     read: Path | str | None = None,
     speed: float | None = None,
     axes: Sequence[str] = (),
+    node: int | None = None,
+    model: Path | str | None = None,
     log: Path | str | None = None,
     duration: float | None = None,
     bitrate: int | None = None,
@@ -58,11 +67,14 @@ def monitor(
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
 
+    Several modules of a bus are shown one below the other; `node`: that one alone. `model`: file of a model beside the
+    default one, for the names of what a module sends.
     A port that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played;
     default: as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
     python-can's format. `bitrate` of the CAN bus, bit/s, where the interface needs one. `json`: the last complete
-    reports as a document `selfcal.identify/1` in telemetry's units, without checks. `plot`: the picture of the run.
-    Raises UserError for what the user can put right.
+    reports as a document `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules
+    a document `selfcal.modules/1` that holds one for each. `plot`: the picture of the run; of several modules one each,
+    whose name ends in the node. Raises UserError for what the user can put right.
     """
     import can
 
@@ -72,6 +84,8 @@ def monitor(
         )
     for name in axes:
         axis_unit(name)
+    if node is not None and not 0 <= node < NODES:
+        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     if speed is not None and (read is None or not 0.0 < speed < math.inf):
         raise UserError("--speed is above 0, and goes with --read")
     if log is not None and Path(log).suffix.lower() not in WRITTEN:
@@ -82,8 +96,10 @@ def monitor(
         check_picture(plot)
     check_writable(json, plot)
     name = str(read if channel is None else channel)
-    decoder = Decoder()
-    history: dict[str, list[AxisReport]] = {}
+    models = KnownModels(*([] if model is None else [model]))
+    streams = Streams(node=node)
+    contacts: dict[int, Contact] = {}
+    histories: dict[int, dict[str, list[AxisReport]]] = {}
     with held() as ending, ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
@@ -101,7 +117,16 @@ def monitor(
             except OSError as error:
                 raise UserError(f"{log}: cannot write: {error.strerror}") from error
         opened = time.monotonic()
-        view = View(decoder, source, title, contact=contact, axes=axes)
+        view = View(
+            streams,
+            source,
+            title,
+            contact=contact,
+            contacts=contacts,
+            axes=axes,
+            names=models.names,
+            advice=models.advice,
+        )
         try:
             with view:
                 while not ending.asked and (left := end - time.monotonic()) > 0.0:
@@ -112,13 +137,11 @@ def monitor(
                             time.sleep(min(LOOK_S, left))
                         opened = time.monotonic()
                         continue
-                    received, lost, malformed = decoder.statistics.received, decoder.statistics.lost, source.malformed
+                    malformed = source.malformed
                     frame = source.recv(min(0.25, left))
-                    reports = [] if frame is None else decoder.feed(frame)
-                    in_a_row = (decoder.statistics.received, decoder.statistics.lost) == (received + 1, lost)
+                    reports = [] if frame is None else _feed(streams, frame, contacts if contact is not None else None)
                     if contact is not None and (frame is not None or source.malformed > malformed):
-                        first, last = decoder.status_ms or (0, 0)
-                        contact.heard(in_a_row=in_a_row, paced=abs(last - first) > 1000.0 * SILENT_S)
+                        contact.heard(in_a_row=False, paced=any(one.paced for one in contacts.values()))
                     if frame is None:
                         if contact is not None and min(contact.silent_s, time.monotonic() - opened) > REOPEN_S:
                             cast(Link, source).open_again()  # a module that has restarted waits for that
@@ -126,27 +149,64 @@ def monitor(
                         continue
                     if logger is not None:
                         logger(frame)
+                    if streams.known and all(one.surely_foreign for one in streams.known.values()):
+                        break
                     view.show(reports)
-                    _keep(history, [one for one in reports if not axes or one.axis in axes])
+                    for report in reports:
+                        if report.axis in (axes or AXES):
+                            _keep(histories.setdefault(report.node, {}), [report])
             wanted = ending.asked
         except KeyboardInterrupt:
             wanted = True
-        view.show(decoder.flush())
+        view.show(streams.flush())
         view.print_last()
-        outcome = Outcome(**vars(decoder.statistics))
+        outcome = Outcome(**vars(streams.statistics))
         console = Console(stderr=True)
-        for line in _farewell(source, contact, decoder, name):
+        for line in _farewell(source, contact, contacts, streams, name):
             outcome.contact_lost = not wanted
             console.print(line, highlight=False, markup=False, soft_wrap=True)
-    reported = {axis: history[axis] for axis in AXES if axis in history}
+    known = streams.known
+    foreign = {number: decoder.foreign for number, decoder in known.items() if decoder.foreign}
+    if foreign and len(foreign) == len(known):
+        raise UserError(f"{name}: {next(iter(foreign.values()))}")
+    reported = {
+        number: {axis: histories[number][axis] for axis in AXES if axis in histories[number]}
+        for number in sorted(histories)
+        if number in known and histories[number]
+    }
     if (json is not None or plot is not None) and not reported:
         raise UserError(f"{name}: no complete report came, so there is nothing to write")
+    names = {number: models.names(known[number].status) for number in reported}
     if json is not None:
-        write_json(_document(reported, decoder.status, name), json)
+        documents = {
+            number: _document(history, known[number].status, name, names[number], number)
+            for number, history in reported.items()
+        }
+        several = {"schema": MODULES, "modules": {str(number): one for number, one in documents.items()}}
+        write_json(next(iter(documents.values())) if len(documents) == 1 else several, json)
     if plot is not None:
-        plot_run(reported, plot, f"{Path(name).name}: the module's telemetry")
-        console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
+        for number, history in reported.items():
+            file = Path(plot) if len(reported) == 1 else Path(plot).with_stem(f"{Path(plot).stem}-node{number}")
+            which = f" of node {number}" if len(reported) > 1 or number else ""
+            plot_run(history, file, f"{Path(name).name}: the module's telemetry{which}", names=names[number])
+            console.print(f"plot: {file}", highlight=False, markup=False, soft_wrap=True)
     return outcome
+
+
+def _feed(streams: Streams, frame: can.Message, contacts: dict[int, Contact] | None) -> list[AxisReport]:
+    """Take a frame, and note by the host's clock that its module was heard."""
+    node = node_of(frame.arbitration_id)
+    before = streams.decoders.get(node) if node is not None else None
+    received, lost = (before.statistics.received, before.statistics.lost) if before is not None else (0, 0)
+    reports = streams.feed(frame)
+    decoder = streams.decoders.get(node) if node is not None else None
+    if contacts is not None and decoder is not None and decoder.statistics.received > received:
+        in_a_row = (decoder.statistics.received, decoder.statistics.lost) == (received + 1, lost)
+        first, last = decoder.status_ms or (0, 0)
+        contacts.setdefault(decoder.node, Contact()).heard(
+            in_a_row=in_a_row, paced=abs(last - first) > 1000.0 * SILENT_S
+        )
+    return reports
 
 
 def _keep(history: dict[str, list[AxisReport]], reports: Sequence[AxisReport]) -> None:
@@ -162,21 +222,33 @@ def _keep(history: dict[str, list[AxisReport]], reports: Sequence[AxisReport]) -
             del kept[1:-1:2]
 
 
-def _farewell(source: Link | FrameLog, contact: Contact | None, decoder: Decoder, name: str) -> list[str]:
+def _farewell(
+    source: Link | FrameLog, contact: Contact | None, contacts: Mapping[int, Contact], streams: Streams, name: str
+) -> list[str]:
     """What went wrong at the end, if anything did."""
     if isinstance(source, FrameLog):
         return [f"{name}: the log is damaged and ends early: {source.damage}"] if source.damage else []
     assert contact is not None
-    if decoder.finished:
+    known = streams.known
+    if known and all(decoder.finished for decoder in known.values()):
         return []
     if source.closed:
         return [f"{name}: the other side has gone"]
     if not contact.ever:
         return [f"{name}: no word from a module"]
-    return [f"{name}: contact lost, no word for {contact.silent_s:.0f} s"] if contact.lost else []
+    lost = {node: contacts[node] for node, one in known.items() if not one.finished and contacts[node].lost}
+    said = [
+        f"{name}: {f'node {node}: ' if set(known) != {0} else ''}contact lost, no word for {one.silent_s:.0f} s"
+        for node, one in lost.items()
+    ]
+    if not known and contact.lost:
+        said.append(f"{name}: contact lost, no word for {contact.silent_s:.0f} s")
+    return said
 
 
-def _document(history: Mapping[str, Sequence[AxisReport]], status: Mapping[str, float], name: str) -> dict[str, Any]:
+def _document(
+    history: Mapping[str, Sequence[AxisReport]], status: Mapping[str, float], name: str, names: Names, node: int
+) -> dict[str, Any]:
     """The last complete reports as `identify` gives its results. Checks need the samples, which are not here."""
     interval, block = status.get("bank_interval", math.nan), status.get("bank_block", math.nan)
     run = SimpleNamespace(
@@ -186,10 +258,23 @@ def _document(history: Mapping[str, Sequence[AxisReport]], status: Mapping[str, 
         duration_s=max(reports[-1].time_s for reports in history.values()),
     )
     found = {
-        axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(), Judged({}, None), {})
+        axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
         for axis, reports in history.items()
     }
     document = to_document(cast(Any, run), found)
-    for axis in document["axes"].values():
-        axis["adequate"] = None
+    document["node"] = node
+    for axis, entry in document["axes"].items():
+        entry["adequate"] = None
+        told = history[axis][-1].coefficients(names)
+        if told:
+            units = dict(names.columns)
+            entry["coefficients"] = {
+                column: {
+                    "mean": mean,
+                    "sd": sd,
+                    "probability": probability,
+                    "unit": f"{axis_unit(axis)}/{units[column]}" if units[column] else None,
+                }
+                for column, (mean, sd, probability) in told.items()
+            }
     return document

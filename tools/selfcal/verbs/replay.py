@@ -23,6 +23,7 @@ from rich.console import Console
 
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_lattice
+from selfcal.dbc import HYPOTHESES
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError, note
@@ -32,10 +33,10 @@ from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.result import in_unit
-from selfcal.tables import bank_block, gate_table, make_tables
+from selfcal.tables import Tables, bank_block, gate_table, make_tables
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
-from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, open_bus
+from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus
 
 MAGIC = b"SELFCAL1"
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
@@ -112,9 +113,11 @@ def replay(
     loaded_model = Model.load(model)
     if loaded_model.regressors:
         raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
-    sums = [law for law in loaded_model.hypotheses if law in SUMS]
-    if sums:
-        raise UserError(f"{loaded_model.path}: telemetry has no items for {', '.join(sums)}; take `identify`")
+    if len(loaded_model.hypotheses) > HYPOTHESES:
+        raise UserError(
+            f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
+            f"{len(loaded_model.hypotheses)}; take `identify`"
+        )
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     names = chosen_axes(recording, loaded_model, axes)
     for name in names:
@@ -138,7 +141,7 @@ def replay(
         title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
         truth = recording.meta.get("truth") if simulated else None
         units = {name: recording.columns[name].unit for name in history}
-        plot_run(history, plot, title, truth if isinstance(truth, dict) else None, units)
+        plot_run(history, plot, title, truth if isinstance(truth, dict) else None, units, names_of(loaded_model))
         note(f"plot: {plot}")
     return document
 
@@ -152,7 +155,8 @@ def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         tables = Path(name)
-        write_tables(model, make_tables(model, rate_hz, tuple(axes), nodes or target), tables)
+        made = make_tables(model, rate_hz, tuple(axes), nodes or target)
+        write_tables(model, made, tables)
         key = _content(tables, made_by.make)
         folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -163,12 +167,28 @@ def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host
                 shutil.rmtree(part, ignore_errors=True)  # a build that was killed leaves it
                 try:
                     shutil.copytree(tables, part)
-                    _make(made_by.make, target, part.relative_to(ROOT))
+                    _make(made_by.make, target, part.relative_to(ROOT), model_flags(made))
                     part.rename(folder)
                 except BaseException:
                     shutil.rmtree(part, ignore_errors=True)
                     raise
     return folder / made_by.image
+
+
+def model_flags(tables: Tables) -> str:
+    """Sizes that a firmware needs beyond the configured ones (port/arm.mk); none for the laws of the default model."""
+    if not tables.term_nodes and len(tables.hypotheses) <= 3:
+        return ""
+    grids = [grid.nodes for one in tables.hypotheses for grid in (one.rho, one.alpha) if grid]
+    sizes = {
+        "TERMS_MAX": 3 if tables.term_nodes else 1,
+        "HYPOTHESES_MAX": len(tables.hypotheses),
+        "GRID_MAX": max(grids, default=6),
+        "ALPHA_MAX": max((one.alpha.nodes for one in tables.hypotheses if one.alpha), default=6),
+        "HYPOTHESIS_NODES_MAX": max(*grids, *(one.nodes for one in tables.hypotheses)),
+        "NODES_MAX": tables.nodes,
+    }
+    return " ".join(f"-USELFCAL_{name} -DSELFCAL_{name}={size}" for name, size in sizes.items())
 
 
 def _content(tables: Path, name: str) -> str:
@@ -182,14 +202,14 @@ def _content(tables: Path, name: str) -> str:
     return said.hexdigest()[:16]
 
 
-def _make(name: str, target: str, folder: Path) -> None:
+def _make(name: str, target: str, folder: Path, flags: str) -> None:
     """Make a firmware in `folder`, which is relative to ROOT: a checkout's own path may hold spaces."""
     command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
     # Of a `make` around this program nothing is passed on: neither its options nor its variables.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
         done = subprocess.run(
-            [*command, f"CORE={target}"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+            [*command, f"CORE={target}", f"MODEL_FLAGS={flags}"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
         )
     except OSError as error:
         raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
@@ -250,7 +270,7 @@ def run(
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
                 link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
             if link is not None and wire:
-                finished = _watch(link, recording, history, target, module)
+                finished = _watch(link, recording, model, history, target, module)
                 link.close_channel()  # the emulator forgets what it holds of a line that is closed
             said = before + _ending(module)
         if module.returncode != 0 or not finished:
@@ -347,6 +367,7 @@ def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str,
 def _watch(
     link: Link,
     recording: Recording,
+    model: Model,
     history: dict[str, list[AxisReport]],
     target: str,
     module: subprocess.Popen[str],
@@ -357,7 +378,7 @@ def _watch(
     whole: dict[str, bool] = {}  # the axis's last report
     decoder = Decoder(from_start=True)
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
-    with View(decoder, link, title, recording.duration_s) as view:
+    with View(decoder, link, title, recording.duration_s, names=lambda status: names_of(model)) as view:
         heard = time.monotonic()
         while not decoder.finished:
             frame = link.recv(1.0)
@@ -368,6 +389,8 @@ def _watch(
                 continue
             heard = time.monotonic()
             reports = decoder.feed(frame)
+            if decoder.surely_foreign:
+                raise UserError(f"{recording.path}: {decoder.foreign}")
             view.show(reports)
             for report in reports:
                 whole[report.axis] = report.complete
@@ -414,7 +437,7 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     blocks = usable_blocks(as_float(recording.in_unit(name, group.unit)), recording.missing_before, tables, group)
     if not history:
         raise UserError("too little rest for a report" if gate else "too short for a report")
-    result = history[-1].result()
+    result = history[-1].result(names_of(model))
     if not any(math.isfinite(p) for p in result.probability.values()):
         from selfcal.engines.library import outside_priors
 
