@@ -17,15 +17,19 @@ from rich.console import Console
 from test_wire import spoil
 
 from selfcal import cli
+from selfcal.dbc import PLACE_NAMES, Names
 from selfcal.errors import UserError
 from selfcal.live import View
+from selfcal.model import Model
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import AxisReport, Decoder, Link, open_bus
+from selfcal.wire import AxisReport, Decoder, Link, Streams, names_of, open_bus
 
 from wire_stream import lines, message, serial_line, stream
 
 #: What an axis's report has no number for where the record lies outside the priors.
-NO_NUMBER = ("bias_mean", "bias_sd", "constant_probability", "random_walk_probability", "gauss_markov_probability")
+NO_NUMBER = ("bias_mean", "bias_sd", "h0_probability", "h1_probability", "h2_probability")
+#: The names of the default model.
+NAMES = names_of(Model.load())
 
 
 def text_of(sent_lines: list[str]) -> bytes:
@@ -62,7 +66,8 @@ def test_a_channel_that_falls_silent_is_opened_again() -> None:
     statistics = monitor(channel=os.ttyname(slave), duration=10.0)
     os.close(master)
     os.close(slave)
-    assert statistics.received == 2 * len(sent)
+    # the restart's counter is ahead of the last one or not: up to two frames go until it is found again
+    assert 2 * len(sent) - 2 <= statistics.received == 2 * len(sent) - statistics.refused
 
 
 def test_any_python_can_interface() -> None:
@@ -168,7 +173,7 @@ def test_view_shows_what_did_not_arrive_as_missing(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("COLUMNS", "200")
     sent = stream(23, 2)
     first, second = (one for one in sent if one.message == "GX")
-    dropped = second.lines[1:6]  # count, flags, evidence, bias
+    dropped = [second.lines[1], *second.lines[3:6]]  # count, evidence, bias
     at = sent.index(first) + 1
     decoder = Decoder()
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
@@ -184,14 +189,14 @@ def test_view_shows_what_did_not_arrive_as_missing(monkeypatch: pytest.MonkeyPat
     assert f"{first.truth['count']:.0f}" not in picture
     assert f"{first.truth['bias_mean']:.5g}" not in picture
     assert "? ± ? °/s" in picture
-    law = max(("constant", "random_walk", "gauss_markov"), key=lambda name: second.truth[f"{name}_probability"])
-    assert f"N {second.truth[f'{law}_N_median']:.3g} [" in picture
+    k = max(range(3), key=lambda k: second.truth[f"h{k}_probability"])
+    assert f"h{k}: N {second.truth[f'h{k}_N_median']:.3g} [" in picture
 
 
 def test_view_of_a_record_outside_the_priors(monkeypatch: pytest.MonkeyPatch) -> None:
     """The module has no number for what it was to find: neither missing nor some law's."""
     monkeypatch.setenv("COLUMNS", "200")
-    report = AxisReport("gx", 1.0, True, {"count": 600.0} | dict.fromkeys(NO_NUMBER, math.nan))
+    report = AxisReport("gx", 1.0, True, {"count": 600.0, "hypotheses": 3.0} | dict.fromkeys(NO_NUMBER, math.nan))
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
         view = View(Decoder(), Link(bus), "test")
         view.show([report])
@@ -207,9 +212,9 @@ def test_view_of_what_the_grid_does_not_bear(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("COLUMNS", "200")
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
         for flags, said in ((1.0, False), (9.0, True)):
-            values = {"constant_probability": 1.0, "random_walk_probability": 0.0, "gauss_markov_probability": 0.0}
+            values = {"h0_probability": 1.0, "h1_probability": 0.0, "h2_probability": 0.0, "hypotheses": 3.0}
             view = View(Decoder(), Link(bus), "test")
-            view.show([AxisReport("gx", 1.0, True, values | {"constant_N_flags": flags, "random_walk_N_flags": 8.0})])
+            view.show([AxisReport("gx", 1.0, True, values | {"h0_N_flags": flags, "h1_N_flags": 8.0})])
             assert ("not borne by the grid" in shown(view)) == said
 
 
@@ -275,15 +280,14 @@ def six_axes(monkeypatch: pytest.MonkeyPatch, width: int, height: int) -> list[s
     decoder = Decoder()
     decoder.status.update(state=1.0, samples=36000.0, missing=70.0, gap_count=1.0, sensor_fault=1.0, motion=1.0)
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
-        view = View(decoder, Link(bus), "slcan /dev/ttyACM0", total_s=3600.0)
+        view = View(decoder, Link(bus), "slcan /dev/ttyACM0", total_s=3600.0, names=lambda status: NAMES)
         for k in range(40):
             for axis in ("gx", "gy", "gz", "ax", "ay", "az"):
                 values = {"count": 36000.0, "bias_mean": -0.040421 + 1e-4 * k, "bias_sd": 0.0025}
-                values |= {"constant_probability": 0.0, "random_walk_probability": 0.063}
-                values |= {"gauss_markov_probability": 0.937}
-                for name, numbers in (GYRO if axis[0] == "g" else ACCEL).items():
+                values |= {"h0_probability": 0.0, "h1_probability": 0.063, "h2_probability": 0.937, "hypotheses": 3.0}
+                for place, numbers in zip(PLACE_NAMES, (GYRO if axis[0] == "g" else ACCEL).values(), strict=True):
                     for key, number in zip(("median", "q05", "q95"), numbers, strict=True):
-                        values[f"gauss_markov_{name}_{key}"] = number
+                        values[f"h2_{place}_{key}"] = number
                 view.show([AxisReport(axis, 10.0 * k, True, values)])
         decoder.time_ms = 402_000
         console = Console(width=width, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123

@@ -85,8 +85,8 @@ def test_hostile_values_with_a_right_checksum_do_not_end_the_view(value: float) 
                     if frame is hostile:
                         assert len(shown(view)) < 20_000
                 assert len(shown(view)) < 20_000
-                axis = definition.name.lower() in ("gx", "gy", "gz", "ax", "ay", "az")
-                probability = entry.name.endswith("_probability")
+                axis = definition.name != "STATUS"
+                probability = entry.name.endswith("probability")
                 possible = (
                     (math.isnan(value) and axis)
                     or (math.isfinite(value) and not (probability and not 0.0 <= value <= 1.0))
@@ -158,7 +158,7 @@ def test_a_line_without_an_end_takes_no_memory() -> None:
 
 def test_no_law_is_most_probable_until_all_probabilities_came() -> None:
     """Random walk lost, 0.437 and 0 there: it may have had 0.563."""
-    values = {"constant_probability": 0.0, "gauss_markov_probability": 0.437}
+    values = {"hypotheses": 3.0, "h0_probability": 0.0, "h2_probability": 0.437}
     report = AxisReport("gx", 1.0, False, values)
     assert most_probable(report) is None
     with can.Bus(interface="virtual", channel="selfcal-view") as bus:
@@ -166,22 +166,24 @@ def test_no_law_is_most_probable_until_all_probabilities_came() -> None:
         view.show([report])
         assert "not all probabilities came" in shown(view)
         assert "N ? [" not in shown(view)
-    whole = AxisReport("gx", 1.0, False, values | {"random_walk_probability": 0.563})
-    assert most_probable(whole) == "random_walk"
+    whole = AxisReport("gx", 1.0, False, values | {"h1_probability": 0.563})
+    assert most_probable(whole) == 1
     # one of them is no number
-    assert most_probable(AxisReport("gx", 1.0, True, values | {"random_walk_probability": math.nan})) is None
-    # a model without that law sends no such item
-    assert most_probable(AxisReport("gx", 1.0, True, values)) == "gauss_markov"
+    assert most_probable(AxisReport("gx", 1.0, True, values | {"h1_probability": math.nan})) is None
+    # how many there are did not arrive either
+    del values["hypotheses"]
+    assert most_probable(AxisReport("gx", 1.0, False, values | {"h1_probability": 0.563})) is None
 
 
 def test_a_lost_probability_frame_in_the_stream() -> None:
-    """Of each law in turn, through the decoder."""
+    """Of each hypothesis in turn, through the decoder."""
     sent = stream(23, 1)
     (gx,) = (one for one in sent if one.message == "GX")
-    items = [6, 7, 8]  # constant, random walk, Gauss-Markov
-    for item in items:
+    for k in range(3):
         decoder = Decoder()
-        kept = [line for line in lines(sent) if line not in [ln for ln in gx.lines if _item(ln) == item]]
+        lost = [line for line in gx.lines if int(line[1:4], 16) == 0x220 + k and _item(line) == 0]
+        assert len(lost) == 1
+        kept = [line for line in lines(sent) if line not in lost]
         reports = [report for line in kept for report in decoder.feed(message(line))]
         (report,) = (one for one in reports if one.axis == "gx")
         assert most_probable(report) is None
@@ -312,7 +314,8 @@ def test_a_port_that_vanishes_is_taken_up_again(tmp_path: Path) -> None:
     watcher.join()
     os.close(slave)
     os.close(master)
-    assert outcome[0].received == 2 * len(sent)
+    # up to two frames go until the counter is found again
+    assert 2 * len(sent) - 2 <= outcome[0].received == 2 * len(sent) - outcome[0].refused
 
 
 def _await(master: int, wanted: bytes) -> None:
@@ -346,8 +349,8 @@ def test_a_log_is_read_back_as_it_came(tmp_path: Path) -> None:
         assert documents[1]["recording"]["path"] == str(log)
     assert list(documents[1]["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
     for axis, found in documents[1]["axes"].items():
-        assert found["hypotheses"]["random_walk"] == pytest.approx(truth[axis]["random_walk_probability"], abs=1e-7)
-        assert found["parameters"]["gauss_markov"]["alpha"]["median"] == truth[axis]["gauss_markov_alpha_median"]
+        assert found["hypotheses"]["h0"] == pytest.approx(truth[axis]["h0_probability"], abs=1e-7)
+        assert found["parameters"]["h1"]["p2"]["median"] == truth[axis]["h1_p2_median"]
         assert found["adequate"] is None
     monitor(read=log, plot=tmp_path / "read.png")
     assert (tmp_path / "read.png").read_bytes().startswith(b"\x89PNG")

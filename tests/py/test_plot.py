@@ -8,20 +8,23 @@ from typing import Any
 import pytest
 from matplotlib import pyplot
 
+from selfcal.dbc import BY_PLACE, Names
+from selfcal.model import Model
 from selfcal.plot import plot_run
-from selfcal.wire import AxisReport
+from selfcal.wire import AxisReport, names_of
 
 G = 9.80665  # m/s^2
 
 
+NAMES = names_of(Model.load())
+
+
 def report(axis: str, time_s: float, probability: tuple[float, float, float], scale: float = 1.0) -> AxisReport:
-    values = dict(
-        zip(("constant_probability", "random_walk_probability", "gauss_markov_probability"), probability, strict=True)
-    )
-    numbers = {"constant_N": 0.06, "random_walk_N": 0.04, "random_walk_K": 0.001}
-    numbers |= {"gauss_markov_N": 0.04, "gauss_markov_sigma_m": 0.02, "gauss_markov_alpha": 0.01}
+    values = {"hypotheses": 3.0} | {f"h{k}_probability": p for k, p in enumerate(probability)}
+    numbers = {"h0_N": 0.06, "h1_N": 0.04, "h1_p1": 0.001}
+    numbers |= {"h2_N": 0.04, "h2_p1": 0.02, "h2_p2": 0.01}  # Gauss-Markov's alpha is no reading
     for name, value in numbers.items():
-        size = value * (1.0 if name.endswith("alpha") else scale)
+        size = value * (1.0 if name.endswith("p2") else scale)
         values |= {f"{name}_q05": 0.8 * size, f"{name}_median": size, f"{name}_q95": 1.25 * size}
     return AxisReport(axis, time_s, True, values)
 
@@ -34,6 +37,7 @@ def figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     monkeypatch.setattr(pyplot, "close", kept.append)
 
     def draw(*arguments: Any, **options: Any) -> Any:
+        options.setdefault("names", NAMES)
         plot_run(arguments[0], tmp_path / "run.png", "a $title_ of its own", *arguments[1:], **options)
         assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
         return kept.pop()
@@ -89,3 +93,19 @@ def test_a_truth_is_drawn_in_the_picture_s_unit(figure: Any) -> None:
     (line,) = (line for line in drawn.axes[5 * 2 + 2].lines if line.get_linestyle() == "--")
     assert line.get_ydata()[0] == pytest.approx(0.001)
     assert drawn.axes[10].get_title("right") == "random walk 0.700 (truth: random walk)"
+
+
+def test_without_a_model_panels_are_places(figure: Any) -> None:
+    """A place that a law lacks has no line; the last place is drawn as it came."""
+    drawn = figure({"gx": HISTORY["gx"]}, names=BY_PLACE)
+    assert [panel.get_title("left") for panel in drawn.axes] == ["P", "N", "p1", "p2"]
+    assert [len(panel.lines) for panel in drawn.axes] == [3, 3, 2, 1]
+    assert drawn.axes[0].get_title("right") == "h1 0.700"
+    assert drawn.axes[2].get_ylabel() == ""
+
+
+def test_the_same_law_twice_has_two_lines_in_one_panel(figure: Any) -> None:
+    names = Names(("slow", "fast", "both"), (("N",), ("N", "sigma_m"), ("N", "sigma_m", "alpha")))
+    drawn = figure({"gx": HISTORY["gx"]}, names=names)
+    assert [panel.get_title("left") for panel in drawn.axes] == ["P", "N", "sigma_m", "1/alpha"]
+    assert [len(panel.lines) for panel in drawn.axes] == [3, 3, 2, 1]

@@ -291,6 +291,10 @@ def monitor(
     read: Annotated[Path | None, typer.Option(metavar="FILE", help="Read a log of frames instead of a channel")] = None,
     speed: Annotated[float | None, typer.Option(metavar="X", help="Of --read, 1 as it came; default: at once")] = None,
     axis: Axis = None,
+    node: Annotated[int | None, typer.Option(metavar="N", help="Show this module alone, 0 to 11")] = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="MODEL.yaml", help="Model of a module, for names; default: the default one")
+    ] = None,
     log: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc)")
     ] = None,
@@ -300,7 +304,7 @@ def monitor(
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
 ) -> None:
-    """Live view of a module's telemetry; exit code 1 if the module was out of reach when the time was up."""
+    """Live view of modules' telemetry; exit code 1 if a module was out of reach when the time was up."""
     from selfcal.verbs import monitor as verb
 
     outcome = verb.monitor(
@@ -309,6 +313,8 @@ def monitor(
         read=read,
         speed=speed,
         axes=axis or (),
+        node=node,
+        model=model,
         log=log,
         duration=duration,
         bitrate=bitrate,
@@ -328,11 +334,12 @@ def demo(
     speed: Annotated[float, typer.Option(metavar="X", help="Times real time")] = 10.0,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
     channel: Annotated[str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP")] = "",
+    node: Annotated[int, typer.Option(metavar="N", help="The module's number on its bus, 0 to 11")] = 0,
 ) -> None:
     """A module without hardware: the firmware over a recording, for `selfcal monitor` to watch."""
     from selfcal.verbs import demo as verb
 
-    verb.demo(log, speed=speed, transport=transport.value, channel=channel)
+    verb.demo(log, speed=speed, transport=transport.value, channel=channel, node=node)
 
 
 @app.command()
@@ -352,6 +359,7 @@ def command(
     channel: Annotated[str, typer.Option(metavar="NAME", help="Channel: a serial port for slcan")] = "",
     interface: Annotated[str, typer.Option(metavar="NAME", help="python-can interface")] = "slcan",
     bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
+    node: Annotated[int, typer.Option(metavar="N", help="The module's number on its bus, 0 to 11")] = 0,
 ) -> None:
     """Have a module do something, if its image was built with a command key."""
     from selfcal.verbs import command as verb
@@ -361,7 +369,9 @@ def command(
     elif order == "build-flag":
         print(verb.build_flag(verb.read_key(key)))
     else:
-        answer = verb.command(order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate)
+        answer = verb.command(
+            order, value, key_file=key, interface=interface, channel=channel, bitrate=bitrate, node=node
+        )
         print(f"{order}: {answer} ({verb.UNVERIFIED})")
         sys.exit(0 if answer == "done" else USER_ERROR)
 
@@ -395,6 +405,20 @@ def codegen(
     from selfcal.verbs import codegen as verb
 
     print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate))}")
+
+
+@app.command()
+def dbc(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    node: Annotated[int, typer.Option(metavar="N", help="The module's number on its bus, 0 to 11")] = 0,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="File to write; default: stdout")
+    ] = None,
+) -> None:
+    """Write the DBC file of one module, with its model's names and units."""
+    from selfcal.verbs import dbc as verb
+
+    verb.dbc(model, node=node, output=output)
 
 
 #: What typer says of a wrong value, and what a person reads.

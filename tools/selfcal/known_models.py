@@ -32,8 +32,7 @@ class KnownModels:
         """What to do where the names are places; empty if nothing is."""
         if "model_id" not in status or "bank_block" not in status or self.names(status).known:
             return ""
-        told = int(status["model_id"])
-        return f"model {told:08x} is none that is known here: names are places; --model FILE, the one it was built with"
+        return f"names are places: give the model {int(status['model_id']):08x} that it was built with, --model FILE"
 
     def _find(self, model_id: float, interval_s: float, block: float) -> Names:
         for model in self.models:

@@ -267,7 +267,7 @@ class View:
         for axis, (report, trend) in last.items():
             age_s = max(0.0, module.time_s - report.time_s)
             age_s += contact.silent_s if contact is not None else 0.0
-            best = most_probable(report)
+            best = most_probable(report, names)
             head = Text(f"{axis:<5}{_number(report, 'count', '%.0f'):>8}")
             for k in range(hypotheses):
                 head.append("  ").append(_bar(report, k, cells), "bold green" if k == best else "")
@@ -296,12 +296,13 @@ def told_of(report: AxisReport) -> int:
     return max((k + 1 for k in range(len(BY_PLACE.hypotheses)) if f"h{k}_probability" in report.values), default=0)
 
 
-def most_probable(report: AxisReport) -> int | None:
+def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
     """The hypothesis with the greatest probability; None if one that did not arrive, or is no number, could be
-    greater."""
+    greater. Where the report does not tell how many there are, a model's `names` do."""
+    count = report.hypotheses or (len(names.hypotheses) if names.known else None)
     signals = {k: f"h{k}_probability" for k in range(told_of(report))}
     known = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
-    if not known or len(known) != report.hypotheses:
+    if not known or len(known) != count:
         return None
     if len({math.isnan(probability) for probability in known.values()}) > 1:
         return None  # all of them NaN is a report outside the priors: the view says that
@@ -395,7 +396,7 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
 
 def _parameters(report: AxisReport, names: Names) -> list[str]:
     """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none."""
-    k = most_probable(report)
+    k = most_probable(report, names)
     if k is None:
         return ["most probable law: ? (not all probabilities came)"]
     if math.isnan(report.values[f"h{k}_probability"]):

@@ -8,8 +8,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from selfcal.dbc import NODE_IDS, NODES
 from selfcal.errors import UserError
-from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, open_bus, serial_ports
+from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of, open_bus, serial_ports
 
 if TYPE_CHECKING:
     import can
@@ -68,11 +69,11 @@ def payload(command: str, argument: int = 0, *, key: bytes | None = None, challe
     return said + struct.pack("<I", tag)
 
 
-def frame(data: bytes) -> can.Message:
-    """A message COMMAND."""
+def frame(data: bytes, node: int = 0) -> can.Message:
+    """A message COMMAND to a node."""
     import can
 
-    identifier = load_dbc().get_message_by_name(COMMAND).frame_id
+    identifier = load_dbc().get_message_by_name(COMMAND).frame_id + NODE_IDS * node
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
 
 
@@ -128,9 +129,17 @@ def argument_of(order: str, value: str | None) -> int:
 
 
 def command(
-    order: str, value: str | None, *, key_file: Path | str, interface: str, channel: str, bitrate: int | None = None
+    order: str,
+    value: str | None,
+    *,
+    key_file: Path | str,
+    interface: str,
+    channel: str,
+    bitrate: int | None = None,
+    node: int = 0,
 ) -> str:
-    """Have a module do `order`; returns its answer, the name of a result in the DBC. Nothing proves who gave it.
+    """Have the module of a node do `order`; returns its answer, the name of a result in the DBC. Nothing proves who
+    gave it.
 
     Raises UserError for an order or argument that does not exist, a key that cannot be read, a channel that is not
     named or cannot be opened, or no answer.
@@ -139,6 +148,8 @@ def command(
     if order not in orders:
         raise UserError(f"no such command: {order} (there are {', '.join((*orders, *OWN_ORDERS))})")
     argument = argument_of(order, value)
+    if not 0 <= node < NODES:
+        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     if not channel:
         raise UserError(
             f"to which module? --channel names its serial port ({serial_ports()}), or the --interface's channel"
@@ -146,27 +157,30 @@ def command(
     key = read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
         for wait in (PAUSE_S, PAUSE_S, 0.0):
-            link.bus.send(frame(payload(CHALLENGE)))
-            challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE])
+            link.bus.send(frame(payload(CHALLENGE), node))
+            challenge = _await(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE], node)
             if challenge is not None:
                 break
             time.sleep(wait)
         else:
             raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
-        link.bus.send(frame(payload(order, argument, key=key, challenge=challenge)))
-        result = _await(link, "result", ANSWER_S, codes("command")[order])
+        link.bus.send(frame(payload(order, argument, key=key, challenge=challenge), node))
+        result = _await(link, "result", ANSWER_S, codes("command")[order], node)
     return next((name for name, number in codes("result").items() if number == result), str(result))
 
 
-def _await(link: Link, signal: str, timeout_s: float, about: int) -> int | None:
+def _await(link: Link, signal: str, timeout_s: float, about: int, node: int) -> int | None:
     """A signal of the answer, None if it is another; raises UserError if none comes within `timeout_s`."""
-    decoder = Decoder()
+    decoder = Decoder(node=node)
     end = time.monotonic() + timeout_s
     while (left := end - time.monotonic()) > 0 and not link.closed:
         message = link.recv(left)
         if message is None:
             break
-        decoder.feed(message)
+        if node_of(message.arbitration_id) == node:
+            decoder.feed(message)
+        if decoder.foreign:
+            raise UserError(decoder.foreign)
         if signal in decoder.answer:
             return int(decoder.answer[signal])
         if decoder.answer.get("command") == about:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from selfcal.dbc import NODES
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import load
@@ -26,24 +27,34 @@ GROUP, PORT = "239.74.163.2", 43113
 FOREVER_S = 999_999.0
 
 
-def demo(log: Path | str | None = None, *, speed: float = 10.0, transport: str = "slcan", channel: str = "") -> None:
+def demo(
+    log: Path | str | None = None,
+    *,
+    speed: float = 10.0,
+    transport: str = "slcan",
+    channel: str = "",
+    node: int = 0,
+) -> None:
     """Play a recording through the firmware, `speed` times as fast as it was taken, until its end or Ctrl-C; prints
     how to watch.
 
     On a pseudo-terminal the module's time stands still while nobody has its channel open, and hosts may come and go.
+    `node`: its number on its bus.
     With `transport` can it goes on by itself, on the CAN device `channel` or over UDP within this machine.
     """
     if not 0.0 < speed <= FASTEST:
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
     if channel and transport != "can":
         raise UserError(f"--channel {channel}: goes with --transport can")
+    if not 0 <= node < NODES:
+        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     path = Path(log or SHIPPED)
     model = Model.load()
     recording = load(path)
     names = chosen_axes(recording, model, ())
     with Console(stderr=True).status("building the firmware"):
         firmware = build(model, recording.rate_hz, names)
-    more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}"]
+    more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]
     if transport == "can":
         more += ["--can", channel or f"{GROUP}:{PORT}"]
         watch = (

@@ -208,9 +208,8 @@ def _make(name: str, target: str, folder: Path, flags: str) -> None:
     # Of a `make` around this program nothing is passed on: neither its options nor its variables.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
-        done = subprocess.run(
-            [*command, f"CORE={target}", f"MODEL_FLAGS={flags}"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-        )
+        command += [f"CORE={target}", f"MODEL_FLAGS={flags}"]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     except OSError as error:
         raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
     if done.returncode != 0:
