@@ -18,7 +18,7 @@
 
 enum { AXES = 6, STATUS_MS = 10000 };
 
-static const selfcal_law_t order[] = {SELFCAL_RANDOM_WALK, SELFCAL_GAUSS_MARKOV, SELFCAL_CONSTANT};
+static const unsigned order[] = {RANDOM_WALK, GAUSS_MARKOV, CONSTANT};
 /* Of those: the places that their parameters have on the wire; NULL: they lack that. */
 static const char *const place_name[][SELFCAL_PARAMETERS] = {
     {"N", "p1", NULL, NULL}, {"N", NULL, "p1", "p2"}, {"N", NULL, NULL, NULL}};
@@ -121,9 +121,9 @@ int main(int argc, char **argv)
     selfcal_hypothesis_t hypothesis[SELFCAL_HYPOTHESES_MAX];
     memset(hypothesis, 0, sizeof hypothesis);
     for (int k = 0; k < SELFCAL_HYPOTHESES_MAX; k++) {
-        hypothesis[k].law = order[k % LAWS];
-        hypothesis[k].rho = hypothesis[k].law == SELFCAL_CONSTANT ? NULL : &grid;
-        hypothesis[k].alpha = hypothesis[k].law == SELFCAL_GAUSS_MARKOV ? &grid : NULL;
+        hypothesis[k].law = &named_law[order[k % LAWS]];
+        hypothesis[k].rho = order[k % LAWS] == CONSTANT ? NULL : &grid;
+        hypothesis[k].alpha = order[k % LAWS] == GAUSS_MARKOV ? &grid : NULL;
     }
     selfcal_regressors_t regressors;
     memset(&regressors, 0, sizeof regressors);

@@ -11,7 +11,9 @@
 static const selfcal_axis_t axis_table[2];
 static const selfcal_grid_t grid; /* a hypothesis has the places whose grids it has */
 static const selfcal_hypothesis_t all_laws[] = {
-    {SELFCAL_GAUSS_MARKOV, 0.0F, &grid, &grid}, {SELFCAL_CONSTANT, 0.0F, NULL, NULL}, {SELFCAL_RANDOM_WALK, 0.0F, &grid, NULL}};
+    {&named_law[GAUSS_MARKOV], 0.0F, &grid, &grid, NULL},
+    {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
+    {&named_law[RANDOM_WALK], 0.0F, &grid, NULL, NULL}};
 static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL};
 static const char *const names[] = {"ay", "gx"};
 enum { GX = 0x201, AY = 0x205, GX_H0 = 0x220, AY_H0 = 0x240, GX_COEFFICIENTS = 0x20A }; /* of node 0 */
@@ -189,7 +191,7 @@ static void test_the_same_law_may_stand_eight_times(void)
     static selfcal_model_t model;
     TEST_ASSERT_TRUE(SELFCAL_HYPOTHESES_MAX >= 4);
     for (unsigned k = 0; k < 9; k++) {
-        same[k].law = SELFCAL_RANDOM_WALK;
+        same[k].law = &named_law[RANDOM_WALK];
         same[k].rho = &grid;
     }
     model = full;

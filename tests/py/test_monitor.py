@@ -17,12 +17,12 @@ from rich.console import Console
 from test_wire import spoil
 
 from selfcal import cli
-from selfcal.dbc import PLACE_NAMES, Names
+from selfcal.dbc import PLACE_NAMES
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.model import Model
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import AxisReport, Decoder, Link, Streams, names_of, open_bus
+from selfcal.wire import AxisReport, Decoder, Link, names_of, open_bus
 
 from wire_stream import lines, message, serial_line, stream
 

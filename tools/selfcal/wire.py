@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from selfcal.dbc import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 from selfcal.errors import UserError
-from selfcal.model import LAWS, Model
+from selfcal.model import Model
 from selfcal.result import AxisResult, Estimate
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def names_of(model: Model) -> Names:
 
     Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
     columns = tuple((column, one.unit) for one in model.regressors for column in one.columns)
-    return Names(tuple(model.hypotheses), tuple(LAWS[name] for name in model.hypotheses), columns)
+    return Names(tuple(model.hypotheses), tuple(model.laws[name].parameters for name in model.hypotheses), columns)
 
 
 def carries(axis: str, unit: str) -> bool:

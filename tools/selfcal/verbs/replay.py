@@ -27,7 +27,6 @@ from selfcal.dbc import HYPOTHESES
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError, note
-from selfcal.laws import SUMS
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
