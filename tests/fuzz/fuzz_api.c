@@ -381,7 +381,7 @@ static void check_frames(void) {
     selfcal_frame_t frame;
     unsigned frames = 0;
     while (selfcal_telemetry_next(&telemetry, &frame)) {
-        HOLDS(frame.length == 8U && frame.id < 0x800U && ++frames < 100U);
+        HOLDS(frame.length == 8U && frame.id < 0x800U && ++frames < 200U);
     }
 }
 
@@ -620,6 +620,8 @@ static void send_status(input_t *in) {
     HOLDS(status == SELFCAL_OK || status == SELFCAL_BAD_MODEL);
     has_telemetry = status == SELFCAL_OK;
     if (has_telemetry) {
+        const uint8_t node = which >> 3;
+        HOLDS(selfcal_telemetry_node(&telemetry, node) == (node < 12U ? SELFCAL_OK : SELFCAL_BAD_ARGUMENT));
         HOLDS(selfcal_telemetry_status(&telemetry, selfcal_counters(&bank.self),
                                        (which & 4U) != 0U ? SELFCAL_RUNNING : SELFCAL_FINISHED, which,
                                        (uint32_t)bits(in, 4)) == SELFCAL_OK);

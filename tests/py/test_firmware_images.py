@@ -128,7 +128,7 @@ def test_the_stack_stays_below_its_bound(core: str, tmp_path: Path) -> None:
     assert module.stderr.readline() == b"SELFCAL_UART\n"
     module.stdin.write(b"O\r")
     module.stdin.flush()
-    module.stdout.read(1 + 22 * (3 * (STATUS + 2 * 44) + STATUS))
+    module.stdout.read(1 + 22 * (3 * (STATUS + 2 * 46) + STATUS))
     _, errors = module.communicate(b"C\r", timeout=60)
     found = re.fullmatch(rb"stack (\d+)\n", errors)
     assert found, errors

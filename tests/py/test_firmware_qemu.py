@@ -158,7 +158,7 @@ def test_every_run_sends_the_same_bytes(tmp_path: Path) -> None:
         module.stdin.write(b"C\rS6\r\rO\rO\r")
         module.stdin.flush()
         # an answer to each command, three reports with their status, the last status
-        frames = module.stdout.read(5 + 22 * (3 * (STATUS + 44) + STATUS))
+        frames = module.stdout.read(5 + 22 * (3 * (STATUS + 46) + STATUS))
         output, errors = module.communicate(b"C\r", timeout=30)
         assert (module.returncode, output, errors) == (0, b"\r", b""), name
         sent.append(frames)
@@ -175,7 +175,7 @@ def test_the_json_is_that_of_the_host(core: str, tmp_path: Path) -> None:
     done = subprocess.run([*line, "--json", str(tmp_path / "a.json")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     reports = TARGETS[core].reports
-    assert f"frames: {reports * (STATUS + 44) + STATUS} received, 0 lost" in done.stderr
+    assert f"frames: {reports * (STATUS + 46) + STATUS} received, 0 lost" in done.stderr
     document = replay(recording.path, target=core, report_every=300.0)
     host = replay(recording.path, report_every=300.0)
 

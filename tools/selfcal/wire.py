@@ -654,7 +654,7 @@ class Link:
 
 #: s that a write to a serial line may take: on a pseudo-terminal that nobody reads it would never end.
 WRITE_S = 1.0
-#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 310, and a datagram takes 768 bytes.
+#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
 UDP_BUFFER = 4 << 20
 
 
