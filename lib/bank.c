@@ -76,31 +76,40 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     return place;
 }
 
+#if SELFCAL_TERMS_MAX > 1
 static bool valid_term(const selfcal_term_t *term, float dt_s) {
     const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
     const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
     const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
     const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
-    return (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor))) && term->deviation >= FACTOR_MIN &&
-           term->deviation <= FACTOR_MAX;
+    return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN && term->deviation <= FACTOR_MAX &&
+           (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
 }
 
-/* A law that the bank has filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
-static bool valid_law(const selfcal_law_t *law, float dt_s) {
-    if (law->terms > SELFCAL_LAW_TERMS || !is_bool(&law->coloured_noise)) {
-        return false;
-    }
+/* A sum that there are filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
+static bool valid_sum(const selfcal_law_t *law, float dt_s) {
     unsigned by_ratio = 0;
     for (uint8_t a = 0; a < law->terms; a++) {
-        const selfcal_term_t *term = &law->term[a];
-        if (!is_bool(&term->stated) || !is_bool(&term->by_ratio) || !valid_term(term, dt_s)) {
+        if (!valid_term(&law->term[a], dt_s)) {
             return false;
         }
-        by_ratio += term->by_ratio ? 1U : 0U;
+        by_ratio += law->term[a].by_ratio ? 1U : 0U;
     }
-    const bool states_fit = (uint8_t)(law->terms + (law->coloured_noise ? 1U : 0U)) <= SELFCAL_TERMS_MAX;
-    return states_fit && (is_plain(law) || is_sum(law)) && !(has_ratio(law) && has_alpha(law)) &&
-           (by_ratio == 0U || by_ratio < law->terms) && !(law->coloured_noise && (by_ratio > 0U || law->terms == 0U));
+    return law->terms > 0U && law->terms + (law->coloured_noise ? 1U : 0U) <= SELFCAL_TERMS_MAX &&
+           !(has_ratio(law) && has_alpha(law)) && (by_ratio == 0U || (by_ratio < law->terms && !law->coloured_noise));
+}
+#endif
+
+static bool valid_law(const selfcal_law_t *law, float dt_s) {
+    if (law == NULL || law->terms > SELFCAL_LAW_TERMS || !is_bool(&law->coloured_noise)) {
+        return false;
+    }
+#if SELFCAL_TERMS_MAX > 1
+    return is_plain(law) || valid_sum(law, dt_s);
+#else
+    (void)dt_s;
+    return is_plain(law);
+#endif
 }
 
 bool selfcal_law_is_sum(const selfcal_law_t *law) {
@@ -123,7 +132,7 @@ static bool valid_model(const selfcal_model_t *model) {
     uint32_t nodes = 0;
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
-        if (hypothesis->law == NULL || !valid_law(hypothesis->law, model->dt_s) ||
+        if (!valid_law(hypothesis->law, model->dt_s) ||
             (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes))) {
             return false;
         }

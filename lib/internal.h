@@ -94,17 +94,7 @@ static inline size_t term_pair(size_t a, size_t b) {
     return a * (a + 1U) / 2U + b;
 }
 
-/* What a law has. */
-static inline bool has_walk(const selfcal_law_t *law) {
-    for (uint8_t a = 0; a < law->terms; a++) {
-        if (law->term[a].kind == SELFCAL_WALK) {
-            return true;
-        }
-    }
-    return false;
-}
-
-/* Its terms; a law with more than this build has room for is refused. */
+/* What a law has. Terms that this build has room for: a law with more is refused. */
 static inline size_t terms_of(const selfcal_law_t *law) {
     return law->terms < SELFCAL_TERMS_MAX ? law->terms : SELFCAL_TERMS_MAX;
 }
@@ -113,22 +103,30 @@ static inline bool has_drift(const selfcal_law_t *law) {
     return law->terms > 0U;
 }
 
-/* The drift parameter is sigma_m; else K, if the law has a drift. */
-static inline bool has_deviation(const selfcal_law_t *law) {
-    return has_drift(law) && !has_walk(law);
-}
-
-static inline bool has_decay(const selfcal_law_t *law) {
-    for (uint8_t a = 0; a < law->terms; a++) {
-        if (law->term[a].kind == SELFCAL_MARKOV) {
+static inline bool has_term(const selfcal_law_t *law, selfcal_term_kind_t kind) {
+    for (size_t a = 0; a < terms_of(law); a++) {
+        if (law->term[a].kind == kind) {
             return true;
         }
     }
     return false;
 }
 
+/* The drift parameter is K; else sigma_m, if the law has a drift. */
+static inline bool has_walk(const selfcal_law_t *law) {
+    return has_term(law, SELFCAL_WALK);
+}
+
+static inline bool has_deviation(const selfcal_law_t *law) {
+    return has_drift(law) && !has_walk(law);
+}
+
+static inline bool has_decay(const selfcal_law_t *law) {
+    return has_term(law, SELFCAL_MARKOV);
+}
+
 static inline bool has_alpha(const selfcal_law_t *law) {
-    for (uint8_t a = 0; a < law->terms; a++) {
+    for (size_t a = 0; a < terms_of(law); a++) {
         if (law->term[a].kind == SELFCAL_MARKOV && !law->term[a].stated) {
             return true;
         }
@@ -137,7 +135,7 @@ static inline bool has_alpha(const selfcal_law_t *law) {
 }
 
 static inline bool has_ratio(const selfcal_law_t *law) {
-    for (uint8_t a = 0; a < law->terms; a++) {
+    for (size_t a = 0; a < terms_of(law); a++) {
         if (law->term[a].by_ratio) {
             return true;
         }
@@ -148,17 +146,13 @@ static inline bool has_ratio(const selfcal_law_t *law) {
 /* One plain term, or none: the filters of bank.c. All others are sums (terms.c). */
 static inline bool is_plain(const selfcal_law_t *law) {
     const selfcal_term_t *term = &law->term[0];
-    return !law->coloured_noise && (law->terms == 0U || (law->terms == 1U && term->deviation == 1.0F && !term->by_ratio &&
-                                                          (term->kind == SELFCAL_WALK || (term->bandwidth == 1.0F && !term->stated))));
+    const bool walk = term->kind == SELFCAL_WALK, markov = term->kind == SELFCAL_MARKOV && term->bandwidth == 1.0F && !term->stated;
+    return !law->coloured_noise &&
+           (law->terms == 0U || (law->terms == 1U && term->deviation == 1.0F && !term->by_ratio && (walk || markov)));
 }
 
 static inline bool is_sum(const selfcal_law_t *law) {
     return SELFCAL_TERMS_MAX > 1 && !is_plain(law);
-}
-
-/* A plain Gauss-Markov drift, a pole of its own at each alpha. */
-static inline bool is_markov(const selfcal_law_t *law) {
-    return is_plain(law) && has_decay(law);
 }
 
 /* Of a term, 1/s, at an alpha; 0 of a walk, which does not decay. */

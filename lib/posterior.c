@@ -161,14 +161,17 @@ static void transform_line(const selfcal_grid_t *grid, bool transposed, const se
 /* n ln V beyond which selfcal_real_t would cost 0.02 nat. */
 #define WIDE_BEYOND R(2e5)
 
+/* A plain Gauss-Markov law, of one pole at each alpha. */
+static bool has_pole(const selfcal_work_t *work) {
+    return hypothesis_of(work)->alpha != NULL && !is_sum(hypothesis_of(work)->law);
+}
+
 /* 1 - phi of the drift at an alpha; 0 of a random walk. */
 static selfcal_real_t beta_at(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    const bool pole = is_markov(hypothesis_of(work)->law);
-    return pole ? -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+    return has_pole(work) ? -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s) : R(0.0);
 }
 static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    const bool pole = is_markov(hypothesis_of(work)->law);
-    return pole ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
+    return has_pole(work) ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
 static bool has_expectation(const selfcal_work_t *work) {
@@ -576,7 +579,7 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
  * is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
-    const bool pole = is_markov(hypothesis_of(work)->law);
+    const bool pole = has_pole(work);
     const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - work->truth.ln_noise));
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
@@ -727,6 +730,8 @@ static void make_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     row->beta = beta_at(work, ln_alpha);
     row->half_ln_dt = half_ln_dt(work);
     row->shift = drift_shift(work);
+    row->prior = prior_of(work);
+    row->drift = drift_parameter(hypothesis->law);
     uint16_t taps = 1;
     row->basis_first = 0;
     row->basis[0] = R(1.0);
@@ -827,8 +832,8 @@ static reach_t reach_of(const selfcal_work_t *work, const selfcal_real_t ln_valu
     reach_t reach = {-INFINITY, INFINITY, R(0.0), R(0.0), R(0.0)};
     selfcal_real_t whole = R(6.0); /* drop up to which the cells of [delta_lo, delta_hi] see what the limits leave, measured */
     for (unsigned j = 0; j < (hypothesis->rho != NULL ? 2U : 1U); j++) {
-        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
-        const selfcal_prior_t *prior = &prior_of(work)[p];
+        const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
+        const selfcal_prior_t *prior = &work->scratch.grid.row.prior[p];
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min - ln_value[p], hi = (selfcal_real_t)prior->ln_max - ln_value[p];
         if (j == 0U && (lo > half[j] || hi < -half[j])) {
             half[j] = R(0.0);
@@ -1199,9 +1204,9 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     side_t side[2];
     bool whole = reach.from == work->delta_lo && reach.to == work->delta_hi;
     for (unsigned j = 0; j < sides; j++) {
-        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
         side_t *s = &side[j];
-        s->prior = &prior_of(work)[p];
+        s->prior = &work->scratch.grid.row.prior[p];
         s->ln_value = ln_value[p];
         s->off = r_expm1(ln_value[p] - work->best_ln[p]);
         s->cut = s->ln_value + reach.from - half[j] < (selfcal_real_t)s->prior->ln_min ||
@@ -1209,7 +1214,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
         whole = whole && !s->cut && !s->prior->uniform;
     }
     for (unsigned j = 0; j < sides && whole; j++) {
-        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
         side[j].spread = spread_over(work, p, work->scratch.grid.modes[j], r_fmax(R(2.0) * half[j], histogram_step(work, p)));
     }
     if (whole) {
@@ -1218,7 +1223,7 @@ static moments_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[],
     *cost = COST_OF_CUT + (sigma_cells(work, reach.from, reach.to, reach.base) ? COST_OF_LAYING : 0U);
     const selfcal_real_t width = work->delta_width;
     for (unsigned j = 0; j < sides; j++) {
-        const unsigned p = j == 0U ? SELFCAL_N : drift_parameter(hypothesis->law);
+        const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
         side_t *s = &side[j];
         s->width = r_fmax(width, R(2.0) * half[j]);
         s->spread = spread_over(work, p, work->scratch.grid.histogram[p], s->width);
@@ -1283,8 +1288,6 @@ static void begin_row(selfcal_work_t *work) {
 /* Some cells of a row. */
 static void step_sum(selfcal_work_t *work) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const selfcal_prior_t *prior = prior_of(work);
-    const selfcal_parameter_t drift = drift_parameter(hypothesis->law);
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
     const unsigned taps = hypothesis->rho != NULL ? 6U : 1U;
     if (work->at == 0U) {
@@ -1299,7 +1302,7 @@ static void step_sum(selfcal_work_t *work) {
     const selfcal_real_t wide = (range.hi - range.lo) / (selfcal_real_t)count;
     const selfcal_real_t high = (work->range[1].hi - work->range[1].lo) / (selfcal_real_t)work->rows;
     selfcal_real_t density = wide * high * cell_weight(work->rows, work->row);
-    if (prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL) {
+    if (work->scratch.grid.row.prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL) {
         density *= r_exp(row->ln_alpha);
     }
     selfcal_real_t part_mass = R(0.0), part_mass_sq = R(0.0), part_off_grid = R(0.0), first[2] = {R(0.0), R(0.0)}, second[2] = {R(0.0), R(0.0)};
@@ -1343,8 +1346,8 @@ static void step_sum(selfcal_work_t *work) {
     work->mass_sq += (selfcal_wide_t)part_mass_sq;
     work->off_grid += (selfcal_wide_t)part_off_grid;
     for (unsigned j = 0; j < 2U; j++) {
-        work->first[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)first[j];
-        work->second[j == 0U ? SELFCAL_N : drift] += (selfcal_wide_t)second[j];
+        work->first[j == 0U ? SELFCAL_N : work->scratch.grid.row.drift] += (selfcal_wide_t)first[j];
+        work->second[j == 0U ? SELFCAL_N : work->scratch.grid.row.drift] += (selfcal_wide_t)second[j];
     }
     if (hypothesis->alpha != NULL) {
         const selfcal_wide_t dev = expm1((selfcal_wide_t)row->ln_alpha - (selfcal_wide_t)work->best_ln[SELFCAL_ALPHA]);

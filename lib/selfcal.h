@@ -808,6 +808,8 @@ typedef struct {
     selfcal_real_t basis[6]; /* of alpha */
     uint8_t basis_first;
     selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
+    const selfcal_prior_t *prior; /* of the hypothesis on the axis */
+    selfcal_parameter_t drift;    /* which parameter goes with rho */
 } selfcal_cell_row_t;
 
 /* Where in ln rho or ln alpha the likelihood counts, and samples of one search pass. Private. */
