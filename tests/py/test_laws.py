@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy import stats
 
 from selfcal import _reference
@@ -198,3 +199,36 @@ def test_a_wrong_law_gets_one_clear_line(tmp_path: Path, old: str, new: str, com
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(UserError, match=complaint):
         tables_of(Model.load(path))
+
+
+#: Nodes of a law of two terms beside a random walk: what each target has room for.
+SMALL = {"host": [24, 20], "cortex-m4f": [16, 12], "cortex-m0": [12, 8]}
+
+
+@pytest.mark.parametrize("target", SMALL)
+def test_a_module_runs_a_law_of_terms(tmp_path: Path, target: str) -> None:
+    """Recording, model file, firmware: what its telemetry says of the law is what `identify` says on the same nodes,
+    within the design's tolerances of a report (0.05 nat, 0.05 sd; a probability near 1 moves by less than 1e-3)."""
+    tree = yaml.safe_load(MODEL.path.read_text())
+    tree["groups"]["gyro"]["axes"] = ["gx"]
+    tree["hypotheses"] = {"random_walk": 1, "two_markov": tree["hypotheses"]["two_markov"]}
+    tree["nodes"] = {name: {"random_walk": 8, "two_markov": SMALL[target]} for name in ("host", target)}
+    tree["simulate"] = {
+        "rate_hz": 1.0,
+        "duration_s": 600.0,
+        "axes": {"gx": {"hypothesis": "two_markov", "N": 0.02, "sigma_m": 0.05, "alpha": 0.01, "bias": 0.3}},
+    }
+    model, log = tmp_path / "model.yaml", tmp_path / "log.csv"
+    model.write_text(yaml.safe_dump(tree))
+    assert run("simulate", model, "-o", log, "--seed", "3").returncode == 0
+    answers = []
+    for verb in (("identify",), ("replay", "--target", target)):
+        out = run(*verb[:1], log, "--model", model, *verb[1:], "--json", "-")
+        assert out.returncode == 0, out.stderr
+        answers.append(json.loads(out.stdout)["axes"]["gx"])
+    host, module = answers
+    assert module["hypotheses"]["two_markov"] == pytest.approx(host["hypotheses"]["two_markov"], abs=1e-3)
+    assert module["log_evidence"]["two_markov"] == pytest.approx(host["log_evidence"]["two_markov"], abs=0.05)
+    for name, mine in module["parameters"]["two_markov"].items():
+        theirs = host["parameters"]["two_markov"][name]
+        assert mine["mean"] == pytest.approx(theirs["mean"], abs=0.05 * theirs["sd"]), name
