@@ -260,7 +260,7 @@ class View:
         """An axis's lines: the probabilities; bias, its course and N; what else there is."""
         cells, contact = _bar_cells(hypotheses, width), self._contact_of(module)
         bias = {axis: _bias(report) for axis, (report, _) in last.items()}
-        parameters = {axis: _parameters(report, names) for axis, (report, _) in last.items()}
+        parameters = {axis: _parameters(report, names, named=not cells) for axis, (report, _) in last.items()}
         bias_width = max(map(len, bias.values()))
         spark = min(SPARK[1], width - INDENT - bias_width - 2 - max(len(texts[0]) for texts in parameters.values()))
         blocks = []
@@ -394,8 +394,9 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
     return "".join(heights).ljust(cells)
 
 
-def _parameters(report: AxisReport, names: Names) -> list[str]:
-    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none."""
+def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> list[str]:
+    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none.
+    `named`: its name before them, as without a model's names."""
     k = most_probable(report, names)
     if k is None:
         return ["most probable law: ? (not all probabilities came)"]
@@ -414,8 +415,9 @@ def _parameters(report: AxisReport, names: Names) -> list[str]:
         said.append(f"{label} {middle} [{low}, {high}] {unit if unit != '1' else ''}".rstrip())
     if any(int(report.values.get(f"h{k}_{place}_flags", 0)) & OFF_GRID for place in PLACE_NAMES[: len(given)]):
         said.append("not borne by the grid of nodes")
-    if not names.known:
-        said[:1] = [f"{BY_PLACE.hypotheses[k]}: {said[0] if said else 'no number'}"]
+    if named or not names.known:
+        name = names.hypotheses[k] if k < len(names.hypotheses) else BY_PLACE.hypotheses[k]
+        said[:1] = [f"{name.replace('_', ' ')}: {said[0] if said else 'no number'}"]
     return said
 
 
