@@ -61,10 +61,6 @@ def test_committed_files_are_the_generated_ones() -> None:
     assert (ROOT / "lib" / "selfcal_frames.h").read_text() == frames_codegen.header(load_dbc())
 
 
-def test_table_in_the_guide_is_the_generated_one() -> None:
-    assert frames_codegen.table(load_dbc()) in (ROOT / "GUIDE.md").read_text()
-
-
 def test_names_of_a_model_are_symbols_of_a_dbc() -> None:
     """Whatever a model calls its parts: at most 32 letters, digits and underscores, all different."""
     names = Names(
