@@ -1111,7 +1111,8 @@ typedef struct {
 selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal_model_t *model,
                                         const char *const axis_name[]);
 
-/* The module's number on its bus, 0 to 11, from the next report, status, sample or answer on. SELFCAL_BAD_ARGUMENT beyond. */
+/* The module's number on its bus, 0 to 11, from here on. SELFCAL_BAD_ARGUMENT beyond; SELFCAL_BUSY, and nothing changes,
+ * while frames are still to be fetched. */
 selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node);
 
 /* What the following reports tell of the regressors' coefficients on their axis, by column of the model. They must stay as

@@ -90,6 +90,9 @@ selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node)
     if (self == NULL || node >= SELFCAL_FRAME_NODES) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    if (self->items != 0) {
+        return SELFCAL_BUSY;
+    }
     self->first_id = (uint16_t)(SELFCAL_FRAME_STATUS_ID + SELFCAL_FRAME_NODE_IDS * node);
     return SELFCAL_OK;
 }

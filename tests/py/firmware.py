@@ -60,9 +60,10 @@ def image(
     laws: tuple[str, ...] = ("constant", "random_walk", "gauss_markov"),
     target: str = "stm32f405",
     rate_hz: float = QUIET_RATE_HZ,
+    node: int | None = None,
 ) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: at `rate_hz`, bank at
-    `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds)."""
+    `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds). `node`: its number on its bus."""
     folder = ROOT / "build" / "firmware" / name
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
@@ -82,6 +83,7 @@ def image(
                 old.write_bytes(file.read_bytes())
         makefile = f"port/{target}/{target}.mk"
         command = ["make", "-s", "-f", makefile, target, f"MODEL_DIR={folder}", f"OUT={folder}"]
+        command += [] if node is None else [f"NODE={node}"]
         subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
     return folder / "selfcal.elf"
 

@@ -231,6 +231,25 @@ def test_challenges_come_one_a_second() -> None:
     assert challenge(board) != number
 
 
+def test_a_node_of_a_bus_has_identifiers_of_its_own() -> None:
+    """Node 3, 3 * 128 above node 0: it sends nothing else, and a command to node 0 is none to it."""
+    board = Board(image(**IDLE | {"name": "idle-node", "node": 3}), seed=31)
+    board.run(0.9)
+    for identifier, answers in ((COMMAND_ID, 0), (COMMAND_ID + 3 * 128, 1)):
+        since = len(board.frames)
+        board.can.say(identifier, verb.payload("challenge"))
+        board.run(0.1)
+        heard = [message for message in messages(board, since) if message.arbitration_id == 0x209 + 3 * 128]
+        assert len(heard) == answers
+    frames = messages(board)
+    assert {message.arbitration_id - 3 * 128 for message in frames} == {0x200, 0x209}
+    decoder = Decoder(node=3, from_start=True)
+    for message in frames:
+        decoder.feed(message)
+    assert (decoder.statistics.received, decoder.statistics.lost) == (len(frames), 0)
+    assert decoder.status["wire_version"] == 4
+
+
 def test_an_answer_outlives_the_next_question() -> None:
     """A challenge that is asked for while a save is under way: both are answered."""
     board = Board(image(**IDLE), seed=31)
