@@ -1020,13 +1020,13 @@ void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount);
 selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise);
 
 /* -------------------------------------------------------------------------------------------------------- telemetry
- * Reports as classical CAN frames of 8 bytes with 11-bit identifiers. selfcal.dbc describes every item, its unit and its
+ * Reports as classical CAN frames of 8 bytes with 11-bit identifiers. selfcal.dbc describes every item, with its unit and
  * bits. selfcal_frames.h and the decoders are made from the same source.
  * Each frame carries one value and its item number, a counter over all frames of the module, the module time in whole
  * seconds modulo 256, and a CRC-12.
- * A report's opening and end do not depend on the laws. Between them each hypothesis has a message of its own, which
- * carries up to three parameters by place: N; the drift parameter; the bandwidth or ratio. A place that the law lacks is
- * not sent. So any model of up to eight hypotheses fits, and the same law may stand twice.
+ * A report's opening and end do not depend on the laws. Between them each hypothesis has a message of its own. It carries
+ * up to three parameters by place: N; the drift parameter; the bandwidth or ratio. A place that the law lacks is not
+ * sent. So any model of up to eight hypotheses fits, and the same law may stand twice.
  * Up to twelve modules share a bus: the node number moves all identifiers.
  * Frames must reach the wire in the order they are made (bxCAN: set TXFP). */
 
@@ -1074,8 +1074,8 @@ typedef struct {
     uint32_t motion;               /* code as in selfcal.dbc */
 } selfcal_corrected_t;
 
-/* The coefficient of one regressor column, given that the column is in use, and the probability that it is. A mean that is
- * NaN: nothing is known of this column, and nothing is sent. */
+/* The coefficient of one regressor column, given that the column is in use, and the probability that it is. With a mean of
+ * NaN nothing is known of the column, and nothing is sent. */
 typedef struct {
     float mean, sd, probability;
 } selfcal_sent_coefficient_t;
@@ -1106,21 +1106,21 @@ typedef struct {
 } selfcal_telemetry_t;
 
 /* `axis_name[]`: the name of each axis of the model, which chooses its message: gx gy gz (deg/s), ax ay az (m/s^2). The
- * model's units must be those. The node is 0. SELFCAL_BAD_ARGUMENT on a null pointer. SELFCAL_BAD_MODEL if a name has no
- * message or comes twice, or if the model has more than eight hypotheses. */
+ * model's units must be those. The node is 0. SELFCAL_BAD_ARGUMENT on a null pointer. SELFCAL_BAD_MODEL if a name has
+ * no message or comes twice, or if the model has more than eight hypotheses. */
 selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal_model_t *model,
                                         const char *const axis_name[]);
 
-/* The module's number on its bus, 0 to 11, from here on. SELFCAL_BAD_ARGUMENT beyond; SELFCAL_BUSY, and nothing changes,
+/* The module's number on its bus, 0 to 11, from here on. SELFCAL_BAD_ARGUMENT beyond. SELFCAL_BUSY, and nothing changes,
  * while frames are still to be fetched. */
 selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node);
 
-/* What the following reports tell of the regressors' coefficients on their axis, by column of the model. They must stay as
- * the report must. NULL, as at the start: nothing. */
+/* What the following reports tell of the regressors' coefficients on their axis, by column of the model. They must stay
+ * as the report must. NULL, as at the start: nothing. */
 void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[]);
 
-/* Sends one axis's report next: 7 frames, and of each hypothesis 3 and 5 for each of its parameters; 46 with the paper's
- * three laws. 3 more for each coefficient. `time_ms`: module time since its start, modulo 2^32, later than that of
+/* Sends one axis's report next: 7 frames, and of each hypothesis 3 and 5 for each of its parameters. The paper's three
+ * laws take 46. Each coefficient takes 3 more. `time_ms`: module time since its start, modulo 2^32, later than that of
  * the axis's last report. `report` and `counters` must stay, the report unchanged, until selfcal_telemetry_next() says
  * false. SELFCAL_BUSY, and nothing changes, while frames are still to be fetched. */
 selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,

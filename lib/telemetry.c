@@ -13,7 +13,7 @@ static const char *const axis_names[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_NAM
 /* Items of the places lie evenly, so that loops reach them. */
 SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
-                          SELFCAL_HYPOTHESIS_P2_Q95 + 1 == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_PLACES * SELFCAL_FRAME_STATISTICS &&
+                          SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
                           SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
 SELFCAL_STATIC_ASSERT(columns_are_even, SELFCAL_COEFFICIENTS_C1_MEAN == SELFCAL_COEFFICIENTS_C0_MEAN + 3 &&
                                             SELFCAL_COEFFICIENTS_C5_PROBABILITY + 1 == 3 * 6);
@@ -130,8 +130,8 @@ static uint8_t columns(const selfcal_telemetry_t *self)
     return self->coefficient != NULL && self->model->regressors != NULL ? self->model->regressors->count : 0U;
 }
 
-/* A report is its opening, a part for each hypothesis, the coefficients and the end. Goes to the next part; false after the
- * last, and in what is no report. */
+/* A report is its opening, a part for each hypothesis, the coefficients and the end. Goes to the next part; false after
+ * the last, and in what is no report. */
 static bool next_part(selfcal_telemetry_t *self)
 {
     const uint32_t hypotheses = self->model->hypotheses;
@@ -288,7 +288,8 @@ static uint32_t health_value(const selfcal_telemetry_t *self)
            (c->stuck[axis] != 0 ? 1U << SELFCAL_AXIS_STUCK_SHIFT : 0U) |
            (c->gaps != 0 ? 1U << SELFCAL_AXIS_GAPS_SHIFT : 0U) |
            (c->blocks_lost != 0 ? 1U << SELFCAL_AXIS_BLOCKS_LOST_SHIFT : 0U) |
-           (uint32_t)self->model->hypotheses << SELFCAL_AXIS_HYPOTHESES_SHIFT | columns_told(self) << SELFCAL_AXIS_COLUMNS_SHIFT;
+           (uint32_t)self->model->hypotheses << SELFCAL_AXIS_HYPOTHESES_SHIFT |
+           columns_told(self) << SELFCAL_AXIS_COLUMNS_SHIFT;
 }
 
 static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)

@@ -35,8 +35,8 @@ void slcan_init(slcan_t *self);
 
 /* Takes one byte from the host. Returns how many bytes of `answer` are to be written back: 0 within a line. A line ends in
  * CR, or in CR and LF. C closes; O and L open, also when open, L for listening only: no command is taken; S0 to S8 and an empty
- * line are accepted and change nothing; V, v and N are answered; anything else is answered BEL. With commands, a line of the module's COMMAND message
- * ("t2088" and 16 hexadecimal digits of node 0) on an open channel is a command. */
+ * line are accepted and change nothing; V, v and N are answered; anything else is answered BEL. With commands, a line of the
+ * module's COMMAND message ("t2088" of node 0, and 16 hexadecimal digits) on an open channel is a command. */
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]);
 
 /* The frame as a line, without a terminating zero. */

@@ -9,7 +9,8 @@
  * has closed the channel, and another may open it.
  * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last
  * frame (port/posix/can.h).
- * With --gate motion is kept out, by the model's gate. --node: the module's number on its bus, which moves all identifiers.
+ * With --gate motion is kept out, by the model's gate.
+ * --node is the module's number on its bus, 0 to 11. It moves all identifiers.
  * Exit code: 0; 1 if the host went away or never came, or the bus failed; 2 for bad arguments or a bad recording.
  *
  * RECORDING: see port/replay/replay.h.

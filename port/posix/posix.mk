@@ -12,5 +12,6 @@ posix: $(OUT)/selfcal-posix
 
 $(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h
 	@mkdir -p $(OUT)
-	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) $(CONFIG_$(AS)) $(MODEL_FLAGS) $(NODE_FLAGS) $(POSIX_CFLAGS) -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
+	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) $(CONFIG_$(AS)) $(MODEL_FLAGS) $(NODE_FLAGS) $(POSIX_CFLAGS) \
+	    -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
 	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm

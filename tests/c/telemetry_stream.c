@@ -3,7 +3,8 @@
  *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS COLUMNS NODE
  *
  * As a slow module would that takes SLOW_MS for each axis: an axis's report is begun when that of the last is out, with the
- * status every STATUS_MS between. 0: all at once. The hypotheses are a random walk, Gauss-Markov, a constant bias, and these again.
+ * status every STATUS_MS between. 0: all at once. The hypotheses are a random walk, Gauss-Markov, a constant bias, and
+ * these again.
  *
  * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
 #include "selfcal.h"

@@ -146,7 +146,7 @@ static void test_full_report_is_opening_hypotheses_and_end(void)
     TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
 }
 
-/* Place 1 is K if the law has a walk, else the deviation; place 2 what has the grid alpha. Every statistic and flag tells itself. */
+/* Place 1 is K if the law has a walk, else the deviation. Place 2 has the grid alpha. Every statistic and flag is its own. */
 static void test_each_place_carries_its_parameter(void)
 {
     static const selfcal_parameter_t parameter[3][3] = {
@@ -156,8 +156,12 @@ static void test_each_place_carries_its_parameter(void)
     for (unsigned k = 0; k < 3; k++) {
         for (unsigned q = 0; q < SELFCAL_PARAMETERS; q++) {
             const float base = (float)(100U * k + 10U * q);
-            const selfcal_estimate_t estimate = {.mean = base, .median = base + 1.0F, .sd = base + 2.0F, .q05 = base + 3.0F,
-                                                 .q95 = base + 4.0F, .flags = (uint8_t)(1U + q + k)};
+            const selfcal_estimate_t estimate = {.mean = base,
+                                                 .median = base + 1.0F,
+                                                 .sd = base + 2.0F,
+                                                 .q05 = base + 3.0F,
+                                                 .q95 = base + 4.0F,
+                                                 .flags = (uint8_t)(1U + q + k)};
             report.hypothesis[k].parameter[q] = estimate;
         }
     }
