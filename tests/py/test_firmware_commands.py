@@ -574,7 +574,7 @@ def test_an_axis_outside_the_priors_has_no_bias() -> None:
     board.run(7.0)
     found = {report.axis: report for report in reports(messages(board))[1] if report.complete}
     assert sorted(found) == sorted(AXES)
-    numbers = ("bias_mean", "bias_sd", "constant_probability", "random_walk_probability")
+    numbers = ("bias_mean", "bias_sd", "h0_probability", "h1_probability")
     assert all(math.isnan(found["ax"].value(name)) for name in numbers)
     since = len(board.frames)
     assert obey(board, "write_offsets", 1 << AXES.index("ax"), seconds=1.0) == [RESULT["not_now"]]

@@ -27,7 +27,7 @@ from selfcal.recording import Recording, load
 from selfcal.verbs.identify import identify_axis
 from selfcal.verbs.replay import ROOT, TARGETS, build, emulator, replay, run, write_rows
 from selfcal.verbs.simulate import simulate
-from selfcal.wire import AxisReport, axis_unit, load_dbc
+from selfcal.wire import AxisReport, axis_unit, load_dbc, names_of
 
 from conftest import shared_recording
 
@@ -256,7 +256,7 @@ def test_twenty_minutes_of_six_axes(core: str, name: str, tmp_path: Path) -> Non
     worst_p = worst_mean = worst_sd = 0.0
     for axis in SIX:
         truth = identify_axis(recording, axis, model, "reference", None).result
-        found = history[core][axis][-1].result()
+        found = history[core][axis][-1].result(names_of(model))
         worst_p = max(worst_p, *(abs(found.probability[law] - p) for law, p in truth.probability.items()))
         print(axis, " ".join(f"{law} {found.probability[law]:.4f} ({p:.4f})" for law, p in truth.probability.items()))
         for law, parameters in truth.parameters.items():
