@@ -28,7 +28,6 @@
 #define SELFCAL_FRAME_AXIS_ID 0x201U
 #define SELFCAL_FRAME_HYPOTHESIS_ID 0x220U
 #define SELFCAL_FRAME_COEFFICIENTS_ID 0x20AU
-#define SELFCAL_FRAME_ADEQUACY_ID 0x210U
 
 /* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */
 #define SELFCAL_FRAME_AXES 6U
@@ -107,41 +106,13 @@ enum {
 #define SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT 8U
 #define SELFCAL_HYPOTHESIS_P2_FLAGS_MASK 0xFU
 
-/* Items of the message GX_COEFFICIENTS. */
+/* Items of the message GX_COEFFICIENTS. Each later column's are 3 higher. */
 enum {
     SELFCAL_COEFFICIENTS_C0_MEAN = 0, /* float32 */
     SELFCAL_COEFFICIENTS_C0_SD = 1, /* float32 */
     SELFCAL_COEFFICIENTS_C0_PROBABILITY = 2, /* float32 */
-    SELFCAL_COEFFICIENTS_C1_MEAN = 3, /* float32 */
-    SELFCAL_COEFFICIENTS_C1_SD = 4, /* float32 */
-    SELFCAL_COEFFICIENTS_C1_PROBABILITY = 5, /* float32 */
-    SELFCAL_COEFFICIENTS_C2_MEAN = 6, /* float32 */
-    SELFCAL_COEFFICIENTS_C2_SD = 7, /* float32 */
-    SELFCAL_COEFFICIENTS_C2_PROBABILITY = 8, /* float32 */
-    SELFCAL_COEFFICIENTS_C3_MEAN = 9, /* float32 */
-    SELFCAL_COEFFICIENTS_C3_SD = 10, /* float32 */
-    SELFCAL_COEFFICIENTS_C3_PROBABILITY = 11, /* float32 */
-    SELFCAL_COEFFICIENTS_C4_MEAN = 12, /* float32 */
-    SELFCAL_COEFFICIENTS_C4_SD = 13, /* float32 */
-    SELFCAL_COEFFICIENTS_C4_PROBABILITY = 14, /* float32 */
-    SELFCAL_COEFFICIENTS_C5_MEAN = 15, /* float32 */
-    SELFCAL_COEFFICIENTS_C5_SD = 16, /* float32 */
-    SELFCAL_COEFFICIENTS_C5_PROBABILITY = 17, /* float32 */
 };
 
-
-/* Items of the message GX_ADEQUACY. */
-enum {
-    SELFCAL_ADEQUACY_ADEQUACY = 0, /* uint32 */
-    SELFCAL_ADEQUACY_SUSPICION = 1, /* uint32 */
-    SELFCAL_ADEQUACY_SUSPICION_SCORE = 2, /* float32 */
-    SELFCAL_ADEQUACY_REASON = 3, /* uint32 */
-};
-
-
-#define SELFCAL_ADEQUACY_ADEQUACY_NOT_JUDGED 0U
-#define SELFCAL_ADEQUACY_ADEQUACY_ADEQUATE 1U
-#define SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE 2U
 
 /* Items of the message STATUS. */
 enum {

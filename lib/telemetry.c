@@ -15,8 +15,7 @@ SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
                           SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
                           SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
-SELFCAL_STATIC_ASSERT(columns_are_even, SELFCAL_COEFFICIENTS_C1_MEAN == SELFCAL_COEFFICIENTS_C0_MEAN + 3 &&
-                                            SELFCAL_COEFFICIENTS_C5_PROBABILITY + 1 == 3 * 6);
+enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
 uint16_t selfcal_crc12(const uint8_t *data, size_t length)
 {
@@ -143,7 +142,7 @@ static bool next_part(selfcal_telemetry_t *self)
         const uint32_t id = SELFCAL_FRAME_HYPOTHESIS_ID + SELFCAL_FRAME_HYPOTHESES * axis + k;
         begin_message(self, id, 0, SELFCAL_HYPOTHESIS_P2_Q95);
     } else if (k == hypotheses && columns(self) > 0U) {
-        begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, 3U * columns(self) - 1U);
+        begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, COLUMN_ITEMS * columns(self) - 1U);
     } else {
         self->part = (uint8_t)(hypotheses + 2U);
         begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
@@ -263,9 +262,9 @@ static bool hypothesis_value(const selfcal_telemetry_t *self, uint8_t k, uint8_t
 /* The value of an item of the coefficients; false if nothing is known of its column. */
 static bool coefficient_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
 {
-    const selfcal_sent_coefficient_t *column = &self->coefficient[item / 3U];
+    const selfcal_sent_coefficient_t *column = &self->coefficient[item / COLUMN_ITEMS];
     const float number[] = {column->mean, column->sd, column->probability};
-    *value = float_bits(number[item % 3U]);
+    *value = float_bits(number[item % COLUMN_ITEMS]);
     return !isnan(column->mean);
 }
 

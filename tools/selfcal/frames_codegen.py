@@ -7,13 +7,14 @@ python -m selfcal.frames_codegen --table    print the telemetry table (Markdown)
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
-from selfcal.dbc import AXIS_UNITS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
+from selfcal.dbc import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
 from selfcal.errors import UserError
 from selfcal.units import parameter_unit
 from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
@@ -22,6 +23,10 @@ from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STA
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
+#: Those that modules send.
+SENT = ("", "_H0", "_COEFFICIENTS")
+#: Signals of columns after the first, which C reaches by the number of the column.
+LATER = re.compile(r"c[1-9]_")
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,9 @@ def _first(database: Database, suffix: str) -> Message:
 def check(database: Database) -> None:
     """Raise UserError unless the messages of all axes and hypotheses are alike, have the identifiers that C works out,
     and are in the units of their axes."""
+    columns = [field.item for field in fields(_first(database, "_COEFFICIENTS"))]
+    if columns != list(range(3 * COLUMNS)):
+        raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
     for place, axis in enumerate(AXES):
         for suffix in suffixes:
@@ -173,8 +181,8 @@ def header(database: Database) -> str:
         "",
         "/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */",
     ]
-    for suffix, name in OF_AXIS.items():
-        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{_first(database, suffix).frame_id:X}U")
+    for suffix in SENT:
+        lines.append(f"#define SELFCAL_FRAME_{OF_AXIS[suffix]}_ID 0x{_first(database, suffix).frame_id:X}U")
     names = ", ".join(f'"{name}"' for name in AXES)
     lines += [
         "",
@@ -187,8 +195,8 @@ def header(database: Database) -> str:
         "",
         "/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */",
     ]
-    for suffix, name in OF_AXIS.items():
-        lines += _of_message(_first(database, suffix), name)
+    for suffix in SENT:
+        lines += _of_message(_first(database, suffix), OF_AXIS[suffix])
     for name in (STATUS, CORRECTED, ANSWER):
         lines += _of_message(database.get_message_by_name(name), name)
     lines += ["#endif", ""]
@@ -197,7 +205,9 @@ def header(database: Database) -> str:
 
 def _of_message(message: Message, name: str) -> list[str]:
     """Items of a message, and the numbers of their choices."""
-    lines = [f"/* Items of the message {message.name}. */", *_items(f"SELFCAL_{name}", fields(message))]
+    members = [field for field in fields(message) if not LATER.match(field.name)]
+    more = "" if len(members) == len(fields(message)) else f" Each later column's are {len(members)} higher."
+    lines = [f"/* Items of the message {message.name}.{more} */", *_items(f"SELFCAL_{name}", members)]
     for signal in message.signals:
         for number, word in (signal.choices or {}).items():
             lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
