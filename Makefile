@@ -14,6 +14,7 @@
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 #   make setup                  the set-up alone
+#   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make lock [UPGRADE=1 | UPGRADE=name]   versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
@@ -88,6 +89,15 @@ lock:
 	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: --requirement tools/setup/lock.txt
 	cd tools && ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group dev --custom-compile-command "make lock" \
 	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements.txt pyproject.toml
+	cd tools && for group in $(OPTIONAL); do ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group $$group \
+	    --python-version 3.11 --constraint requirements.txt --custom-compile-command "make lock" \
+	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements-$$group.txt || exit 1; done
+
+# Packages that few need, each group by itself: `make setup-rivals`, `make setup-cluster`.
+OPTIONAL := rivals cluster
+.PHONY: $(OPTIONAL:%=setup-%)
+$(OPTIONAL:%=setup-%): setup-%: setup
+	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements-$*.txt
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-VERBS = ("codegen", "identify", "monitor", "montecarlo", "replay", "simulate")
+VERBS = ("codegen", "identify", "monitor", "montecarlo", "replay", "rivals", "simulate")
 
 
 def __getattr__(name: str) -> Any:

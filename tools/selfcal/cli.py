@@ -222,6 +222,42 @@ def compare(
 
 
 @app.command()
+def rivals(
+    log: Log,
+    axis: Axis = None,
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the block means instead of the model file's")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Method to run (repeat for more); default: all")
+    ] = None,
+    json: Json = None,
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+) -> None:
+    """Other methods on the same recording: their estimates, choice of a law, time and memory."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import rivals as verb
+
+    result = verb.rivals(
+        log,
+        axes=axis or (),
+        model=model,
+        decimate=decimate,
+        only=only or (),
+        json=json,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+    )
+    verb.show(result, to_stderr=str(json) == "-")
+
+
+@app.command()
 def simulate(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[

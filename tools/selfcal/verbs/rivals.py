@@ -1,0 +1,249 @@
+"""`selfcal rivals`: what other methods make of the same record: estimates, choice of a law, time and memory."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from selfcal import units
+from selfcal.document import check_writable, recording_entry, write_json
+from selfcal.errors import UserError, first_line, printable
+from selfcal.methods import RIVALS, Rival
+from selfcal.methods.problem import Answer, Problem
+from selfcal.model import PLAIN, Model
+from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.tables import make_tables
+from selfcal.verbs.identify import chosen_axes
+
+SCHEMA = "selfcal.rivals/1"
+#: Bank samples that every method can work with: five points of an Allan curve.
+FEWEST = 50
+#: An interval from a value to so many times it says nothing: wider than any prior here.
+LOOSE = 1e4
+#: Columns of a terminal that the table takes with the intervals, and without.
+WHOLE_WIDTH, BRIEF_WIDTH = 190, 110
+
+
+def rivals(
+    log: Path | str,
+    *,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    decimate: float | None = None,
+    only: Sequence[str] = (),
+    json: Path | str | None = None,
+    rate: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    scale: Mapping[str, Scale] | None = None,
+) -> dict[str, Any]:
+    """Run the library and every other method of `selfcal.methods` on the same block means of each axis.
+
+    `only`: names of the methods to run, else all. Each runs in a process of its own, one after the other, so that its
+    time and its memory are its own. Returns the document `selfcal.rivals/1`; numbers are in the recording's units.
+    A method that fails, or whose package is absent, has its reason in its place: {"error": ...}.
+    """
+    check_writable(json)
+    chosen = chosen_rivals(only)
+    if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
+        raise UserError("--decimate must be a rate above 0 Hz")
+    loaded = Model.load(model)
+    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    names = chosen_axes(recording, loaded, axes)
+    found: dict[str, Any] = {}
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("rivals", total=len(names) * len(chosen))
+        for name in names:
+            problem, left_out = problem_of(recording, name, loaded, decimate)
+            entries = {}
+            for rival in chosen:
+                progress.update(task, description=f"{name}: {rival.title}")
+                entries[rival.name] = measured(rival, problem, recording.columns[name].unit)
+                progress.advance(task)
+            found[name] = {
+                "samples": int(problem.y.size),
+                "samples_left_out": left_out,
+                "interval_s": problem.dt_s,
+                "rivals": entries,
+            }
+    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": found}
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def chosen_rivals(only: Sequence[str]) -> list[Rival]:
+    """Those named, in the order of the table. Raises UserError for a name that there is not."""
+    for name in only:
+        if name not in RIVALS:
+            raise UserError(f"--only: there is no rival '{name}' ({', '.join(RIVALS)})")
+    return [rival for rival in RIVALS.values() if not only or rival.name in only]
+
+
+def problem_of(recording: Recording, name: str, model: Model, decimate: float | None) -> tuple[Problem, int]:
+    """The longest stretch of the axis' block means without a gap, and how many means lie outside it. Most methods take
+    no gaps, and all must see the same samples."""
+    from selfcal.blocks import usable_blocks
+
+    laws = tuple(law for law in model.hypotheses if law in PLAIN)
+    if not laws:
+        raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
+    group = model.group_of(name)
+    tables = make_tables(replace(model, regressors=()), recording.rate_hz, (name,), bank_rate_hz=decimate)
+    samples = as_float(recording.in_unit(name, group.unit))
+    mean = usable_blocks(samples, recording.missing_before, tables, group).mean
+    y = longest_stretch(mean)
+    if y.size < FEWEST:
+        raise UserError(
+            f"{recording.path}: {name}: {y.size} averages of {tables.dt_s:g} s without a gap are too few, "
+            f"{FEWEST} are needed: record longer, or give --decimate HZ"
+        )
+    one = replace(group, axes=(name,))
+    return Problem(y, tables.dt_s, one, laws), int(np.isfinite(mean).sum()) - y.size
+
+
+def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The longest run of finite values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(mean), [False]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    return mean[starts[longest] : ends[longest]]
+
+
+def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
+    """One method in a process of its own: its answer, its seconds, and its memory beyond the program's."""
+    if rival.missing:
+        return {"title": rival.title, "error": rival.missing}
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_alone, args=(rival, problem, sender))
+    process.start()
+    sender.close()
+    try:
+        found: dict[str, Any] = receiver.recv()
+    except EOFError:
+        found = {"error": "it ended without an answer"}
+    process.join()
+    if "answer" in found:
+        found |= entry_of(found.pop("answer"), problem.group.unit, unit)
+    return {"title": rival.title, **found}
+
+
+def _alone(rival: Rival, problem: Problem, sender: Connection) -> None:
+    try:
+        function = rival.load()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        start = time.perf_counter()
+        answer = function(problem)
+        seconds = time.perf_counter() - start
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        unit_bytes = 1 if sys.platform == "darwin" else 1024
+        sender.send({"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes})
+    except Exception as error:  # whatever another's library raises is the answer for this record
+        sender.send({"error": first_line(error)})
+
+
+def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
+    """What the document says of an answer, in the unit `to`."""
+    factor = units.factor(unit, to)
+    return {
+        "parameters": {
+            law: {
+                name: {key: number * (1.0 if name == "alpha" else factor) for key, number in asdict(value).items()}
+                | {"unit": units.parameter_unit(name, to)}
+                for name, value in estimates.items()
+            }
+            for law, estimates in answer.estimates.items()
+        },
+        "weights": {criterion: dict(weights) for criterion, weights in answer.weights.items()},
+    }
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """A table an axis: a row for each method and law."""
+    console = Console(stderr=to_stderr)
+    brief = console.is_terminal and console.width < WHOLE_WIDTH
+    console.width = max(console.width, BRIEF_WIDTH if brief else WHOLE_WIDTH)
+    for name, axis in document["axes"].items():
+        console.print(_table(name, axis, brief=brief))
+        if axis["samples_left_out"]:
+            console.print(f"left out: {axis['samples_left_out']} averages outside the longest stretch without a gap")
+        for entry in axis["rivals"].values():
+            if "error" in entry:
+                console.print(f"no answer: {entry['title']}: {entry['error']}", highlight=False, markup=False)
+    console.print(
+        "estimates [5 %, 95 %] in the units of the recording, an interval where the method states one\n"
+        "weight of the law: by Bayes' rule, A by AIC, B by BIC; memory: beyond the program's own",
+        highlight=False,
+        markup=False,
+    )
+
+
+def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        title=f"{printable(name)}: {axis['samples']} averages of {axis['interval_s']:g} s",
+        title_justify="left",
+    )
+    for heading in ("method", "law", "weight", "N", "K or sigma_m", "1/alpha, s", "time", "memory"):
+        table.add_column(heading, no_wrap=True)
+    for entry in axis["rivals"].values():
+        if "error" in entry:
+            continue
+        cost = (_seconds(entry["seconds"]), f"{entry['peak_memory_bytes'] / 1e6:.1f} MB")
+        title = entry["title"]
+        laws = list(entry["parameters"])
+        for law in laws:
+            p = entry["parameters"][law]
+            weight = " ".join(
+                f"{weights[law]:.3f}" + {"Bayes": "", "AIC": " A", "BIC": " B"}[criterion]
+                for criterion, weights in entry["weights"].items()
+                if law in weights
+            )
+            table.add_row(
+                title,
+                law,
+                weight,
+                _shown(p.get("N"), brief=brief),
+                _shown(p.get("K", p.get("sigma_m")), brief=brief),
+                _shown(p.get("alpha"), inverse=True, brief=brief),
+                *cost,
+                end_section=law == laws[-1],
+            )
+            title, cost = "", ("", "")
+    return table
+
+
+def _seconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g} ms" if seconds < 1.0 else f"{seconds:.3g} s"
+
+
+def _shown(value: Mapping[str, Any] | None, *, inverse: bool = False, brief: bool = False) -> str:
+    if value is None:
+        return ""
+    middle, low, high = value["value"], value["q05"], value["q95"]
+    if not math.isfinite(middle):
+        return "none"
+    if inverse:
+        middle, low, high = 1.0 / middle, 1.0 / high, 1.0 / low
+    if brief or not (math.isfinite(low) and math.isfinite(high)):
+        return f"{middle:.3g}"
+    if not (low > 0.0 and high < LOOSE * low):
+        return f"{middle:.3g} (undetermined)"
+    return f"{middle:.3g} \\[{low:.3g}, {high:.3g}]"
