@@ -14,6 +14,7 @@ from selfcal import methods as registry
 from selfcal.allan import relative_variance
 from selfcal.errors import UserError
 from selfcal.methods import RIVALS
+from selfcal.methods.ensemble import summary
 from selfcal.methods.problem import Floats, Problem, weights
 from selfcal.methods.steady_state import ln_likelihood
 from selfcal.methods.wavelets import covariance
@@ -169,11 +170,74 @@ def test_the_library_answers_as_identify_does() -> None:
 def test_what_it_refuses(tmp_path: Path) -> None:
     done = run("rivals", SHIPPED, "--only", "oracle")
     assert done.returncode == 2
-    assert done.stderr.startswith("selfcal: error: --only: there is no rival 'oracle' (library, allan_slopes, ")
+    assert done.stderr.startswith("selfcal: error: --only: there is no rival 'oracle' (library, grid, allan_slopes, ")
     log = tmp_path / "log.csv"
     log.write_text("t[s],gx[deg/s]\n" + "".join(f"{k},{0.1 * (k * 7 % 5)}\n" for k in range(30)))
     with pytest.raises(UserError, match=r"gx: 30 averages of 1 s without a gap are too few, 50 are needed: record lon"):
         rivals(log)
+
+
+@pytest.mark.parametrize("law", list(TRUTH))
+def test_the_dense_grid_is_the_library(law: str) -> None:
+    """Two codes, one posterior: probabilities to 2e-4, twice the library's tolerance against its textbook reference.
+    Its quantiles are read between nodes that are up to a third of a posterior sd apart, so they agree to a tenth."""
+    posed = problem(law, 600)
+    ours, grid = (RIVALS[name].load()(posed) for name in ("library", "grid"))
+    assert ours.weights["Bayes"] == pytest.approx(grid.weights["Bayes"], abs=2e-4)
+    for name, value in grid.estimates[law].items():
+        found = ours.estimates[law][name]
+        width = math.log(value.q95 / value.q05)
+        assert abs(math.log(found.q05 / value.q05)) < 0.1 * width
+        assert abs(math.log(found.q95 / value.q95)) < 0.1 * width
+
+
+def test_errors_of_an_ensemble() -> None:
+    """By hand: errors of 0.1 and -0.3 over 0.2 and 0.2; one interval of two holds the truth; one hit of two."""
+    group = Model.load(ENSEMBLE).group_of("gx")
+    rows = []
+    for seed, (ours, theirs) in enumerate(((0.1, 0.2), (-0.3, 0.2))):
+        for name, error in (("library", ours), ("ml", theirs)):
+            value = 0.05 * math.exp(error)
+            row = {"law": "random_walk", "samples": 100, "seed": seed, "rival": name, "seconds": 1.0}
+            for parameter, truth in (("N", 0.5), ("K", 0.05)):
+                row |= {f"truth.{parameter}": truth, f"value.{parameter}": value * truth / 0.05}
+                row |= {f"q05.{parameter}": row[f"value.{parameter}"] * math.exp(-0.2)}
+                row |= {f"q95.{parameter}": row[f"value.{parameter}"] * math.exp(0.2)}
+            weight = 0.8 if seed else 0.3
+            row |= {"weight.Bayes.random_walk": weight, "weight.Bayes.gauss_markov": 1.0 - weight}
+            rows.append(row)
+    entry = next(one for one in summary(rows, group) if one["rival"] == "library")
+    assert entry["parameters"]["K"]["rmse_ln"] == pytest.approx(math.sqrt(0.05))
+    assert entry["parameters"]["K"]["ratio"] == pytest.approx(math.sqrt(0.05) / 0.2)
+    assert entry["parameters"]["K"]["coverage_90"] == 0.5
+    assert entry["choice"]["Bayes"]["hit_rate"] == 0.5
+    assert entry["choice"]["Bayes"]["log_score"] == pytest.approx(0.5 * (math.log(0.8) + math.log(0.3)))
+
+
+def test_the_ensemble_as_a_command(tmp_path: Path) -> None:
+    """12 records a law of 150 samples, truths drawn from the prior. 90 % of the library's intervals hold the truth: of
+    12, at least 8 do but once in 200 (binomial)."""
+    out = tmp_path / "out.json"
+    only = [word for name in ("library", "grid", "ml") for word in ("--only", name)]
+    done = run("rivals", "--records", "12", "--samples", "150", "--truth", "prior", *only, "--json", out)
+    assert done.returncode == 0, done.stderr
+    assert "choice of the law, mean over the laws" in done.stdout
+    document = json.loads(out.read_text())
+    assert document["schema"] == "selfcal.rivals_ensemble/1"
+    for entry in document["cells"]:
+        if entry["rival"] == "library":
+            assert all(p["coverage_90"] >= 8 / 12 for p in entry["parameters"].values())
+    by = {(one["rival"], one["criterion"]): one["log_score"] for one in document["choice"]}
+    # the library's probabilities are the grid's to 2e-4
+    assert by["library", "Bayes"] == pytest.approx(by["grid", "Bayes"], abs=2e-3)
+
+
+def test_a_recording_or_records() -> None:
+    for arguments in (["rivals"], ["rivals", SHIPPED, "--records", "3"]):
+        done = run(*arguments)
+        assert done.returncode == 2
+        assert "rivals takes a recording, or --records N for simulated ones" in done.stderr
+    assert "--truth is middle or prior, not 'best'" in run("rivals", "--records", "3", "--truth", "best").stderr
 
 
 def test_wavelet_moments_beside_simts() -> None:

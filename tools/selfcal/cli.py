@@ -97,6 +97,13 @@ Scale = Annotated[
     list[str] | None,
     typer.Option("--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB of LSB columns (repeat for more)"),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
+]
+Results = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder that keeps finished records, so that a later run goes on")
+]
 
 
 @app.command()
@@ -223,7 +230,20 @@ def compare(
 
 @app.command()
 def rivals(
-    log: Log,
+    log: Annotated[
+        Path | None,
+        typer.Argument(metavar="[LOG]", help=f"Recording: {READ}; or give --records", show_default=False),
+    ] = None,
+    records: Annotated[
+        int | None, typer.Option(metavar="N", help="Instead of a recording: simulated records of each law")
+    ] = None,
+    samples: Annotated[
+        list[int] | None, typer.Option(metavar="N", help="Samples of each record (repeat for more); default: 150, 600")
+    ] = None,
+    truth: Annotated[
+        str, typer.Option(metavar="middle|prior", help="Parameters of the records: the priors' middle, or drawn")
+    ] = "middle",
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same records", min=0)] = 1,
     axis: Axis = None,
     model: ModelFile = None,
     decimate: Annotated[
@@ -232,16 +252,36 @@ def rivals(
     only: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Method to run (repeat for more); default: all")
     ] = None,
+    scheduler: Scheduler = None,
+    results: Results = None,
     json: Json = None,
     rate: Rate = None,
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
 ) -> None:
-    """Other methods on the same recording: their estimates, choice of a law, time and memory."""
+    """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
     from selfcal.recording import parse_pairs, parse_scales
     from selfcal.verbs import rivals as verb
 
+    if (log is None) == (records is None):
+        raise UserError("rivals takes a recording, or --records N for simulated ones: selfcal rivals LOG")
+    if records is not None:
+        result = verb.ensemble(
+            records,
+            samples=samples or verb.SAMPLES,
+            truth=truth,
+            model=model,
+            axis=axis[0] if axis else "gx",
+            only=only or (),
+            seed=seed,
+            json=json,
+            scheduler=scheduler,
+            results=results,
+        )
+        verb.show_ensemble(result, to_stderr=str(json) == "-")
+        return
+    assert log is not None
     result = verb.rivals(
         log,
         axes=axis or (),
@@ -419,12 +459,23 @@ def montecarlo(
     duration: Annotated[float, typer.Option(metavar="S", help="Length of each, s")] = 3600.0,
     axis: Annotated[str, typer.Option(metavar="NAME", help="Axis whose priors are drawn from")] = "gx",
     seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same records", min=0)] = 1,
+    scheduler: Scheduler = None,
+    results: Results = None,
     json: Json = None,
 ) -> None:
     """Simulate records with parameters drawn from the prior and compare stated with actual errors."""
     from selfcal.verbs import montecarlo as verb
 
-    result = verb.montecarlo(model, records=records, duration_s=duration, axis=axis, seed=seed, json=json)
+    result = verb.montecarlo(
+        model,
+        records=records,
+        duration_s=duration,
+        axis=axis,
+        seed=seed,
+        json=json,
+        scheduler=scheduler,
+        results=results,
+    )
     verb.show(result, to_stderr=str(json) == "-")
 
 

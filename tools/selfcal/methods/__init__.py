@@ -40,6 +40,7 @@ RIVALS = {
     rival.name: rival
     for rival in (
         Rival("library", "selfcal, the library", "library", "library"),
+        Rival("grid", "the bank on a dense grid, own", "grid", "grid"),
         Rival("allan_slopes", "Allan deviation, slopes read", "allan", "slopes"),
         Rival("allan_fit", "Allan deviation, weighted fit", "allan", "fit"),
         Rival("gmwm", "wavelet moments (GMWM)", "wavelets", "gmwm"),

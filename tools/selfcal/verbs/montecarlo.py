@@ -8,9 +8,8 @@ the law that is chosen: with the P of the true law the two would not have the sa
 from __future__ import annotations
 
 import math
-import multiprocessing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.laws import Law, named
 from selfcal.model import Group, Model, Prior
+from selfcal.spread import Row, spread
 from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
 
@@ -36,16 +35,8 @@ MIN_SAMPLES = 10
 MOST_SAMPLES = 10_000_000
 
 
-@dataclass(frozen=True)
-class Record:
-    """One simulated record and what the bank said of it."""
-
-    law: str
-    truth: Mapping[str, float]
-    probability: Mapping[str, float]
-    #: mean, sd, q05, q95 of the true law's parameters
-    estimates: Mapping[str, tuple[float, float, float, float]]
-    bias_error_sd: float
+#: What of each estimate of the true law a row has.
+ESTIMATE = ("mean", "sd", "q05", "q95")
 
 
 def montecarlo(
@@ -56,9 +47,13 @@ def montecarlo(
     axis: str = "gx",
     seed: int = 1,
     json: Path | str | None = None,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
 ) -> dict[str, Any]:
     """Simulate `records` records per law at the bank rate, identify each with the library, and compare with the truth.
 
+    `scheduler`: address of a Dask scheduler, else the work is done here; the numbers are the same. `results`: a folder
+    that keeps finished records, so that a run that was stopped goes on, and one of more records adds to it.
     Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
     records the calculated and actual probability of false identification, with the sd of their difference.
     """
@@ -73,20 +68,23 @@ def montecarlo(
     if loaded.regressors:
         raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)
-    jobs = [(law, seed + 1_000_003 * index) for law in loaded.hypotheses for index in range(records)]
-    work = partial(_record, loaded, axis, duration_s)
-    found: list[Record] = []
-    console = Console(stderr=True)
-    hidden = not console.is_terminal
-    with Progress(console=console, transient=True, disable=hidden) as progress, multiprocessing.Pool() as pool:
-        task = progress.add_task("records", total=len(jobs))
-        for record in pool.imap(work, jobs, chunksize=8):
-            found.append(record)
-            progress.advance(task)
+    jobs = [(law, seed + 1_000_003 * index) for index in range(records) for law in loaded.hypotheses]
+    found = spread(
+        partial(_record, loaded, axis, duration_s),
+        jobs,
+        settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
+        scheduler=scheduler,
+        results=results,
+    )
     document = _summary(found, records, duration_s, axis)
     if json is not None:
         write_json(document, json)
     return document
+
+
+def settings_of(model: Model) -> str:
+    """The model without the place of its file."""
+    return repr(replace(model, path=Path(), name=""))
 
 
 def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
@@ -120,7 +118,8 @@ def simulate_bank_samples(
     return values[0], float(bias_now[0])
 
 
-def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> Record:
+def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
+    """One row: the law, the truth, the probabilities, and the estimates of the true law."""
     from selfcal.engines.library import Bank
 
     law, seed = job
@@ -133,37 +132,36 @@ def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     bank = Bank(tables)
     bank.push(y[:, None])
     result = bank.report(0)
-    return Record(
-        law,
-        truth,
-        result.probability,
-        {name: (e.mean, e.sd, e.q05, e.q95) for name, e in result.parameters[law].items()},
-        (result.bias_mean - bias_now) / result.bias_sd,
-    )
+    row: Row = {"law": law, "seed": seed, "bias_error_sd": (result.bias_mean - bias_now) / result.bias_sd}
+    row |= {f"truth.{name}": value for name, value in truth.items()}
+    row |= {f"probability.{name}": value for name, value in result.probability.items()}
+    for name, estimate in result.parameters[law].items():
+        row |= {f"{key}.{name}": getattr(estimate, key) for key in ESTIMATE}
+    return [row]
 
 
-def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str) -> dict[str, Any]:
+def _summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) -> dict[str, Any]:
     laws: dict[str, Any] = {}
-    for law in dict.fromkeys(record.law for record in found):
-        mine = [record for record in found if record.law == law]
+    for law in dict.fromkeys(str(row["law"]) for row in rows):
+        mine = [row for row in rows if row["law"] == law]
         parameters = {}
-        for name in mine[0].estimates:
-            truth = np.array([record.truth[name] for record in mine])
-            mean, sd, q05, q95 = np.array([record.estimates[name] for record in mine]).T
+        for name in (key.removeprefix("mean.") for key in mine[0] if key.startswith("mean.")):
+            truth, mean, sd, q05, q95 = (
+                np.array([row[f"{key}.{name}"] for row in mine]) for key in ("truth", *ESTIMATE)
+            )
             parameters[name] = {
                 "coverage_90": float(((truth >= q05) & (truth <= q95)).mean()),
                 "rms_actual": float(np.sqrt(((mean - truth) ** 2).mean())),
                 "rms_calculated": float(np.sqrt((sd**2).mean())),
             }
-        right = np.array([max(r.probability, key=lambda name: r.probability[name]) == law for r in mine])
-        errors = np.array([record.bias_error_sd for record in mine])
+        errors = np.array([row["bias_error_sd"] for row in mine])
         laws[law] = {
             "parameters": parameters,
-            "false_identification": float(1.0 - right.mean()),
+            "false_identification": float(np.mean([_chosen(row) != law for row in mine])),
             "bias_coverage_90": float((np.abs(errors) < 1.6449).mean()),
         }
-    top = np.array([max(record.probability.values()) for record in found])
-    wrong = np.array([max(r.probability, key=lambda name: r.probability[name]) != r.law for r in found])
+    top = np.array([max(_probability(row).values()) for row in rows])
+    wrong = np.array([_chosen(row) != row["law"] for row in rows])
     return {
         "schema": SCHEMA,
         "records_per_law": records,
@@ -173,9 +171,20 @@ def _summary(found: Sequence[Record], records: int, duration_s: float, axis: str
         "false_identification": {
             "calculated": float(1.0 - top.mean()),
             "actual": float(wrong.mean()),
-            "sd_of_difference": float(np.std(wrong - (1.0 - top)) / math.sqrt(len(found))),
+            "sd_of_difference": float(np.std(wrong - (1.0 - top)) / math.sqrt(len(rows))),
         },
     }
+
+
+def _probability(row: Row) -> dict[str, float]:
+    start = "probability."
+    return {name.removeprefix(start): value for name, value in row.items() if name.startswith(start)}
+
+
+def _chosen(row: Row) -> str:
+    """The most probable law."""
+    probability = _probability(row)
+    return max(probability, key=lambda name: probability[name])
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

@@ -1,4 +1,7 @@
-"""`selfcal rivals`: what other methods make of the same record: estimates, choice of a law, time and memory."""
+"""`selfcal rivals`: what other methods make of the same record: estimates, choice of a law, time and memory.
+
+With a recording, one table an axis. With a number of records instead, the same for simulated ones whose truth is known.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -22,15 +26,24 @@ from rich.table import Table
 
 from selfcal import units
 from selfcal.document import check_writable, recording_entry, write_json
-from selfcal.errors import UserError, first_line, printable
+from selfcal.errors import UserError, first_line, note, printable
 from selfcal.methods import RIVALS, Rival
+from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
-from selfcal.model import PLAIN, Model
+from selfcal.model import DEFAULT, LAWS, PLAIN, Model
 from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.spread import spread
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
+from selfcal.verbs.montecarlo import settings_of
 
 SCHEMA = "selfcal.rivals/1"
+ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
+#: The model of the ensemble, and the numbers of samples that it has unless told otherwise.
+ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
+SAMPLES = (150, 600)
+#: Samples of a record of the ensemble at most: the slowest method takes seconds then.
+MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
 #: An interval from a value to so many times it says nothing: wider than any prior here.
@@ -83,6 +96,73 @@ def rivals(
                 "rivals": entries,
             }
     document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": found}
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def ensemble(
+    records: int,
+    *,
+    samples: Sequence[int] = SAMPLES,
+    truth: str = "middle",
+    model: Path | str | None = None,
+    axis: str = "gx",
+    only: Sequence[str] = (),
+    seed: int = 1,
+    json: Path | str | None = None,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
+) -> dict[str, Any]:
+    """Give every method the same simulated records, `records` of each law and number of `samples`.
+
+    `truth`: 'middle' has every record made with the middle of the priors' logarithms, 'prior' draws it for each. The
+    model is `models/ensemble.yaml` unless one is given. `scheduler`, `results`: as for `montecarlo`.
+    Returns the document `selfcal.rivals_ensemble/1`.
+    """
+    check_writable(json)
+    chosen = chosen_rivals(only)
+    loaded = Model.load(ENSEMBLE if model is None else model)
+    for rival in chosen:
+        if rival.missing:
+            note(f"left out: {rival.title}: {rival.missing}")
+    chosen = [rival for rival in chosen if not rival.missing]
+    if records < 2:
+        raise UserError("--records must be at least 2")
+    if truth not in ("middle", "prior"):
+        raise UserError(f"--truth is middle or prior, not '{truth}'")
+    if not all(FEWEST <= n <= MOST_ENSEMBLE for n in samples):
+        raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
+    if not set(loaded.hypotheses) <= set(PLAIN):
+        raise UserError(f"{loaded.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
+    cells = [Cell(law, n, seed + 1_000_003 * k) for n in samples for k in range(records) for law in loaded.hypotheses]
+    rows = spread(
+        partial(rows_of, loaded, axis, truth, chosen),
+        cells,
+        settings={
+            "schema": ENSEMBLE_SCHEMA,
+            "model": settings_of(loaded),
+            "axis": axis,
+            "truth": truth,
+            "samples": list(samples),
+            "rivals": [rival.name for rival in chosen],
+            "seed": seed,
+            "records": records if len(samples) > 1 else None,  # more of one length may be added
+        },
+        scheduler=scheduler,
+        results=results,
+    )
+    entries = summary(rows, loaded.group_of(axis))
+    document = {
+        "schema": ENSEMBLE_SCHEMA,
+        "model": str(loaded.path),
+        "axis": axis,
+        "truth": truth,
+        "seed": seed,
+        "records_per_law": records,
+        "cells": entries,
+        "choice": over_laws(entries),
+    }
     if json is not None:
         write_json(document, json)
     return document
@@ -228,6 +308,82 @@ def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
             )
             title, cost = "", ("", "")
     return table
+
+
+def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """A table for each number of samples and law, then the choice of a law over all laws."""
+    console = Console(stderr=to_stderr)
+    console.width = max(console.width, WHOLE_WIDTH)
+    cells: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
+    for entry in document["cells"]:
+        cells.setdefault((entry["samples"], entry["law"]), []).append(entry)
+    for (samples, law), entries in cells.items():
+        names = LAWS[law]
+        table = Table(
+            box=box.SIMPLE_HEAD,
+            title=f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}",
+            title_justify="left",
+        )
+        for heading in (
+            "method",
+            *(f"error of ln {name} over ML's" for name in names),
+            "90 % intervals hold",
+            "none",
+            "time",
+        ):
+            table.add_column(heading, no_wrap=True)
+        for entry in entries:
+            p = entry["parameters"]
+            table.add_row(
+                entry["rival"],
+                *(_ratio(p[name]) for name in names),
+                " ".join(f"{100 * p[name]['coverage_90']:.1f}" for name in names) if _covers(p, names) else "",
+                f"{100 * max(p[name]['no_answer'] for name in names):.0f} %",
+                _seconds(entry["seconds"]),
+            )
+        console.print(table)
+    table = Table(box=box.SIMPLE_HEAD, title="choice of the law, mean over the laws", title_justify="left")
+    for heading in ("samples", "method", "by", "right", *document_laws(document), "log score"):
+        table.add_column(heading, no_wrap=True)
+    for entry in document["choice"]:
+        table.add_row(
+            str(entry["samples"]),
+            entry["rival"],
+            entry["criterion"],
+            f"{entry['hit_rate']:.3f}",
+            *(f"{_hit(document, entry, law):.3f}" for law in document_laws(document)),
+            f"{entry['log_score']:.4f} ± {entry['log_score_sd']:.4f}",
+        )
+    console.print(table)
+    console.print(
+        "error: rms of the logarithm over that of ML [95 % of a bootstrap], each estimate kept within the prior\n"
+        "none: records without an answer, in the worst parameter; time: median CPU time of a record, all laws\n"
+        "ekf, ukf: begin at the priors' middle and leave N, K and sigma_m there: their errors are the start's",
+        highlight=False,
+        markup=False,
+    )
+
+
+def document_laws(document: Mapping[str, Any]) -> list[str]:
+    """The laws of an ensemble, in order."""
+    return list(dict.fromkeys(entry["law"] for entry in document["cells"]))
+
+
+def _hit(document: Mapping[str, Any], choice: Mapping[str, Any], law: str) -> float:
+    for entry in document["cells"]:
+        if (entry["samples"], entry["rival"], entry["law"]) == (choice["samples"], choice["rival"], law):
+            return float(entry["choice"][choice["criterion"]]["hit_rate"])
+    return math.nan
+
+
+def _covers(parameters: Mapping[str, Any], names: Sequence[str]) -> bool:
+    return any(math.isfinite(parameters[name]["coverage_90"]) for name in names)
+
+
+def _ratio(parameter: Mapping[str, Any]) -> str:
+    if not math.isfinite(parameter.get("ratio", math.nan)):
+        return "" if math.isnan(parameter["rmse_ln"]) else f"rms {parameter['rmse_ln']:.3f}"
+    return f"{parameter['ratio']:.3f} \\[{parameter['ratio_q025']:.3f}, {parameter['ratio_q975']:.3f}]"
 
 
 def _seconds(seconds: float) -> str:

@@ -1,0 +1,107 @@
+"""Work over many processors: the same rows whoever computes them, and nothing finished is lost."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from selfcal import spread as module
+from selfcal.errors import UserError
+from selfcal.spread import Row, spread
+from selfcal.verbs.montecarlo import montecarlo
+
+CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))
+needs_cluster = pytest.mark.skipif(not CLUSTER, reason="DASK OR PYARROW ABSENT: make setup-cluster")
+
+
+def squares(log: Path | None, job: int) -> list[Row]:
+    """A row a job, and a line in `log` for each that is computed."""
+    if log is not None:
+        with log.open("a") as file:
+            file.write(f"{job}\n")
+    return [{"job": job, "square": job**2, "text": "a" if job % 2 else None}]
+
+
+EXPECTED = [{"job": job, "square": job**2, "text": "a" if job % 2 else None} for job in range(20)]
+
+
+def test_rows_come_in_the_order_of_the_jobs() -> None:
+    assert spread(partial(squares, None), range(20), settings={}, piece=3) == EXPECTED
+
+
+@needs_cluster
+def test_finished_work_is_kept(tmp_path: Path) -> None:
+    """A run that lost a piece computes that piece alone. More jobs add to what is there."""
+    log, folder = tmp_path / "log", tmp_path / "kept"
+    work = partial(squares, log)
+    assert spread(work, range(18), settings={"a": 1}, piece=4, results=folder) == EXPECTED[:18]
+    (folder / "part-000002.parquet").unlink()
+    log.write_text("")
+    assert spread(work, range(18), settings={"a": 1}, piece=4, results=folder) == EXPECTED[:18]
+    assert sorted(map(int, log.read_text().split())) == [8, 9, 10, 11]
+    log.write_text("")
+    assert spread(work, range(20), settings={"a": 1}, piece=4, results=folder) == EXPECTED
+    assert sorted(map(int, log.read_text().split())) == [16, 17, 18, 19]  # the last piece was of two
+
+
+@needs_cluster
+def test_a_folder_of_other_settings_or_a_broken_one_is_refused(tmp_path: Path) -> None:
+    work = partial(squares, None)
+    spread(work, range(4), settings={"a": 1}, results=tmp_path)
+    with pytest.raises(UserError, match=r"part-000000\.parquet: is of other settings: give --results another folder"):
+        spread(work, range(4), settings={"a": 2}, results=tmp_path)
+    (tmp_path / "part-000000.parquet").write_bytes(b"PAR1")
+    with pytest.raises(UserError, match=r"cannot be read .*: delete it to have it made anew"):
+        spread(work, range(4), settings={"a": 1}, results=tmp_path)
+
+
+def test_absent_packages_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="--results needs pyarrow: make setup-cluster"):
+        spread(partial(squares, None), range(2), settings={}, results=tmp_path)
+    with pytest.raises(UserError, match=r"--scheduler needs dask\.distributed: make setup-cluster"):
+        spread(partial(squares, None), range(2), settings={}, scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.fixture
+def scheduler() -> Iterator[str]:
+    """A Dask scheduler with a worker, as a user starts them, on ports of their own."""
+    python = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    started = subprocess.Popen([*python, "--host", "127.0.0.1"], stderr=subprocess.PIPE, text=True)
+    assert started.stderr is not None
+    address = None
+    for line in started.stderr:
+        match = re.search(r"Scheduler at:\s+(tcp://\S+)", line)
+        if match is not None:
+            address = match[1]
+            break
+    assert address is not None
+    options = ["--nthreads", "1", "--no-dashboard", "--no-nanny", "--host", "127.0.0.1"]
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, *options]
+    worker = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    yield address
+    for process in (worker, started):
+        process.terminate()
+        process.wait(20)
+
+
+@needs_cluster
+def test_a_cluster_gives_the_same_numbers(scheduler: str) -> None:
+    """Bit by bit: a record's numbers depend on its seed alone."""
+    here = montecarlo(records=4, duration_s=100.0)
+    assert montecarlo(records=4, duration_s=100.0, scheduler=scheduler) == here
+
+
+@needs_cluster
+def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PATIENCE_S", 0.5)
+    with pytest.raises(UserError, match=r"--scheduler tcp://127\.0\.0\.1:9: no Dask scheduler answers") as caught:
+        spread(partial(squares, None), range(2), settings={}, scheduler="tcp://127.0.0.1:9")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,145 @@
+"""Many records over many processors: this machine's, or a Dask cluster's; finished work is kept in a folder.
+
+A job's numbers depend on the job alone, so any number of workers gives the same rows. Jobs go out in pieces. With a
+folder each finished piece becomes a Parquet file there, and a later run reads it instead of computing it again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from selfcal.errors import UserError, first_line
+from selfcal.output import whole
+
+#: Whatever a function makes a record of; it is pickled.
+Job = Any
+Row = dict[str, Any]
+#: s until a scheduler has answered.
+PATIENCE_S = 10.0
+
+
+def spread(
+    function: Callable[[Job], list[Row]],
+    jobs: Sequence[Job],
+    *,
+    settings: Mapping[str, Any],
+    piece: int = 8,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
+) -> list[Row]:
+    """The rows of `function` for all `jobs`, in their order.
+
+    `settings`: everything that decides the rows beside the jobs; a folder of other settings is refused. `piece`: jobs
+    that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
+    `results`: the folder. Raises UserError for a package that is absent and a scheduler that does not answer.
+    """
+    store = None if results is None else Store(Path(results), settings)
+    pieces = [list(jobs[at : at + piece]) for at in range(0, len(jobs), piece)]
+    found: dict[int, list[Row]] = {}
+    if store is not None:
+        found = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, len(work))) is not None}
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("records", total=len(jobs), completed=sum(len(pieces[k]) for k in found))
+        waiting = [(k, work) for k, work in enumerate(pieces) if k not in found]
+        for k, rows in _cluster(function, waiting, scheduler) if scheduler else _here(function, waiting):
+            found[k] = rows
+            if store is not None:
+                store.write(k, len(pieces[k]), rows)
+            progress.advance(task, len(pieces[k]))
+    return [row for k in range(len(pieces)) for row in found[k]]
+
+
+def _piece(function: Callable[[Job], list[Row]], work: tuple[int, list[Job]]) -> tuple[int, list[Row]]:
+    k, jobs = work
+    return k, [row for job in jobs for row in function(job)]
+
+
+def _obedient() -> None:
+    """A worker ends when its pool does, without a word; Ctrl-C is the command's own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def _here(
+    function: Callable[[Job], list[Row]], waiting: Sequence[tuple[int, list[Job]]]
+) -> Iterator[tuple[int, list[Row]]]:
+    if waiting:
+        with multiprocessing.Pool(initializer=_obedient) as pool:
+            yield from pool.imap_unordered(partial(_piece, function), waiting)
+
+
+def _cluster(
+    function: Callable[[Job], list[Row]], waiting: Sequence[tuple[int, list[Job]]], scheduler: str
+) -> Iterator[tuple[int, list[Row]]]:
+    if importlib.util.find_spec("distributed") is None:
+        raise UserError("--scheduler needs dask.distributed: make setup-cluster")
+    from distributed import Client, as_completed
+
+    try:
+        client: Any = Client(scheduler, timeout=PATIENCE_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise UserError(
+            f"--scheduler {scheduler}: no Dask scheduler answers ({first_line(error)}): start one with `dask scheduler`"
+        ) from error
+    with client:
+        futures = client.map(partial(_piece, function), waiting, pure=False)
+        for _, answer in as_completed(futures, with_results=True):
+            yield answer
+
+
+class Store:
+    """A folder of finished pieces, each a Parquet file that is whole or absent."""
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        if importlib.util.find_spec("pyarrow") is None:
+            raise UserError("--results needs pyarrow: make setup-cluster")
+        self.folder = folder
+        self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be made a folder: {error.strerror}") from error
+
+    def place(self, k: int) -> Path:
+        return self.folder / f"part-{k:06}.parquet"
+
+    def read(self, k: int, jobs: int) -> list[Row] | None:
+        """The rows of piece `k`, None if it is absent or was of fewer jobs. Raises UserError for other settings."""
+        from pyarrow import ArrowException, parquet
+
+        place = self.place(k)
+        if not place.exists():
+            return None
+        try:
+            table = parquet.read_table(place)
+        except (ArrowException, OSError) as error:
+            raise UserError(f"{place}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
+        made = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+        if made.get("selfcal.settings") != self.key:
+            raise UserError(f"{place}: is of other settings: give --results another folder")
+        return table.to_pylist() if made.get("selfcal.jobs") == str(jobs) else None
+
+    def write(self, k: int, jobs: int, rows: Sequence[Row]) -> None:
+        """Keep the rows of piece `k`."""
+        import pyarrow
+        from pyarrow import parquet
+
+        names = dict.fromkeys(name for row in rows for name in row)
+        table = pyarrow.table({name: [row.get(name) for row in rows] for name in names})
+        table = table.replace_schema_metadata({"selfcal.settings": self.key, "selfcal.jobs": str(jobs)})
+        with whole(self.place(k)) as temporary:
+            parquet.write_table(table, temporary)
