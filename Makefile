@@ -6,6 +6,7 @@
 #   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
+#   make calibration            ranks of the truth in the bank's posterior over thousands of records, every law
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
@@ -34,7 +35,7 @@ export RECORDING
 include port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all help setup system python lock run posix quick test hidden soak tolerances emulate c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden soak tolerances emulate calibration c-tests check clean
 
 all: setup
 
@@ -130,7 +131,7 @@ quick: setup
 	@$(BIN)/python tests/run.py --quick
 
 # The matrices are small: a BLAS with threads burns a core and is no faster.
-soak tolerances emulate campaigns: export OPENBLAS_NUM_THREADS := 1
+soak tolerances emulate campaigns calibration: export OPENBLAS_NUM_THREADS := 1
 
 # What `make test` leaves out. When each last ran, and on which commit, stands in tests/long_runs.txt.
 LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
@@ -150,6 +151,10 @@ tolerances: setup
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
+
+# Records of each law and length; the fast subset of `make test` has 60.
+calibration: setup
+	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ $(PYTEST) -s tests/py/test_calibration.py
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt

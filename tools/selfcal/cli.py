@@ -480,6 +480,57 @@ def montecarlo(
 
 
 @app.command()
+def paper(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.html", help="Page to write", show_default=False)
+    ],
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of the real recordings; default: beside the repository")
+    ] = None,
+    records: Annotated[int, typer.Option(metavar="N", help="Records per law in Figs 1 and 2")] = 500,
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same page", min=0)] = 1,
+    scheduler: Scheduler = None,
+    results: Results = None,
+) -> None:
+    """Make the figures of Stepanov & Motorin (2017) anew, on one page beside what the paper says."""
+    from selfcal.verbs import paper as verb
+
+    verb.show(verb.paper(output, data=data, records=records, seed=seed, scheduler=scheduler, results=results), output)
+
+
+@app.command()
+def worth(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG...]", help=f"Recordings at rest: {READ}; default: simulated parts", show_default=False
+        ),
+    ] = None,
+    axis: Axis = None,
+    model: ModelFile = None,
+    records: Annotated[int, typer.Option(metavar="N", help="Simulated rests of each law and length")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same rests", min=0)] = 1,
+    scheduler: Scheduler = None,
+    results: Results = None,
+    json: Json = None,
+) -> None:
+    """Error of the bias some time after a rest, by the bank and by what people flash today."""
+    from selfcal.verbs import worth as verb
+
+    result = verb.worth(
+        logs or (),
+        axes=axis or (),
+        model=model,
+        records=records,
+        seed=seed,
+        json=json,
+        scheduler=scheduler,
+        results=results,
+    )
+    verb.show(result, to_stderr=str(json) == "-")
+
+
+@app.command()
 def codegen(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],

@@ -36,7 +36,7 @@ MOST_SAMPLES = 10_000_000
 
 
 #: What of each estimate of the true law a row has.
-ESTIMATE = ("mean", "sd", "q05", "q95")
+ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 
 
 def montecarlo(
@@ -70,7 +70,7 @@ def montecarlo(
     loaded.group_of(axis)
     jobs = [(law, seed + 1_000_003 * index) for index in range(records) for law in loaded.hypotheses]
     found = spread(
-        partial(_record, loaded, axis, duration_s),
+        partial(rows_of, loaded, axis, duration_s),
         jobs,
         settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
         scheduler=scheduler,
@@ -118,7 +118,7 @@ def simulate_bank_samples(
     return values[0], float(bias_now[0])
 
 
-def _record(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
+def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
     """One row: the law, the truth, the probabilities, and the estimates of the true law."""
     from selfcal.engines.library import Bank
 
@@ -146,7 +146,7 @@ def _summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) ->
         mine = [row for row in rows if row["law"] == law]
         parameters = {}
         for name in (key.removeprefix("mean.") for key in mine[0] if key.startswith("mean.")):
-            truth, mean, sd, q05, q95 = (
+            truth, mean, sd, q05, _, q95 = (
                 np.array([row[f"{key}.{name}"] for row in mine]) for key in ("truth", *ESTIMATE)
             )
             parameters[name] = {

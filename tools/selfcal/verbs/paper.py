@@ -1,0 +1,150 @@
+"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page beside the paper's words."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from selfcal.diagnosis.chart import Figure, draw
+from selfcal.diagnosis.page import STYLE
+from selfcal.document import check_writable
+from selfcal.errors import UserError, note, printable
+from selfcal.model import Model
+from selfcal.output import write_text
+from selfcal.paper import section3, section4
+from selfcal.paper.told import Told
+
+#: Where the real recordings are looked for, beside the repository.
+DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
+#: Causes of one recording that the page names.
+MOST_CAUSES = 5
+#: A look at the real records that explains a difference: this recording, by 1 s means.
+EXPLAINED = "adis16405_run1.npz"
+
+
+def paper(
+    output: Path | str,
+    *,
+    data: Path | str | None = None,
+    records: int = 500,
+    seed: int = 1,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
+) -> list[Told]:
+    """Write the page to `output`; returns its figures.
+
+    `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
+    so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
+    `montecarlo`. All seeds follow from `seed`.
+    """
+    check_writable(output)
+    if records < 2:
+        raise UserError("--records must be at least 2")
+    folder = DATA if data is None else Path(data)
+    if data is not None and not folder.is_dir():
+        raise UserError(f"--data {folder}: there is no such folder")
+    priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
+    rows = section3.ensemble(priors, records, seed, scheduler, results)
+    told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("Figs 5 to 8", total=5)
+        simulated = section4.simulated(seed)
+        told += section4.figures_5_and_6(default, simulated, False)
+        progress.advance(task)
+        real = section4.real(folder, default)
+        progress.advance(task)
+        if len(real) == len(section4.STRETCHES):
+            told += with_reason(section4.figures_5_and_6(default, real, True), folder / EXPLAINED)
+        else:
+            missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
+            note(f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone")
+            told.append(
+                Told(
+                    "Figs 5, 6, real",
+                    (),
+                    "P(random walk) goes to 1 on four accelerometer records.",
+                    "Not made: the real recordings are absent. The README says where they are; --data names a folder.",
+                    "skipped",
+                )
+            )
+        progress.advance(task)
+        told.append(section4.figure_7(default, simulated | real, seed))
+        progress.advance(task)
+        told.append(section4.figure_8(priors, seed))
+        progress.advance(task)
+    write_text(output, page(told, records, seed))
+    return told
+
+
+def with_reason(told: Sequence[Told], log: Path) -> list[Told]:
+    """The figures of the real records with what the diagnosis finds in one of them."""
+    from selfcal.verbs.diagnose import diagnose
+
+    entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
+    causes = [
+        f"{finding['cause'].replace('_', ' ')} ({finding['evidence_gain_nats']:.0f} nats)"
+        for finding in entry.get("findings", [])
+    ]
+    more = f" and {len(causes) - MOST_CAUSES} more" if len(causes) > MOST_CAUSES else ""
+    why = (
+        f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means: "
+        f"{', '.join(causes[:MOST_CAUSES]) or 'nothing'}{more}. "
+        "Neither law has these, so the bank compares two models that are both wrong, and the odds follow the record."
+    )
+    return [replace(one, why=f"{why} {one.why}" if one.verdict == "differs" else one.why) for one in told]
+
+
+def page(told: Sequence[Told], records: int, seed: int) -> str:
+    """One self-contained page: a table of all figures, then each with its pictures."""
+    rows = "".join(
+        f"<tr><th scope=row><a href='#f{k}'>{escape(one.name)}</a></th><td>{escape(one.paper)}</td>"
+        f"<td>{escape(one.here)}</td><td class={'good' if one.verdict == 'agrees' else 'bad'}>{one.verdict}</td></tr>"
+        for k, one in enumerate(told)
+    )
+    head = "".join(f"<th scope=col>{name}</th>" for name in ("figure", "the paper", "here", "verdict"))
+    sections = "".join(
+        f"<section id=f{k}><h2>{escape(one.name)}</h2><dl><dt>The paper</dt><dd>{escape(one.paper)}</dd>"
+        f"<dt>Here</dt><dd>{escape(one.here)}</dd>"
+        f"<dt>Verdict</dt><dd class={'good' if one.verdict == 'agrees' else 'bad'}>{one.verdict}</dd>"
+        + (f"<dt>Why</dt><dd>{escape(one.why)}</dd>" if one.why else "")
+        + "</dl>"
+        + "".join(draw(figure) for figure in ([one.figures] if isinstance(one.figures, Figure) else one.figures))
+        + "</section>"
+        for k, one in enumerate(told)
+    )
+    return (
+        "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width,initial-scale=1'>"
+        "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline'\">"
+        f"<title>The paper's figures</title><style>{STYLE}</style></head><body>"
+        "<header><h1>Stepanov &amp; Motorin (2017), made anew</h1>"
+        "<p>O. A. Stepanov, A. V. Motorin, <cite>Problem-oriented approach to identification of sensor error models "
+        "and its application to navigation data processing</cite>, IFAC-PapersOnLine 50-1 (2017) 2830–2835.</p>"
+        f"<p class=soft>selfcal paper --records {records} --seed {seed}. The seeds were fixed beforehand. Every figure "
+        "is shown whether it agrees or not.</p></header><main>"
+        "<div class=scroll tabindex=0 role=group aria-label='All figures'><table>"
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+        f"{sections}</main></body></html>"
+    )
+
+
+def show(told: Sequence[Told], output: Path | str) -> None:
+    """A line a figure, and the place of the page."""
+    console = Console()
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("figure", "here", ""):
+        table.add_column(heading)
+    for one in told:
+        table.add_row(one.name, one.here, one.verdict)
+    console.width = max(console.width, 100)
+    console.print(table)
+    console.print(printable(f"page: {output}"), highlight=False, markup=False, soft_wrap=True)
