@@ -59,6 +59,7 @@ def test_of_simulated_parts(tmp_path: Path) -> None:
     document = worth(records=30, json=out)
     assert json.loads(out.read_text()) == document
     show(document)
+    assert all(1.0 <= ratio["median"] <= ratio["worst"] for ratio in document["regret"].values())
     for entry in document["cases"]:
         errors = entry["rms_error"]
         assert entry["rests"] == 30

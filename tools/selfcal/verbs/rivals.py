@@ -207,7 +207,7 @@ def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
-    """One method in a process of its own: its answer, its seconds, and its memory beyond the program's."""
+    """One method in a process of its own: its answer, its seconds of CPU, and its memory beyond the program's."""
     if rival.missing:
         return {"title": rival.title, "error": rival.missing}
     context = multiprocessing.get_context("fork")
@@ -229,9 +229,9 @@ def _alone(rival: Rival, problem: Problem, sender: Connection) -> None:
     try:
         function = rival.load()
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        start = time.perf_counter()
+        start = time.process_time()
         answer = function(problem)
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
         unit_bytes = 1 if sys.platform == "darwin" else 1024
         sender.send({"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes})
@@ -269,7 +269,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
                 console.print(f"no answer: {entry['title']}: {entry['error']}", highlight=False, markup=False)
     console.print(
         "estimates [5 %, 95 %] in the units of the recording, an interval where the method states one\n"
-        "weight of the law: by Bayes' rule, A by AIC, B by BIC; memory: beyond the program's own",
+        "weight of the law: by Bayes' rule, A by AIC, B by BIC; time: of the CPU; memory: beyond the program's own",
         highlight=False,
         markup=False,
     )

@@ -102,7 +102,8 @@ def worth(
         rows = spread(
             partial(_simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
         )
-    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "cases": _summary(rows)}
+    cases = _summary(rows)
+    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "cases": cases, "regret": regret(cases)}
     if json is not None:
         write_json(document, json)
     return document
@@ -211,6 +212,17 @@ def _summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
+def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """By method, its error over the least of all methods in the same case, rest and horizon: `worst` and `median`."""
+    found: dict[str, list[float]] = {name: [] for name in TITLES}
+    for entry in cases:
+        for horizon in map(str, HORIZONS_S):
+            errors = {name: entry["rms_error"][name][horizon] for name in TITLES}
+            for name, error in errors.items():
+                found[name].append(error / min(errors.values()))
+    return {name: {"worst": max(ratios), "median": float(np.median(ratios))} for name, ratios in found.items()}
+
+
 def _rms(rows: Sequence[Row], key: str) -> float:
     return math.sqrt(sum(row[key] ** 2 for row in rows) / len(rows))
 
@@ -218,7 +230,7 @@ def _rms(rows: Sequence[Row], key: str) -> float:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table a case; the least error of each column is bold."""
     console = Console(stderr=to_stderr)
-    console.width = max(console.width, 124)
+    console.width = max(console.width, 140)
     cases: dict[str, list[Mapping[str, Any]]] = {}
     for entry in document["cases"]:
         cases.setdefault(entry["case"], []).append(entry)
@@ -245,8 +257,15 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
                 end_section=True,
             )
         console.print(table)
+    table = Table(box=box.SIMPLE_HEAD, title="error over the least of all methods", title_justify="left")
+    for heading in ("method", "median", "worst"):
+        table.add_column(heading, no_wrap=True)
+    for name, ratio in document["regret"].items():
+        table.add_row(TITLES[name], f"{ratio['median']:.3g}", f"{ratio['worst']:.3g}")
+    console.print(table)
     if document["recordings"]:
         console.print(
-            f"the mean of the {REFERENCE_S} s that follow stands for the truth; its own noise is in every error",
+            f"the mean of the {REFERENCE_S} s that follow stands for the truth; its own noise is in every error, and "
+            "gravity in an accelerometer's bias",
             highlight=False,
         )
