@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from selfcal.model import LAWS, PLAIN, SUMS, Model
+from selfcal.laws import NAMED, PLAIN, SUMS
+from selfcal.model import Model
 from selfcal.spread import Row, spread
 from selfcal.verbs.montecarlo import rows_of
 
@@ -59,7 +60,7 @@ def test_ranks_of_the_truth_are_uniform(law: str, samples: int) -> None:
     rows = spread(partial(rows_of, model, "gx", samples / model.bank_rate_hz), jobs, settings={})
     said = []
     wrong = []
-    for name in LAWS[law]:
+    for name in NAMED[law].parameters:
         counts = ranks(rows, name)
         low, high = band(records, BINS)
         said.append(f"{name} {counts.tolist()}")

@@ -13,12 +13,13 @@ from scipy import fft
 from selfcal import methods as registry
 from selfcal.allan import relative_variance
 from selfcal.errors import UserError
+from selfcal.laws import NAMED
 from selfcal.methods import RIVALS
 from selfcal.methods.ensemble import summary
 from selfcal.methods.problem import Floats, Problem, weights
 from selfcal.methods.steady_state import ln_likelihood
 from selfcal.methods.wavelets import covariance
-from selfcal.model import LAWS, Model
+from selfcal.model import Model
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.rivals import longest_stretch, problem_of, rivals, show
 
@@ -115,7 +116,7 @@ def test_covariance_of_wavelet_moments(law: str) -> None:
     """Its diagonal against the Allan variance's own formula in allan.py, which was derived apart."""
     posed = problem(law, 500)
     m = np.array([1.0, 4.0, 32.0])
-    terms = posed.terms(law, np.log([TRUTH[law][name] for name in LAWS[law]]))
+    terms = posed.terms(law, np.log([TRUTH[law][name] for name in NAMED[law].parameters]))
     found = np.diag(covariance(terms, m, 500)) / terms.allan_variance(m) ** 2
     apart = [relative_variance(terms, int(k), np.ones(500 - 2 * int(k) + 1, bool)) for k in m]
     # theirs leaves out lags beyond which a Gauss-Markov drift is forgotten, 1e-6

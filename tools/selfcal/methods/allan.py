@@ -7,8 +7,8 @@ import math
 import allantools
 import numpy as np
 
+from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Peak, Problem, Value, maximum, weights
-from selfcal.model import LAWS
 
 #: Slopes within this of +-1/2 count as that slope: half-way to the flat part.
 SLOPE_TOLERANCE = 0.25
@@ -53,7 +53,7 @@ def fit(problem: Problem) -> Answer:
     ln_variance = 2.0 * np.log(deviation)
     peaks: dict[str, Peak] = {}
     for law in problem.laws:
-        if m.size < len(LAWS[law]):
+        if m.size < len(NAMED[law].parameters):
             continue
 
         def objective(ln_theta: Floats, law: str = law) -> float:
@@ -61,5 +61,5 @@ def fit(problem: Problem) -> Answer:
             return -0.25 * float((freedom * (ln_variance - model) ** 2).sum())
 
         peaks[law] = maximum(objective, problem.starts(law))
-    criterion = {law: 2.0 * len(LAWS[law]) - 2.0 * peak.value for law, peak in peaks.items()}
+    criterion = {law: 2.0 * len(NAMED[law].parameters) - 2.0 * peak.value for law, peak in peaks.items()}
     return Answer({law: peak.values(law) for law, peak in peaks.items()}, {"AIC": weights(criterion)})

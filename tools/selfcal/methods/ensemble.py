@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.laws import NAMED
 from selfcal.methods import Rival
 from selfcal.methods.problem import Answer, Floats, Problem
-from selfcal.model import LAWS, Group, Model, Prior
+from selfcal.model import Group, Model, Prior
 from selfcal.spread import Row
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
@@ -42,9 +43,9 @@ def middle(prior: Prior) -> float:
 def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], cell: Cell) -> list[Row]:
     """A row for each method. The estimates are those of the true law, the weights those of all laws."""
     group = model.group_of(axis)
-    truth = draw(group, cell.law, np.random.default_rng([cell.seed, list(LAWS).index(cell.law)]))
+    truth = draw(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
     if truth_from == "middle":
-        truth |= {name: middle(group.priors[name]) for name in LAWS[cell.law]}
+        truth |= {name: middle(group.priors[name]) for name in NAMED[cell.law].parameters}
     y, _ = simulate_bank_samples(cell.law, truth, model.bank_rate_hz, cell.samples, cell.seed)
     problem = Problem(y, 1.0 / model.bank_rate_hz, replace(group, axes=(axis,)), tuple(model.hypotheses))
     rows: list[Row] = []
@@ -58,7 +59,7 @@ def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], c
         row: Row = {"law": cell.law, "samples": cell.samples, "seed": cell.seed, "rival": rival.name}
         row["seconds"] = time.process_time() - start
         estimates = answer.estimates.get(cell.law, {})
-        for name in LAWS[cell.law]:
+        for name in NAMED[cell.law].parameters:
             row[f"truth.{name}"] = truth[name]
             for key in ("value", "q05", "q95"):
                 row[f"{key}.{name}"] = getattr(estimates[name], key) if name in estimates else math.nan
@@ -87,7 +88,7 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
                 entry["seconds"] = float(np.median([row["seconds"] for row in mine]))
                 entry["parameters"] = {
                     parameter: _errors(mine, by_rival.get(REFERENCE), parameter, group.priors[parameter])
-                    for parameter in LAWS[law]
+                    for parameter in NAMED[law].parameters
                 }
                 entry["choice"] = {one: _choice(mine, one, law) for one in _criteria(mine)}
                 found.append(entry)

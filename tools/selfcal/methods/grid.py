@@ -10,8 +10,9 @@ import math
 
 import numpy as np
 
+from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Problem, Value
-from selfcal.model import LAWS, Prior
+from selfcal.model import Prior
 
 #: Nodes: of the ratio for a walk, of the ratio and of alpha, and of the white noise within its likelihood's width.
 WALK, MARKOV, NOISE = 160, (110, 40), 41
@@ -30,7 +31,7 @@ def grid(problem: Problem) -> Answer:
         ln_evidence[law] = top + math.log(float(weight.sum()))
         weight /= weight.sum()
         estimates[law] = {}
-        for name, ln_value in zip(LAWS[law], at, strict=True):
+        for name, ln_value in zip(NAMED[law].parameters, at, strict=True):
             values, place = np.unique(ln_value, return_inverse=True)
             mass = np.bincount(place, weight)
             low, high = np.interp([0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)
@@ -47,7 +48,7 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     ln_alpha, alpha_mass = np.zeros(1), np.zeros(1)
     ln_ratio = np.full(1, -math.inf)
     if law != "constant":
-        drift = priors[LAWS[law][1]]
+        drift = priors[NAMED[law].parameters[1]]
         low, high = _limits(drift)
         ln_ratio = np.linspace(low - noise[1], high - noise[0], WALK if law == "random_walk" else MARKOV[0])
     if law == "gauss_markov":

@@ -12,8 +12,9 @@ import math
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Problem, Value, logarithmic
-from selfcal.model import LAWS, Prior
+from selfcal.model import Prior
 
 #: The bias is fed as a level about the first reading with this many times the record's scatter.
 LEVEL_SD = 10.0
@@ -37,7 +38,7 @@ def _moments(prior: Prior) -> tuple[float, float]:
 
 def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
     y, dt = problem.y - problem.y[0], problem.dt_s
-    prior = [_moments(problem.group.priors[name]) for name in LAWS[law]]
+    prior = [_moments(problem.group.priors[name]) for name in NAMED[law].parameters]
     mean = np.array([0.0, 0.0, *(m for m, _ in prior)])
     start = {"random_walk": 0.0, "gauss_markov": math.exp(prior[1][0])}[law]
     sd = np.array([LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])
@@ -83,4 +84,4 @@ def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
             joint.P = joint.F @ joint.P @ joint.F.T + joint.Q
             joint.x = moved[:, None]
             joint.update(np.array([[value]]), lambda _: row, lambda x: row @ x)
-    return logarithmic(LAWS[law], np.asarray(joint.x).ravel()[2:], np.asarray(joint.P)[2:, 2:])
+    return logarithmic(NAMED[law].parameters, np.asarray(joint.x).ravel()[2:], np.asarray(joint.P)[2:, 2:])

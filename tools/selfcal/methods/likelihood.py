@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from statsmodels.tsa.statespace.structural import UnobservedComponents
 
+from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Problem, Value, information_criteria, logarithmic
-from selfcal.model import LAWS
 
 #: What statsmodels calls the laws. All have a free level, so their likelihoods are of the same samples.
 _MODEL = {"constant": {"level": "dconstant"}, "random_walk": {"level": "llevel"}}
@@ -52,7 +52,7 @@ def _continuous(law: str, found: Floats, covariance: Floats, scale: float, dt_s:
     slope = _derivative(ln_of, found)
     return {
         name: value if math.isfinite(value.value) and value.value > 0.0 else Value(math.nan)
-        for name, value in logarithmic(LAWS[law], ln_of(found), slope @ covariance @ slope.T).items()
+        for name, value in logarithmic(NAMED[law].parameters, ln_of(found), slope @ covariance @ slope.T).items()
     }
 
 

@@ -7,8 +7,9 @@ import math
 
 import numpy as np
 
+from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Problem, Value
-from selfcal.model import LAWS, Prior
+from selfcal.model import Prior
 
 #: Particles a law; the seed of the draws.
 PARTICLES, SEED = 2000, 1
@@ -23,7 +24,7 @@ def particles(problem: Problem) -> Answer:
     for law in problem.laws:
         ln_theta, weight, ln_evidence[law] = filtered(problem, law, np.random.default_rng(SEED))
         estimates[law] = {}
-        for name, column in zip(LAWS[law], ln_theta, strict=True):
+        for name, column in zip(NAMED[law].parameters, ln_theta, strict=True):
             order = np.argsort(column)
             at = np.interp([0.5, 0.05, 0.95], np.cumsum(weight[order]), column[order])
             estimates[law][name] = Value(*np.exp(at).tolist())
@@ -36,7 +37,7 @@ def filtered(problem: Problem, law: str, rng: np.random.Generator) -> tuple[Floa
     """ln parameters [d, particles], their weights, and the ln evidence of all samples but the first, which gives the
     level."""
     y, dt = problem.y, problem.dt_s
-    ln_theta = np.array([_draw(problem.group.priors[name], rng) for name in LAWS[law]])
+    ln_theta = np.array([_draw(problem.group.priors[name], rng) for name in NAMED[law].parameters])
     level = y[0] + np.exp(ln_theta[0]) / math.sqrt(dt) * rng.standard_normal(PARTICLES)
     drift = np.zeros(PARTICLES)
     if law == "gauss_markov":

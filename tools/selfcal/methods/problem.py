@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from selfcal.allan import Terms, overlapping, terms_of
-from selfcal.model import LAWS, Group
+from selfcal.laws import NAMED
+from selfcal.model import Group
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +41,8 @@ class Problem:
 
     def terms(self, law: str, ln_theta: Floats) -> Terms:
         """The law at the logarithms of its parameters."""
-        theta = dict(zip(LAWS[law], np.exp(ln_theta).tolist(), strict=True))
-        return terms_of(law, theta, self.dt_s, self.group.correlation_time_s)
+        theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
+        return terms_of(self.group.laws[law], theta, self.dt_s)
 
     def starts(self, law: str) -> list[Floats]:
         """Where a search begins: moments of the record, and for Gauss-Markov three correlation times."""
@@ -84,7 +85,7 @@ class Peak:
 
     def values(self, law: str) -> dict[str, Value]:
         """Estimates with the interval of a normal distribution in the logarithm."""
-        return logarithmic(LAWS[law], self.at, self.covariance)
+        return logarithmic(NAMED[law].parameters, self.at, self.covariance)
 
 
 def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> dict[str, Value]:
@@ -157,6 +158,6 @@ def weights(criterion: Mapping[str, float]) -> dict[str, float]:
 
 def information_criteria(ln_likelihood: Mapping[str, float], n: int) -> dict[str, dict[str, float]]:
     """AIC and BIC weights of laws from their greatest ln likelihoods over the same `n` samples."""
-    aic = {law: 2.0 * len(LAWS[law]) - 2.0 * value for law, value in ln_likelihood.items()}
-    bic = {law: math.log(n) * len(LAWS[law]) - 2.0 * value for law, value in ln_likelihood.items()}
+    aic = {law: 2.0 * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
+    bic = {law: math.log(n) * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
     return {"AIC": weights(aic), "BIC": weights(bic)}

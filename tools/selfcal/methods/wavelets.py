@@ -14,9 +14,9 @@ from functools import partial
 import numpy as np
 
 from selfcal.allan import Terms, overlapping
+from selfcal.laws import NAMED
 from selfcal.methods.allan import WINDOWS
 from selfcal.methods.problem import STEP, Answer, Floats, Problem, Value, inverse, logarithmic, maximum
-from selfcal.model import LAWS
 
 #: Weights of a second difference of sums over m readings.
 _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
@@ -44,7 +44,7 @@ def gmwm(problem: Problem) -> Answer:
     own = np.diag(y.size / (2.0 * m * variance**2))
     found: dict[str, dict[str, Value]] = {}
     for law in problem.laws:
-        if m.size < len(LAWS[law]):
+        if m.size < len(NAMED[law].parameters):
             continue
 
         def model(ln_theta: Floats, law: str = law) -> Floats:
@@ -61,5 +61,5 @@ def gmwm(problem: Problem) -> Answer:
             continue
         at = maximum(partial(objective, weight), [first.at]).at
         jacobian = np.array([(model(at + s) - model(at - s)) / (2.0 * STEP) for s in np.eye(at.size) * STEP])
-        found[law] = logarithmic(LAWS[law], at, inverse(jacobian @ weight @ jacobian.T))
+        found[law] = logarithmic(NAMED[law].parameters, at, inverse(jacobian @ weight @ jacobian.T))
     return Answer(found)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from selfcal.diagnosis.chart import Band, Curve, Figure, Kind, Panel
+from selfcal.laws import NAMED
 from selfcal.methods.allan import curve
 from selfcal.methods.problem import Problem
-from selfcal.model import DEFAULT, LAWS, Model
+from selfcal.model import DEFAULT, Model
 from selfcal.paper.told import Told
 from selfcal.result import AxisResult
 from selfcal.spread import Row, spread
@@ -54,7 +55,7 @@ def over_time(model: Model, axis: str, dt_s: float, y: Floats, marks: Sequence[i
 def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
     """A row for each mark of one record."""
     law, seed = job
-    truth = draw(model.group_of("gx"), law, np.random.default_rng([seed, list(LAWS).index(law)]))
+    truth = draw(model.group_of("gx"), law, np.random.default_rng([seed, list(NAMED).index(law)]))
     y, _ = simulate_bank_samples(law, truth, 1.0, MARKS[-1], seed)
     rows: list[Row] = []
     for mark, report in zip(MARKS, over_time(model, "gx", 1.0, y, MARKS), strict=True):
@@ -157,7 +158,7 @@ def figures_3_and_4(seed: int) -> list[Told]:
         y, _ = simulate_bank_samples(law, truth, 1.0, ALIKE_SAMPLES, seed)
         frequency, power = signal.welch(y, nperseg=PIECE, detrend="constant")
         spectra.append(Curve(names[law], frequency[1:-1], power[1:-1], kind))
-        m, deviation, freedom = curve(Problem(y, 1.0, group, tuple(LAWS)))
+        m, deviation, freedom = curve(Problem(y, 1.0, group, tuple(NAMED)))
         deviations.append(Curve(names[law], m, deviation, kind))
     # Of ln power: pieces that overlap by half count as 0.75 each. Of ln deviation: 1 / (2 degrees of freedom).
     pieces = 0.75 * (2 * ALIKE_SAMPLES / PIECE - 1)

@@ -27,10 +27,11 @@ from rich.table import Table
 from selfcal import units
 from selfcal.document import check_writable, recording_entry, write_json
 from selfcal.errors import UserError, first_line, note, printable
+from selfcal.laws import NAMED, PLAIN
 from selfcal.methods import RIVALS, Rival
 from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
-from selfcal.model import DEFAULT, LAWS, PLAIN, Model
+from selfcal.model import DEFAULT, Model
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.spread import spread
 from selfcal.tables import make_tables
@@ -318,7 +319,7 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
     for entry in document["cells"]:
         cells.setdefault((entry["samples"], entry["law"]), []).append(entry)
     for (samples, law), entries in cells.items():
-        names = LAWS[law]
+        names = NAMED[law].parameters
         table = Table(
             box=box.SIMPLE_HEAD,
             title=f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}",
