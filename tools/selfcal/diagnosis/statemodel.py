@@ -92,8 +92,8 @@ def flicker_rates(duration_s: float, dt: float) -> Array:
 def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matrices:
     """The state model of `terms` at the parameters `theta`.
 
-    Flicker noise of coefficient B has the one-sided spectrum B^2 / (2 pi f). Terms of variance v whose rates are a
-    factor g apart make v / (ln g f), so v = B^2 ln g / (2 pi).
+    Flicker noise of coefficient B has the two-sided spectrum B^2 / (2 pi f), as in `simulate` and in IEEE 952. Terms of
+    variance v whose rates are a factor g apart make v / (2 ln g f), so v = B^2 ln g / pi.
     """
     value = dict(zip(terms.names, theta, strict=True))
     phi: list[float] = []
@@ -119,7 +119,7 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         rates = flicker_rates(duration_s, dt)
         apart = math.log(rates[1] / rates[0])
         for rate in rates:
-            markov(math.exp(2.0 * value["ln_flicker"]) * apart / (2.0 * math.pi), float(rate))
+            markov(math.exp(2.0 * value["ln_flicker"]) * apart / math.pi, float(rate))
     R, driver = 1.0, -1
     if terms.color == "ar":  # the white noise itself is a first-order process
         f = math.tanh(value["color"])
