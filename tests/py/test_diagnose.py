@@ -180,6 +180,27 @@ def test_the_size_of_flicker_is_that_of_its_allan_floor(tmp_path: Path) -> None:
     assert sum(found) / 3.0 == pytest.approx(0.1, rel=0.12)
 
 
+def test_a_jump_of_two_axes_is_no_motion_and_stands_where_it_is(tmp_path: Path) -> None:
+    """Both axes jump at once beside a fast drift. Truth: the time and the sizes that were put in."""
+    random = np.random.default_rng(4)
+    n, place = 3000, 1700
+    drift = 0.05 * random.standard_normal((2, n)).cumsum(axis=1)
+    values = 0.1 * random.standard_normal((6, n))
+    values[:2] += drift
+    values[:2, place:] += [[1.2], [1.8]]
+    axes = dict(zip(("gx", "gy", "gz", "ax", "ay", "az"), values, strict=True))
+    units = {name: "deg/s" if name[0] == "g" else "m/s^2" for name in axes}
+    save(tmp_path / "log.npz", {name: (units[name], row) for name, row in axes.items()}, 1.0)
+    document = diagnose(tmp_path / "log.npz", axes=["gx", "gy"])
+    for name, size in (("gx", 1.2), ("gy", 1.8)):
+        (finding,) = document["axes"][name]["findings"]
+        assert finding["cause"] == "step"
+        time, amplitude = finding["estimate"]["time_s"], finding["estimate"]["amplitude"]
+        assert time["q05"] - 0.5 < place - 0.5 < time["q95"] + 0.5
+        assert time["sd"] >= 0.28  # no better than between two readings
+        assert abs(amplitude["median"] - size) < 3.0 * amplitude["sd"]
+
+
 def test_the_gain_is_on_time_that_was_not_fitted(tmp_path: Path) -> None:
     """A line of known size: its frequency is looked for in the first half alone, and the second half is scored.
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 
-from selfcal.diagnosis.causes.noise import LN_CHANGES
-from selfcal.diagnosis.causes.step import ln_places, response_of
+from selfcal.diagnosis.causes import noise, periodic, step
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import NET_LEAST, State
+from selfcal.diagnosis.state import NET_LEAST, State, net
 from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
@@ -29,7 +30,6 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
 
     middle = np.zeros(t.size)
     middle[t.size // 2 :] = 1.0
-    line = math.log(max(1.0, 0.5 * n)) + 0.7
     # Half way between the slowest line looked for and the fastest, in octaves.
     frequency = math.sqrt(3.0 / t[-1] * 0.5 * record.rate_hz)
     columns: dict[str, Array] = {
@@ -43,11 +43,16 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         columns[f"axis_{name}"] = values
     least = {cause: _least(state, values, NET_LEAST) for cause, values in columns.items()}
     add("ramp", slope=(least["ramp"], f"{state.unit}/s"))
-    places = ln_places(state.y.size, response_of(state), 2.0 * NET_LEAST)
-    add("step", amplitude=(least["step"] * math.sqrt(1.0 + places / NET_LEAST), state.unit))
+    _, A, response = step.scan(state.series, state.best)
+    add(
+        "step", amplitude=(least["step"] * math.sqrt(_gain_for(lambda gain: step.worth(gain, response, A))), state.unit)
+    )
     add(
         "periodic",
-        amplitude=(least["periodic"] * math.sqrt(1.0 + line / NET_LEAST), state.unit),
+        amplitude=(
+            least["periodic"] * math.sqrt(_gain_for(lambda gain: net(gain, 2, periodic.ln_lines(n, gain)))),
+            state.unit,
+        ),
         frequency_hz=(frequency, "Hz"),
     )
     for cause, unit in (("temperature", "degC"), ("supply", "V")):
@@ -59,7 +64,8 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         unit = record.axes[worst.removeprefix("axis_")].unit
         add("cross_axis", coefficient=(others[worst], coefficient_unit(state.unit, unit)))
     add("colored_noise", lag1=(math.sqrt(2.0 * NET_LEAST / n), "1"))
-    add("variance_change", ratio=(1.0 + math.sqrt(4.0 * (NET_LEAST + LN_CHANGES) / n), "1"))
+    change = NET_LEAST * _gain_for(lambda gain: net(gain, 1, noise.ln_changes(n, gain)))
+    add("variance_change", ratio=(1.0 + math.sqrt(4.0 * change / n), "1"))
     # One sample so far off that its evidence pays for the choice among n.
     add("outliers", deviation=(math.sqrt(2.0 * (NET_LEAST + math.log(n))) * state.best.sigma, state.unit))
     add("missing_samples", missing=(1e-3 * record.present.size, "samples"))
@@ -74,3 +80,9 @@ def _least(state: State, column: Array, nats: float) -> float:
     cross = G[1:k, k]
     A = G[k, k] - cross @ np.linalg.pinv(G[1:k, 1:k], rcond=1e-12, hermitian=True) @ cross
     return math.sqrt(2.0 * nats / A) if 1e-9 * G[k, k] < A else math.inf
+
+
+def _gain_for(worth: Callable[[float], float]) -> float:
+    """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
+    gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
+    return float(gain) / NET_LEAST

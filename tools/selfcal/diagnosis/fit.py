@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize
@@ -14,6 +15,10 @@ from selfcal.diagnosis.statemodel import Array, Terms, matrices
 
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
+#: Standard deviations of a model's parameters at which posteriors of coefficients are summed.
+NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
+#: Longer records know their parameters well enough: the best ones stand for all.
+NODES_MOST = 100_000
 #: A slope is taken over this much of a parameter's standard deviation.
 NEAR = 0.1
 
@@ -172,6 +177,22 @@ def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 
 def curved(series: Series, found: Fit) -> Fit:
     """The fit with its spread, for `refit`."""
     return replace(found, spread=_spread(series, found)) if found.terms.names else found
+
+
+def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
+    """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for."""
+    if not found.terms.names or series.n > NODES_MOST:
+        return [(found.theta, 0.0)]
+    spread = curved(series, found).spread
+    limits = np.array(found.terms.limits(found.dt)).reshape(-1, 2)
+    k = found.theta.size
+    volume = float(np.linalg.slogdet(spread)[1] - np.log(limits[:, 1] - limits[:, 0]).sum())
+    # Of three parameters and more only the two least known are varied.
+    wide = set(np.argsort(-np.linalg.norm(spread, axis=0))[:2])
+    grid = product(*(NODES if j in wide else (0.0,) for j in range(k)))
+    places = [found.theta + spread @ np.array(z) for z in grid]
+    inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
+    return [(theta, volume) for theta in inside or [found.theta]]
 
 
 def finish(series: Series, terms: Terms, theta: Array) -> Fit:

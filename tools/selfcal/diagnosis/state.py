@@ -9,9 +9,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 from scipy.stats import chi2
 
-from selfcal.diagnosis.fit import Fit, Series, best, curved, fit, moved, refit, run
+from selfcal.diagnosis.fit import Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
@@ -97,9 +98,31 @@ class State:
 
     def with_columns(self, more: Array) -> tuple[float, Fit]:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
-        series = self.series.beside(more)
-        fits = [_fit_from(series, terms, self.fits) for terms in self.near()]
+        fits = [self.fitted_with(terms, more) for terms in self.near()]
         return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
+
+    def fitted_with(self, terms: Terms, more: Array) -> Fit:
+        """The fit of one drift with further columns [k, n]."""
+        return _fit_from(self.series.beside(more), terms, self.fits)
+
+    def posterior(self, more: Array) -> tuple[Array, Array, Array]:
+        """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
+        [m], means [m, k] and standard deviations [m, k] of the normals that they are the sum of."""
+        series = self.series.beside(more)
+        k = len(np.atleast_2d(more))
+        drifts = [*self.near()]
+        if not self.extras.flicker:
+            drifts.append(self.rich.terms)
+        ln_weight, means, sds = [], [], []
+        for terms in drifts:
+            started = refit(series, self.rich) if terms == self.rich.terms else self.fitted_with(terms, more)
+            for theta, ln_share in nodes(series, started):
+                one = finish(series, terms, theta)
+                ln_weight.append(ln_share + one.ln_likelihood + float(np.log(one.sd[-k:]).sum()))
+                means.append(one.c[-k:])
+                sds.append(one.sd[-k:])
+        value = np.array(ln_weight)
+        return np.exp(value - value.max()), np.array(means), np.array(sds)
 
     @cached_property
     def rich(self) -> Fit:
@@ -151,6 +174,19 @@ def net(gain: float, freedom: int = 1, ln_looks: float = 0.0) -> float:
     return max(0.0, -(ln_p + ln_looks))
 
 
+def ln_looks(bend: Array, gain: float) -> float:
+    """ln of the number of independent looks among scores of neighbouring places: their largest gains `gain` of noise.
+
+    `bend` [places]: 1 - correlation of each place's score with its neighbour's. A score that forgets exponentially
+    crosses u = sqrt(2 gain) about bend u^2 times a place (Leadbetter, Lindgren & Rootzen 1983, theorem 12.2.9). Between
+    samples it is not looked at: Siegmund's factor nu (Sequential Analysis, 1985, chapter X) counts that.
+    """
+    square = 2.0 * bend * max(gain, 0.0)
+    half = 0.5 * np.sqrt(np.maximum(2.0 * square, 1e-12))
+    nu = (ndtr(half) - 0.5) / (half * (half * ndtr(half) + np.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)))
+    return math.log1p(float((square * nu).sum()))
+
+
 @dataclass(frozen=True)
 class Look:
     """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
@@ -177,3 +213,21 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
         "q95": value + 1.6448536269514722 * sd,
         "unit": unit,
     }
+
+
+def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:
+    """A posterior that is a sum of normals, `weight` of each not normalized, in the form of the contract."""
+    sd = np.broadcast_to(np.asarray(sd, np.float64), mean.shape)
+    weight = weight / weight.sum()
+    middle = float(weight @ mean)
+    spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
+
+    def quantile(p: float) -> float:
+        low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
+        for _ in range(60):
+            at = 0.5 * (low + high)
+            low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
+        return 0.5 * (low + high)
+
+    points = {name: quantile(p) for name, p in (("median", 0.5), ("q05", 0.05), ("q95", 0.95))}
+    return {"mean": middle, "sd": spread, **points, "unit": unit}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import norm
+from scipy.stats import norm, pearson3, skew
 from scipy.stats import t as student
 
 from selfcal.diagnosis.fit import run
@@ -20,6 +20,8 @@ from selfcal.diagnosis.statemodel import Array, Matrices, matrices
 
 #: Simulated records a band rests on.
 ENSEMBLE = 48
+#: An ensemble of this size shows the skewness of a statistic too.
+SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25}
 #: Lags of the correlation, roughly a factor 1.6 apart.
@@ -228,7 +230,14 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic
         # Student's t of a new value against the ensemble: its spread is known to 1/sqrt(2 count).
         z = (value - mean) / (sd * math.sqrt(1.0 + 1.0 / sample.size))
         freedom = sample.size - 1
-        p = 2.0 * float(student.sf(abs(z), freedom)) if abs(z) < 8 else 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
+        if abs(z) >= 8.0:
+            p = 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
+        elif sample.size >= SKEWED:
+            # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
+            third = float(skew(sample))
+            p = 2.0 * float(pearson3.sf(abs(z), math.copysign(third, third * z)))
+        else:
+            p = 2.0 * float(student.sf(abs(z), freedom))
         half = float(student.isf(0.005, freedom)) * sd
         found.append(Statistic(name, value, mean - half, mean + half, p))
     return sorted(found, key=lambda one: one.p)

@@ -10,9 +10,9 @@ from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
-from selfcal.diagnosis.fit import fit, moved
+from selfcal.diagnosis.fit import Fit, finish, fit, moved
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, Regressor, State, interval, net
+from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
 
 #: Fewer turns in a record than this are drift.
@@ -89,6 +89,20 @@ def _band(state: State, record: Record) -> list[Look]:
     ]
 
 
+def _spread(line: Fit, n: int) -> float:
+    """Standard deviation of a line's frequency, Hz: pi^2 n T^2 A^2 / (3 s^2) of information, T the record's length."""
+    sd = float(np.mean(line.sd[-2:])) / max(math.hypot(*line.c[-2:]), 1e-300)
+    return sd * math.sqrt(12.0) / (2.0 * math.pi * n * line.dt)
+
+
+def ln_lines(n: int, gain: float) -> float:
+    """ln of the number of independent lines among `n` samples, for one that gains so much.
+
+    The frequency is continuous: between two bins of the periodogram lies a larger maximum (Baluev 2008, MNRAS 385,
+    1279, equation 6, for even sampling)."""
+    return math.log(max(1.0, 0.5 * n * math.sqrt(math.pi / 3.0))) + 0.5 * math.log(max(1.0, gain))
+
+
 def _line(state: State, record: Record) -> list[Look]:
     """The strongest line, refitted exactly at its best frequency."""
     n = state.y.size
@@ -99,8 +113,7 @@ def _line(state: State, record: Record) -> list[Look]:
     low = TURNS_LEAST / (n * state.dt)
     power[(frequency < low) | (frequency > 0.5 / state.dt - low)] = 0.0
     at = int(np.argmax(power))
-    ln_places = math.log(max(1.0, 0.5 * n)) + 0.7
-    if power[at] < ln_places:
+    if net(float(power[at]), 2, ln_lines(n, float(power[at]))) <= 0.0:
         return []
     t = record.time_s
 
@@ -126,14 +139,24 @@ def _line(state: State, record: Record) -> list[Look]:
     gain, chosen = state.with_columns(pair)
     if f < 30.0 / (n * state.dt):
         gain = min(gain, state.rich_gain(pair))
-    worth = net(gain, 2, ln_places)
+    worth = net(gain, 2, ln_lines(n, gain))
     if worth < 1.0:
         return []
-    a, b = chosen.c[-2:]
-    amplitude = math.hypot(a, b)
-    sd = float(np.mean(chosen.sd[-2:]))
-    # Information of the frequency: pi^2 n T^2 A^2 / (3 s^2) per unit of 1/T.
-    spread = sd / max(amplitude, 1e-300) * math.sqrt(6.0) / (2.0 * math.pi * n * state.dt) * math.sqrt(2.0)
+    spread = _spread(chosen, n)
+    if worth >= NET_LEAST:
+        # The null's drift has swallowed a part of a line: the frequency is the likeliest beside the one that is left.
+        move = 0.5 * spread
+        gains = [finish(state.series.beside(columns(f + k * move)), chosen.terms, chosen.theta) for k in (-1, 0, 1)]
+        low, middle, high = (one.ln_likelihood for one in gains)
+        bend = 2.0 * middle - low - high
+        if bend > 0.0:
+            spread = move / math.sqrt(bend)
+            f += move * min(4.0, max(-4.0, 0.5 * (high - low) / bend))
+            pair = columns(f)
+    amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
+    if worth >= NET_LEAST:
+        weight, means, sds = state.posterior(pair)
+        amplitude = mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)
     name = f"line_{f:.6g}Hz"
     entry = {"kind": "periodic", "frequency_hz": f}
     added = (
@@ -145,7 +168,7 @@ def _line(state: State, record: Record) -> list[Look]:
             "periodic",
             gain,
             worth,
-            {"frequency_hz": interval(f, spread, "Hz"), "amplitude": interval(amplitude, sd, state.unit)},
+            {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude},
             {"regressors": (*state.regressors, *added)},
         )
     ]

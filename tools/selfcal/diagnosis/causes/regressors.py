@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, net
+from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
 from selfcal.regressors import coefficient_unit
 
@@ -118,6 +118,9 @@ def _linear(state: State, cause: str, options: list[Regressor], key: str, ln_loo
         worth = net(gain, 1, ln_looks)
     unit = coefficient_unit(state.unit, chosen.unit)
     estimate: dict[str, Any] = {key: interval(float(fit.c[-1]), float(fit.sd[-1]), unit)}
+    if worth >= NET_LEAST:
+        weight, means, sds = state.posterior(chosen.values)
+        estimate[key] = mixture(weight, means[:, 0], sds[:, 0], unit)
     if cause == "cross_axis":
         estimate["other"] = chosen.name.removeprefix("axis_")
     return [Look(cause, gain, worth, estimate, {"regressors": (*state.regressors, chosen)})]
