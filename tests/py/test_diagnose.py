@@ -201,6 +201,24 @@ def test_a_jump_of_two_axes_is_no_motion_and_stands_where_it_is(tmp_path: Path) 
         assert abs(amplitude["median"] - size) < 3.0 * amplitude["sd"]
 
 
+def test_what_no_cause_explains_is_told_with_its_statistic(tmp_path: Path) -> None:
+    """White noise with an echo of itself 157 samples later, and with a line that sweeps; the third axis is clean."""
+    random = np.random.default_rng(8)
+    n = 3000
+    values = 0.1 * random.standard_normal((3, n))
+    values[0, 157:] += 0.35 * values[0, :-157]
+    turns = np.cumsum(np.linspace(0.05, 0.4, n))
+    values[1] += 0.05 * np.sin(2.0 * math.pi * turns)
+    axes = dict(zip(("gx", "gy", "gz"), values, strict=True))
+    save(tmp_path / "log.npz", {name: ("deg/s", row) for name, row in axes.items()}, 1.0)
+    document = diagnose(tmp_path / "log.npz")
+    for name, statistic in (("gx", "innovation_largest_correlation"), ("gy", "spectrogram_of_")):
+        (finding,) = document["axes"][name]["findings"]
+        assert finding["cause"] == "unexplained"
+        assert finding["estimate"]["statistic"].startswith(statistic)
+    assert document["axes"]["gz"]["verdict"] == "adequate"
+
+
 def test_the_gain_is_on_time_that_was_not_fitted(tmp_path: Path) -> None:
     """A line of known size: its frequency is looked for in the first half alone, and the second half is scored.
 

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.signal import fftconvolve
 from scipy.stats import norm, pearson3, skew
 from scipy.stats import t as student
 
+from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Matrices, matrices
@@ -24,6 +26,11 @@ ENSEMBLE = 48
 SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25}
+#: Lags at most at which an echo is looked for, lengths of a spectrogram's pieces, and places of a jump at most: longer
+#: records are looked at in blocks.
+ECHOES = 20_000
+SEGMENTS = (32, 128, 512)
+JUMP_PLACES = 20_000
 #: Lags of the correlation, roughly a factor 1.6 apart.
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 
@@ -39,8 +46,10 @@ class Statistic:
     p: float
 
 
-def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
-    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read."""
+def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None = None) -> dict[str, float]:
+    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read.
+
+    `response` [n]: of the residuals to a unit step of the bias; without it no jumps are looked for."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
@@ -50,12 +59,20 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
     sd = float(x.std())
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
-    power = _power(filled, min(1 + max(LAGS), n // 8))
-    lagged = _lagged(power, min(1 + max(LAGS), n // 8)) / math.sqrt(n)
+    reach = max(min(1 + max(LAGS), n // 8), min(ECHOES, n // 4))
+    power = _power(filled, reach)
+    lagged = _lagged(power, reach) / math.sqrt(n)
     for lag in LAGS:
-        if lag < lagged.size:
+        if lag < min(lagged.size, n // 8):
             found[f"innovation_lag{lag}"] = float(lagged[lag])
     found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
+    # A reading that repeats what was before, however long before.
+    found["innovation_largest_correlation"] = _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
+    for size in SEGMENTS:
+        if filled.size >= 4 * size:
+            found[f"spectrogram_of_{size}_samples"] = _uneven(np.clip(filled, -5.0, 5.0), size)
+    if response is not None:
+        found["jumps_of_the_bias"] = _jumps(np.clip(filled, -5.0, 5.0), response)
     clipped = np.clip(x, -12.0, 12.0)
     squared = clipped * clipped
     found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
@@ -120,6 +137,31 @@ def all_statistics(w: Array, y: Array | None, lsb: float) -> dict[str, float]:
         odd = int((codes & 1).sum())
         found["odd_even_codes"] = (codes.size - 2 * odd) / math.sqrt(codes.size) if 0 < odd < codes.size else 9.0
     return found
+
+
+def _uneven(x: Array, size: int) -> float:
+    """How unevenly the power lies over time and frequency: the mean square of the spectrogram's cells.
+
+    It is 2 for white noise. A line that wanders, or comes and goes, fills few cells. Pieces overlap by half."""
+    pieces = np.lib.stride_tricks.sliding_window_view(x, size)[:: size // 2]
+    cells = np.abs(rfft(pieces * np.hanning(size), axis=1)[:, 1:-1]) ** 2
+    cells /= cells.mean()
+    return (float((cells**2).mean()) - 2.0) * math.sqrt(cells.size / 20.0)
+
+
+def _jumps(x: Array, response: Array) -> float:
+    """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger."""
+    block = max(1, x.size // JUMP_PLACES)
+    count = x.size // block
+    x, g = (v[: count * block].reshape(count, block).sum(axis=1) for v in (x, response))
+    scores = fftconvolve(x, g[::-1], mode="full")[count - 1 :]
+    # A step near the end is known by few samples.
+    scores /= np.sqrt(np.cumsum(g**2)[::-1])
+    scores = scores[: max(50, count - count // 20)]
+    scores -= scores.mean()
+    forgets = 1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300)
+    squared = scores**2
+    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(max(count * forgets, 4.0) / 24.0)
 
 
 def _power(x: Array, count: int) -> Array:
@@ -213,12 +255,13 @@ def whitened_of(state: State, y: Array) -> Array:
 
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
     """Every statistic of the state against its band; the most striking first."""
-    measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb)
+    response = step.response_of(state.series, state.best)
+    measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
     random = np.random.default_rng(seed)
     rows: dict[str, list[float]] = {name: [] for name in measured}
     for _ in range(count):
         y = simulated(state, random)
-        for name, value in all_statistics(whitened_of(state, y), y, state.lsb).items():
+        for name, value in all_statistics(whitened_of(state, y), y, state.lsb, response).items():
             if name in rows:
                 rows[name].append(value)
     found: list[Statistic] = []
