@@ -42,7 +42,7 @@ ALIKE = 3.0
 P_UNEXPLAINED = 1e-3
 #: What is not so improbable is judged once more, by an ensemble that shows how long the tails are. With the first alone
 #: 4 of 1351 clean axes were called inadequate.
-P_CERTAIN, AGAIN = 1e-7, 240
+P_CERTAIN, AGAIN = 1e-12, 240
 
 
 @dataclass(frozen=True)

@@ -218,13 +218,14 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
 def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:
     """A posterior that is a sum of normals, `weight` of each not normalized, in the form of the contract."""
     sd = np.broadcast_to(np.asarray(sd, np.float64), mean.shape)
-    weight = weight / weight.sum()
+    held = weight > 1e-6 * weight.max()
+    weight, mean, sd = weight[held] / weight[held].sum(), mean[held], sd[held]
     middle = float(weight @ mean)
     spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
 
     def quantile(p: float) -> float:
         low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
-        for _ in range(60):
+        for _ in range(40):
             at = 0.5 * (low + high)
             low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
         return 0.5 * (low + high)

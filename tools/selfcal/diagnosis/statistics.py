@@ -31,6 +31,8 @@ LEAST_SPREAD = {"longest_repeat": 0.25}
 ECHOES = 20_000
 SEGMENTS = (32, 128, 512)
 JUMP_PLACES = 20_000
+#: Times at least that the drift forgets in a record in which jumps are looked for.
+TURNS_LEAST = 50.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 
@@ -71,8 +73,9 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None
     for size in SEGMENTS:
         if filled.size >= 4 * size:
             found[f"spectrogram_of_{size}_samples"] = _uneven(np.clip(filled, -5.0, 5.0), size)
-    if response is not None:
-        found["jumps_of_the_bias"] = _jumps(np.clip(filled, -5.0, 5.0), response)
+    jumps = None if response is None else _jumps(np.clip(filled, -5.0, 5.0), response)
+    if jumps is not None:
+        found["jumps_of_the_bias"] = jumps
     clipped = np.clip(x, -12.0, 12.0)
     squared = clipped * clipped
     found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
@@ -149,19 +152,23 @@ def _uneven(x: Array, size: int) -> float:
     return (float((cells**2).mean()) - 2.0) * math.sqrt(cells.size / 20.0)
 
 
-def _jumps(x: Array, response: Array) -> float:
-    """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger."""
+def _jumps(x: Array, response: Array) -> float | None:
+    """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
+
+    None where the drift forgets too seldom for a kurtosis."""
     block = max(1, x.size // JUMP_PLACES)
     count = x.size // block
     x, g = (v[: count * block].reshape(count, block).sum(axis=1) for v in (x, response))
+    forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
+    if forgets < TURNS_LEAST:
+        return None
     scores = fftconvolve(x, g[::-1], mode="full")[count - 1 :]
     # A step near the end is known by few samples.
     scores /= np.sqrt(np.cumsum(g**2)[::-1])
     scores = scores[: max(50, count - count // 20)]
     scores -= scores.mean()
-    forgets = 1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300)
     squared = scores**2
-    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(max(count * forgets, 4.0) / 24.0)
+    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(forgets / 24.0)
 
 
 def _power(x: Array, count: int) -> Array:
@@ -273,14 +280,14 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic
         # Student's t of a new value against the ensemble: its spread is known to 1/sqrt(2 count).
         z = (value - mean) / (sd * math.sqrt(1.0 + 1.0 / sample.size))
         freedom = sample.size - 1
-        if abs(z) >= 8.0:
-            p = 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
-        elif sample.size >= SKEWED:
+        if sample.size >= SKEWED:
             # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
             third = float(skew(sample))
             p = 2.0 * float(pearson3.sf(abs(z), math.copysign(third, third * z)))
-        else:
+        elif abs(z) < 8.0:
             p = 2.0 * float(student.sf(abs(z), freedom))
+        else:
+            p = 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
         half = float(student.isf(0.005, freedom)) * sd
         found.append(Statistic(name, value, mean - half, mean + half, p))
     return sorted(found, key=lambda one: one.p)
