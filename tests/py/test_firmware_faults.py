@@ -609,7 +609,7 @@ def test_another_rate_than_the_one_set(target: str, factor: float) -> None:
     times. Three are taken before it is seen, and once the clock is right again the module goes on."""
     board = quiet(target, seed=7)
     tap = Tap(board)
-    board.run(1.5)
+    board.run(1.45)  # a status is under way at 1.5 s, and a second sample waits
     right = board.sensor.period_us
     taken = len(tap.pushed)
     board.sensor.period_us = lambda: right() / factor

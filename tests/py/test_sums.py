@@ -26,7 +26,6 @@ from selfcal.result import in_unit
 from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
-from selfcal.verbs.replay import replay
 
 from agreement import (
     MODEL_OF_SUMS as MODEL,
@@ -322,8 +321,3 @@ def test_tables_for_the_firmware_compile_with_the_macro_alone(tmp_path: Path) ->
     refused = subprocess.run(command, check=False, capture_output=True, text=True)
     assert refused.returncode != 0
     assert "set SELFCAL_TERMS_MAX to 3" in refused.stderr
-
-
-def test_the_firmware_does_not_take_them() -> None:
-    with pytest.raises(UserError, match="telemetry has no items for flicker, moving_average, walk_and_markov;"):
-        replay(ROOT / "tests" / "data" / "simulated_adis16405.npz", model=MODEL.path)

@@ -42,7 +42,7 @@ class Problem:
     def terms(self, law: str, ln_theta: Floats) -> Terms:
         """The law at the logarithms of its parameters."""
         theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
-        return terms_of(self.group.laws[law], theta, self.dt_s)
+        return terms_of(NAMED[law], theta, self.dt_s)
 
     def starts(self, law: str) -> list[Floats]:
         """Where a search begins: moments of the record, and for Gauss-Markov three correlation times."""
