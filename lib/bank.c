@@ -267,7 +267,7 @@ static void place_nodes(selfcal_t *self) {
             }
             const selfcal_prior_t *prior = priors_of(model, hypothesis, axis);
             const bool markov = has_deviation(hypothesis->law);
-            const selfcal_prior_t *drift = &prior[markov ? SELFCAL_SIGMA_M : SELFCAL_K];
+            const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
             /* Where the drift hides the white noise a deviation beyond the last node may still count. A sum's likelihood, off which the

@@ -121,6 +121,11 @@ static inline bool has_deviation(const selfcal_law_t *law) {
     return has_drift(law) && !has_walk(law);
 }
 
+/* The place of the parameter that goes with rho. */
+static inline selfcal_parameter_t drift_parameter(const selfcal_law_t *law) {
+    return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
+}
+
 static inline bool has_decay(const selfcal_law_t *law) {
     return has_term(law, SELFCAL_MARKOV);
 }

@@ -65,11 +65,6 @@ static const selfcal_prior_t *prior_of(const selfcal_work_t *work) {
     return priors_of(work->bank->model, hypothesis_of(work), work->axis);
 }
 
-/* The drift parameter that goes with rho. */
-static selfcal_parameter_t drift_parameter(const selfcal_law_t *law) {
-    return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
-}
-
 /* ln(N) - ln(sigma_v). */
 static selfcal_real_t half_ln_dt(const selfcal_work_t *work) {
     return R(0.5) * r_log((selfcal_real_t)work->bank->model->dt_s);

@@ -220,7 +220,7 @@ static unsigned parameter_at(const selfcal_hypothesis_t *hypothesis, unsigned pl
 {
     switch (place) {
     case 0: return SELFCAL_N;
-    case 1: return hypothesis->rho == NULL ? NO_PARAMETER : has_walk(hypothesis->law) ? SELFCAL_K : SELFCAL_SIGMA_M;
+    case 1: return hypothesis->rho == NULL ? NO_PARAMETER : (unsigned)drift_parameter(hypothesis->law);
     default: return hypothesis->alpha == NULL ? NO_PARAMETER : SELFCAL_ALPHA;
     }
 }
