@@ -17,6 +17,8 @@
 #define r_log1p log1p
 #define r_sqrt sqrt
 #define r_fabs fabs
+#define r_sin sin
+#define r_cos cos
 #else
 #define R(x) (x##F)
 #define r_fma_exact fmaf
@@ -26,6 +28,8 @@
 #define r_log1p log1pf
 #define r_sqrt sqrtf
 #define r_fabs fabsf
+#define r_sin sinf
+#define r_cos cosf
 #endif
 
 /* r_fma() where one rounding less is welcome, r_fma_exact() where the product's error is the point. In software a fused

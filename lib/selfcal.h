@@ -305,6 +305,22 @@ typedef struct {
     const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
 } selfcal_hypothesis_t;
 
+/* Where a regressor's value comes from, for selfcal_form(). Times count from the first sample. */
+typedef enum {
+    SELFCAL_COLUMN_TIME = 0,    /* s */
+    SELFCAL_COLUMN_CHANNEL = 1, /* a channel; with a window its mean over that time up to the sample */
+    SELFCAL_COLUMN_RATE = 2,    /* what a channel gained over the window, per second */
+    SELFCAL_COLUMN_SINE = 3,    /* of a line */
+    SELFCAL_COLUMN_COSINE = 4,
+    SELFCAL_COLUMN_STEP = 5     /* 0, and 1 from a time on */
+} selfcal_column_kind_t;
+
+typedef struct {
+    selfcal_column_kind_t kind;
+    uint8_t channel; /* CHANNEL, RATE: an axis; from the model's `axes` on, a channel beside the readings */
+    float number;    /* CHANNEL, RATE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz; STEP: time, s */
+} selfcal_source_t;
+
 typedef struct selfcal_regressors_code selfcal_regressors_code_t;
 extern const selfcal_regressors_code_t selfcal_regressors_code;
 
@@ -317,6 +333,8 @@ typedef struct {
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
     const float *reference;      /* [count] value at which x0 alone is the bias */
     const float *coefficient_sd; /* [axes][count] prior N(0, sd^2), unit per unit of the regressor; 0: not for this axis */
+    const selfcal_source_t *source; /* [count] for selfcal_form(); NULL: the application makes the values by itself */
+    const float *ln_odds;           /* [count] ln of the prior odds that the regressor is in use; a cosine: 0 */
 } selfcal_regressors_t;
 
 typedef struct selfcal_forgetting_code selfcal_forgetting_code_t;
@@ -688,6 +706,46 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
  * sums finite and of the right sign. SELFCAL_CORRUPT: memory was overwritten, by a bug or by a fault; nothing but selfcal_init()
  * or selfcal_restore() should follow. SELFCAL_BAD_ARGUMENT on NULL. O(nodes * axes), no logarithm, no division. */
 selfcal_status_t selfcal_check(const selfcal_t *self);
+
+/* ------------------------------------------------------------------------------------------ values of regressors
+ * For a model whose regressors name their sources. The host's tools form the columns of a recording by the same code. */
+
+/* Bins that a window is held in. More: a finer edge of the window, 4 bytes each and column. */
+#ifndef SELFCAL_COLUMN_BINS
+#define SELFCAL_COLUMN_BINS 32U
+#endif
+
+/* Private; declared here so that the caller can place it. */
+typedef struct {
+    uint64_t step;        /* STEP: its sample; SINE, COSINE: 2^64 turns a sample */
+    uint32_t window, bin; /* samples */
+    uint32_t bins, in_bin;
+    float ring[SELFCAL_COLUMN_BINS + 2U];
+    float sum, first, last;
+} selfcal_trail_t;
+
+typedef struct {
+    const selfcal_model_t *model;
+    uint64_t samples; /* before the newest, missing ones too */
+    bool begun;
+    selfcal_trail_t trail[SELFCAL_REGRESSORS_MAX];
+} selfcal_former_t;
+
+/* Begin at the first sample.
+ * SELFCAL_BAD_ARGUMENT: null pointer, or regressors without sources. SELFCAL_BAD_MODEL: a source that cannot be formed. */
+selfcal_status_t selfcal_former_init(selfcal_former_t *self, const selfcal_model_t *model);
+
+/* Values of all regressors at a sample that follows `missing` absent ones, for selfcal_push_with().
+ * `channels`: the values beside the readings, as the sources count them; NULL if there are none.
+ * A channel that is not finite gives a value that is not finite. The bank keeps that sample out and counts it. */
+void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[], const float channels[], float values[]);
+
+/* Value of regressor k at the last bank sample that the sums hold: where the bias of a report with it in use stands. */
+float selfcal_regressor_last(const selfcal_t *self, uint8_t k);
+
+/* `samples` went by unseen before the next one. After a restart: the bank's counters `samples` plus `missing`.
+ * Times and lines go on; a window begins anew. */
+void selfcal_former_pass(selfcal_former_t *self, uint64_t samples);
 
 /* --------------------------------------------------------------------------------------------------------- snapshot
  * Everything a bank knows as a stream of bytes, the same on every machine (little-endian; format in snapshot.c), with a version and
@@ -1114,6 +1172,11 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
 /* The module's number on its bus, 0 to 11, from here on. SELFCAL_BAD_ARGUMENT beyond. SELFCAL_BUSY, and nothing changes,
  * while frames are still to be fetched. */
 selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node);
+
+/* Mean and sd of each column's coefficient over the laws of a report made with all of them in use. */
+void selfcal_mix_coefficients(const selfcal_report_t *report, const selfcal_model_t *model,
+                              const selfcal_coefficients_t coefficients[], float probability,
+                              selfcal_sent_coefficient_t sent[]);
 
 /* What the following reports tell of the regressors' coefficients on their axis, by column of the model. They must stay
  * as the report must. NULL, as at the start: nothing. */

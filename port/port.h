@@ -26,8 +26,9 @@ typedef struct {
     /* Time since start, ms, modulo 2^32. */
     uint32_t (*time_ms)(void *context);
 
-    /* Takes the oldest waiting sample: one reading per axis in the model's order and units, and how many samples are
-     * missing just before it. The port queues samples while a report is worked out. */
+    /* Takes the oldest waiting sample: one reading per axis in the model's order and units, then one per channel of the
+     * model (selfcal_model_channel_name). `missing`: how many samples are missing just before it. The port queues
+     * samples while a report is worked out. */
     port_sample_t (*sample)(void *context, float reading[], uint32_t *missing);
 
     /* Takes a frame for the wire, in order; false: no room, the same frame is offered again later. With nobody listening

@@ -12,7 +12,7 @@ from unicorn import arm_const as arm
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
 from .flash import Flash
-from .machine import NRF51822, SRAM, STM32F405, Core, Machine, SystemControl
+from .machine import NRF51822, STM32F405, Core, Machine, SystemControl
 from .nrf51 import Gpio as NrfGpio
 from .nrf51 import Gpiote, Nvmc, PowerClock, Spi0, Timer0, Uart0, Wdt
 from .nrf51 import Rng as NrfRng
@@ -128,7 +128,7 @@ class Board(Bench):
     def power_cycle(self, retained: bytes | None = None) -> None:
         """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
         machine = self.machine
-        machine.uc.mem_write(SRAM, machine.random.randbytes(machine.core.sram_bytes))
+        machine.scramble()
         if retained is not None:
             machine.uc.mem_write(self.SLOTS, retained)
         self.flash.cut_at = -1
@@ -210,7 +210,7 @@ class NrfBoard(Bench):
     def power_cycle(self, retained: bytes | None = None) -> None:
         """Off and on again; what memory holds then is chance, but for the flash, which may be given."""
         machine = self.machine
-        machine.uc.mem_write(SRAM, machine.random.randbytes(machine.core.sram_bytes))
+        machine.scramble()
         if retained is not None:
             machine.uc.mem_write(self.SLOTS, retained)
         self.flash.cut_at = -1

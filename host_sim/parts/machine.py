@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from unicorn.unicorn_py3.unicorn import UcContext
 
 SRAM = 0x20000000
+CCM = 0x10000000  # core-coupled memory: the STM32F405's DMA does not reach it
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,10 @@ class Core:
     long_slice: int
     fine: int
     turn: int
+    ccm_bytes: int = 0
 
 
-STM32F405 = Core(arm.UC_CPU_ARM_CORTEX_M4, 0x08000000, 0x100000, 0x20000, 16.0, 1500, 24_000, 100, 0)
+STM32F405 = Core(arm.UC_CPU_ARM_CORTEX_M4, 0x08000000, 0x100000, 0x20000, 16.0, 1500, 24_000, 100, 0, 0x10000)
 NRF51822 = Core(arm.UC_CPU_ARM_CORTEX_M0, 0, 0x40000, 0x8000, 16.0, 150, 2400, 20, 2)
 HANDLER_MOST = 400_000  # instructions a handler may take
 ACCESS_US = 0.03  # a peripheral access, about 5 cycles
@@ -134,7 +136,9 @@ class Machine:
         self.uc.mem_map(core.flash, core.flash_bytes)
         self.uc.mem_map(SRAM, core.sram_bytes)
         self.uc.mem_write(core.flash, b"\xff" * core.flash_bytes)
-        self.uc.mem_write(SRAM, self.random.randbytes(core.sram_bytes))  # what power-on leaves
+        if core.ccm_bytes:
+            self.uc.mem_map(CCM, core.ccm_bytes)
+        self.scramble()
         self.symbols: dict[str, int] = {}
         self._load(elf)
         self.uc.hook_add(UC_HOOK_INTR, self._interrupt_hook)
@@ -165,6 +169,12 @@ class Machine:
         for page in self._pages:
             self.uc.mmio_map(page, 0x1000, self._mmio_read, page, self._mmio_write, page)
         self._restart()
+
+    def scramble(self) -> None:
+        """What power-on leaves in the memories: chance."""
+        self.uc.mem_write(SRAM, self.random.randbytes(self.core.sram_bytes))
+        if self.core.ccm_bytes:
+            self.uc.mem_write(CCM, self.random.randbytes(self.core.ccm_bytes))
 
     def power_cycle(self) -> None:
         """Every event that was to come is void."""

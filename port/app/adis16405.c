@@ -1,5 +1,6 @@
 #include "adis16405.h"
 
+#include <math.h>
 #include <string.h>
 
 /* Registers. */
@@ -30,7 +31,10 @@ enum {
 #define ND 0x8000U
 #define EA 0x4000U
 #define VALUE 0x3FFFU
-enum { FIRST_CHANNEL = 1 }; /* after the supply */
+enum { SUPPLY_WORD = 0, FIRST_CHANNEL = 1, TEMPERATURE_WORD = 10 };
+
+/* With a side channel's 12 bits: it has been read. */
+#define SIDE_READ 0x8000U
 
 /* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no motion,
  * and with nothing to compare with what could be a negative reading is refused. */
@@ -333,6 +337,12 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
             return;
         }
     }
+    for (size_t i = 0; i < 2U; i++) {
+        const size_t word = i == 0U ? SUPPLY_WORD : TEMPERATURE_WORD;
+        if (((words[word] ^ self->first_words[word]) & VALUE) == 0U) {
+            self->side[i] = (uint16_t)(SIDE_READ | (words[word] & 0xFFFU));
+        }
+    }
     const uint32_t head = self->head;
     if (head - self->tail == ADIS16405_QUEUE) {
         self->counters.overruns++;
@@ -347,6 +357,18 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 }
 
 /* --------------------------------------------------------------------------------------------------------- main loop */
+
+float adis16405_temperature(const adis16405_t *self)
+{
+    const uint32_t side = self->side[1]; /* 12 bits, two's complement, 0.14 degC each, 0 at 25 degC */
+    return (side & SIDE_READ) != 0U ? 25.0F + 0.14F * (float)((int32_t)((side & 0xFFFU) ^ 0x800U) - 0x800) : NAN;
+}
+
+float adis16405_supply(const adis16405_t *self)
+{
+    const uint32_t side = self->side[0]; /* 12 bits, 2.418 mV each */
+    return (side & SIDE_READ) != 0U ? 2.418e-3F * (float)(side & 0xFFFU) : NAN;
+}
 
 /* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died is left. */
 static void hold(adis16405_t *self)

@@ -127,6 +127,7 @@ typedef struct {
     uint8_t marks;         /* resets that left MARK */
     bool based;            /* `base` is known */
     int16_t last[ADIS16405_AXES];
+    volatile uint16_t side[2]; /* supply and temperature, as read; 0: none yet */
     uint32_t off_rate;     /* readings in a row whose distance in time from the one before is no whole number of periods */
     uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
@@ -169,5 +170,10 @@ bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], fl
 
 /* The oldest waiting sample, deg/s and m/s^2, and the samples missing before it; false: none is waiting. */
 bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing);
+
+/* The sensor's temperature, degC, and supply, V, of the newest sample that was taken. NaN before the first sample.
+ * If the two readings of a burst differ, the value before stands. */
+float adis16405_temperature(const adis16405_t *self);
+float adis16405_supply(const adis16405_t *self);
 
 #endif

@@ -25,6 +25,21 @@ unsigned port_axis(const char *name)
     return at;
 }
 
+/* The regressors' values go on from what the bank has seen. */
+static void begin_columns(app_t *app)
+{
+#if SELFCAL_MODEL_REGRESSORS > 0
+    const selfcal_counters_t *seen = selfcal_counters(&app->bank);
+    (void)selfcal_former_init(&app->former, &selfcal_model);
+    selfcal_former_pass(&app->former, seen->samples + seen->missing);
+#if APP_CORRECTED_MS
+    memset(app->used, 0, sizeof app->used);
+#endif
+#else
+    (void)app;
+#endif
+}
+
 selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
 {
     memset(app, 0, sizeof *app);
@@ -35,6 +50,7 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
     if (status != SELFCAL_OK) {
         return status;
     }
+    begin_columns(app);
 #if APP_COMMANDS
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         app->bias[axis] = NAN;
@@ -91,6 +107,7 @@ static void restore(app_t *app)
             const uint64_t block = app->bank.block, past = (app->bank.position + module->save_gap) % block;
             (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
             (void)tell_sensor(app);
+            begin_columns(app);
             app->told.state_found = older == 0 ? SELFCAL_STATUS_STATE_FOUND_NEWEST : SELFCAL_STATUS_STATE_FOUND_OLDER;
             app->restored = true;
             return;
@@ -141,6 +158,7 @@ static void save(app_t *app, uint32_t now)
     const uint32_t count = app->restored ? absent(app) : 0U;
     if (count > 0U) {
         pass(app, count);
+        begin_columns(app);
     }
     app->saved_ms = now;
     /* The state in use is the one to be kept, though the newest be whole: start-up may have refused that as another model's. */
@@ -201,7 +219,7 @@ static void leave_out_retired(app_t *app)
 #endif
 
 /* By the rule at selfcal_push_moving(). */
-static void give(app_t *app, const float reading[])
+static void give(app_t *app, const float reading[], const float values[])
 {
 #if SELFCAL_MODEL_GATE
     if (app->gated) {
@@ -218,7 +236,7 @@ static void give(app_t *app, const float reading[])
         }
     }
 #endif
-    (void)selfcal_push(&app->bank, reading); /* what it rejects it counts */
+    (void)selfcal_push_with(&app->bank, reading, values); /* what it rejects it counts */
 }
 
 #if APP_CORRECTED_MS
@@ -231,7 +249,8 @@ static bool stuck(const app_t *app, uint8_t axis)
 
 static bool take_sample(app_t *app)
 {
-    float reading[SELFCAL_MODEL_AXES];
+    float reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS];
+    const float *values = NULL;
     uint32_t missing = 0;
     switch (app->port->sample(app->port->context, reading, &missing)) {
     case PORT_SAMPLE:
@@ -242,11 +261,20 @@ static bool take_sample(app_t *app)
         if (missing > 0) {
             pass(app, missing);
         }
-        give(app, reading);
+#if SELFCAL_MODEL_REGRESSORS > 0
+        float formed[SELFCAL_MODEL_REGRESSORS];
+        const float *channels = SELFCAL_MODEL_CHANNELS > 0U ? reading + SELFCAL_MODEL_AXES : NULL;
+        selfcal_form(&app->former, missing, reading, channels, formed);
+        values = formed;
+#if APP_CORRECTED_MS
+        memcpy(app->values, formed, sizeof formed);
+#endif
+#endif
+        give(app, reading, values);
         app->fresh = true;
 #if APP_CORRECTED_MS
         app->passed += (uint64_t)missing + 1U;
-        memcpy(app->reading, reading, sizeof reading);
+        memcpy(app->reading, reading, sizeof app->reading);
         app->reading_ms = app->port->time_ms(app->port->context);
         app->newer = true;
 #endif
@@ -392,6 +420,7 @@ static uint8_t forget(app_t *app)
         app->has_report[axis] = false;
 #endif
     }
+    begin_columns(app);
     app->fresh = false;
     app->restored = false;
 #if SELFCAL_MODEL_GATE
@@ -551,6 +580,61 @@ static bool advance(app_t *app)
     return true;
 }
 
+#if SELFCAL_MODEL_REGRESSORS > 0
+/* ln evidence of a report over its laws, weighed by their priors. */
+static selfcal_wide_t ln_evidence(const selfcal_report_t *report)
+{
+    selfcal_wide_t top = -(selfcal_wide_t)INFINITY, sum = 0.0, each[SELFCAL_MODEL_HYPOTHESES];
+    for (uint8_t h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
+        each[h] = report->hypothesis[h].ln_evidence + (selfcal_wide_t)selfcal_model.hypothesis[h].ln_probability;
+        top = each[h] > top ? each[h] : top;
+    }
+    for (uint8_t h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
+        sum += isfinite(top) && each[h] > top - 700.0 ? exp(each[h] - top) : 0.0;
+    }
+    return top + log(sum);
+}
+
+/* The report without regressors is followed by one with all that the axis has. The likelier of both is sent, with the
+ * probability of the second. Returns true if the second has begun. */
+static bool weigh(app_t *app)
+{
+    const uint8_t axis = app->report.axis;
+    const float *sd = &selfcal_model.regressors->coefficient_sd[(size_t)axis * SELFCAL_MODEL_REGRESSORS];
+    uint8_t mask = 0;
+    selfcal_wide_t odds = 0.0;
+    for (uint8_t k = 0; k < SELFCAL_MODEL_REGRESSORS; k++) {
+        if (sd[k] > 0.0F) {
+            mask |= (uint8_t)(1U << k);
+            odds += (selfcal_wide_t)selfcal_model.regressors->ln_odds[k];
+        }
+    }
+    if (!app->with) {
+        app->ln_without = ln_evidence(&app->report);
+        app->with = mask != 0U && selfcal_report_begin_subset(&app->work, &app->bank, axis, mask, app->coefficients,
+                                                              &app->report_with) == SELFCAL_OK;
+        selfcal_telemetry_coefficients(&app->telemetry, NULL);
+        return app->with;
+    }
+    app->with = false;
+    const selfcal_wide_t gain = odds + ln_evidence(&app->report_with) - app->ln_without;
+    const float probability = isfinite(gain) ? (float)(1.0 / (1.0 + exp(gain < -700.0 ? 700.0 : -gain))) : 0.0F;
+    selfcal_mix_coefficients(&app->report_with, &selfcal_model, app->coefficients, probability, app->sent);
+    selfcal_telemetry_coefficients(&app->telemetry, app->sent);
+    if (probability > 0.5F) {
+        app->report = app->report_with;
+    }
+#if APP_CORRECTED_MS
+    for (uint8_t k = 0; k < SELFCAL_MODEL_REGRESSORS; k++) {
+        const bool used = probability > 0.5F && (mask >> k & 1U) != 0U && isfinite(app->sent[k].mean);
+        app->used[axis][k] = used ? app->sent[k].mean : 0.0F;
+        app->rested[axis][k] = selfcal_regressor_last(&app->bank, k);
+    }
+#endif
+    return false;
+}
+#endif
+
 static bool compute(app_t *app)
 {
 #if APP_CORRECTED_MS
@@ -558,10 +642,20 @@ static bool compute(app_t *app)
         app->gathered_at = app->passed - app->bank.position;
     }
 #endif
+#if SELFCAL_MODEL_REGRESSORS > 0
+    const selfcal_status_t status = selfcal_report_step(&app->work, app->with ? &app->report_with : &app->report);
+#else
     const selfcal_status_t status = selfcal_report_step(&app->work, &app->report);
+#endif
     if (status == SELFCAL_BUSY) {
         return true;
     }
+#if SELFCAL_MODEL_REGRESSORS > 0
+    if (status == SELFCAL_OK && weigh(app)) {
+        return true;
+    }
+    app->with = false;
+#endif
     app->computing = false;
     app->worked_out = status == SELFCAL_OK;
 #if APP_CORRECTED_MS
@@ -589,6 +683,11 @@ static void correct(app_t *app)
         if (app->has_report[axis] && !selfcal_retired(&app->bank, axis) && !stuck(app, axis)) {
             (void)selfcal_predict(&app->last_report[axis], &selfcal_model, (float)since / SELFCAL_MODEL_RATE_HZ, &bias, &sd);
         }
+#if SELFCAL_MODEL_REGRESSORS > 0
+        for (uint8_t k = 0; k < SELFCAL_MODEL_REGRESSORS; k++) { /* the report's bias holds for the values at its end */
+            bias += app->used[axis][k] * (app->values[k] - app->rested[axis][k]);
+        }
+#endif
         app->corrected.value[axis] = app->reading[axis] - bias;
         app->corrected.sd[axis] = sd;
     }

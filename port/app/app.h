@@ -13,9 +13,6 @@
 #include "selfcal.h"
 #include "selfcal_model.h" /* made by `selfcal codegen` */
 
-#if SELFCAL_MODEL_REGRESSORS > 0
-#error "this application gives its bank no regressors"
-#endif
 #if SELFCAL_MODEL_HYPOTHESES > 8
 #error "telemetry carries eight hypotheses at most"
 #endif
@@ -103,6 +100,19 @@ typedef struct {
     selfcal_t bank;
     selfcal_work_t work;
     selfcal_report_t report;
+#if SELFCAL_MODEL_REGRESSORS > 0
+    selfcal_former_t former;
+    bool with;                 /* the report under way has all regressors of the axis in use */
+    selfcal_wide_t ln_without; /* ln evidence of the report without, over the laws */
+    selfcal_report_t report_with;
+    selfcal_coefficients_t coefficients[SELFCAL_MODEL_HYPOTHESES];
+    selfcal_sent_coefficient_t sent[SELFCAL_MODEL_REGRESSORS];
+#if APP_CORRECTED_MS
+    float values[SELFCAL_MODEL_REGRESSORS];                     /* at the newest sample */
+    float used[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS];   /* coefficients of each axis's last report; 0: unused */
+    float rested[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS]; /* the values for which its bias holds */
+#endif
+#endif
     selfcal_wide_t memory[(SELFCAL_MODEL_BYTES + sizeof(selfcal_wide_t) - 1U) / sizeof(selfcal_wide_t)];
 } app_t;
 

@@ -1,5 +1,7 @@
 #include "sensor.h"
 
+#include <string.h>
+
 /* Two bursts, 634 us, must fit a sample period. */
 typedef char the_rate_can_be_read[(int)SELFCAL_MODEL_RATE_HZ < 1000 ? 1 : -1];
 /* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no quotient of floats.) */
@@ -8,6 +10,9 @@ static const int the_sensor_makes_the_rate = 1 / ADIS16405_HAS_RATE(SELFCAL_MODE
 static adis16405_t sensor;
 static volatile bool listening;             /* a sensor that was not reset with the processor is ready before the driver is */
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
+#if SELFCAL_MODEL_CHANNELS > 0
+static bool is_supply[SELFCAL_MODEL_CHANNELS]; /* else temperature */
+#endif
 
 bool sensor_init(const adis16405_bus_t *bus)
 {
@@ -18,6 +23,11 @@ bool sensor_init(const adis16405_bus_t *bus)
         }
         channel[axis] = (uint8_t)at;
     }
+#if SELFCAL_MODEL_CHANNELS > 0
+    for (size_t i = 0; i < SELFCAL_MODEL_CHANNELS; i++) {
+        is_supply[i] = strcmp(selfcal_model_channel_name[i], "supply") == 0;
+    }
+#endif
     const adis16405_config_t config = {SELFCAL_MODEL_RATE_HZ, 300, 1};
     listening = the_sensor_makes_the_rate != 0 && adis16405_init(&sensor, bus, &config);
     return listening;
@@ -55,6 +65,11 @@ port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing)
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         reading[axis] = all[channel[axis]];
     }
+#if SELFCAL_MODEL_CHANNELS > 0
+    for (size_t i = 0; i < SELFCAL_MODEL_CHANNELS; i++) {
+        reading[SELFCAL_MODEL_AXES + i] = is_supply[i] ? adis16405_supply(&sensor) : adis16405_temperature(&sensor);
+    }
+#endif
     return PORT_SAMPLE;
 }
 

@@ -6,6 +6,10 @@
 #include "port.h"
 #include "selfcal_model.h"
 
+#if !SELFCAL_MODEL_CHANNELS_READ
+#error "the sensor's side channels are temp in degC and supply in V: the regressors of the model take another"
+#endif
+
 /* How its SPI is clocked at the model's rate, and what lies between two frames. */
 #define SENSOR_SCK_MAX_HZ ADIS16405_SCK_MAX_HZ(SELFCAL_MODEL_RATE_HZ)
 #define SENSOR_STALL_US ADIS16405_STALL_US(SELFCAL_MODEL_RATE_HZ)

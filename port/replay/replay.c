@@ -23,6 +23,9 @@ const char *replay_open(replay_t *replay)
     if (little32(header + 8) != SELFCAL_MODEL_AXES) {
         return "its axes are not those of the model built in";
     }
+    if (little32(header + 12) != SELFCAL_MODEL_CHANNELS) {
+        return "its channels are not those of the model built in";
+    }
     const uint64_t rate = little64(header + 16);
     memcpy(&replay->rate_hz, &rate, sizeof rate);
     const double ratio = (double)selfcal_model.dt_s * replay->rate_hz / (double)selfcal_model.block;
@@ -55,9 +58,9 @@ port_sample_t replay_sample(replay_t *replay, float reading[], uint32_t *missing
     }
     replay->waiting = false;
     *missing = little32(replay->row);
-    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        const uint32_t bits = little32(replay->row + 4 + 4 * axis);
-        memcpy(&reading[axis], &bits, sizeof bits);
+    for (size_t i = 0; i < SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS; i++) {
+        const uint32_t bits = little32(replay->row + 4 + 4 * i);
+        memcpy(&reading[i], &bits, sizeof bits);
     }
     return PORT_SAMPLE;
 }

@@ -4,6 +4,7 @@
 #include "stm32f405.h"
 
 extern uint32_t link_stack[], link_data_load[], link_data[], link_data_end[], link_bss[], link_bss_end[];
+extern uint32_t link_ccm[], link_ccm_end[];
 
 enum { FAULT_MAGIC = 0x5EFA0177 };
 
@@ -69,6 +70,9 @@ void startup(void)
         *to = *from++;
     }
     for (uint32_t *to = link_bss; to < link_bss_end; to++) {
+        *to = 0;
+    }
+    for (uint32_t *to = link_ccm; to < link_ccm_end; to++) {
         *to = 0;
     }
     (void)main();

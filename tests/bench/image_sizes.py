@@ -196,7 +196,7 @@ class Image:
 
     def ram(self) -> int:
         """Bytes of RAM that variables take."""
-        return sum(size for name, size in self.sections.items() if name in (".data", ".bss", ".kept"))
+        return sum(size for name, size in self.sections.items() if name in (".data", ".bss", ".ccm", ".kept"))
 
     def deepest(self, start: int, calls: Mapping[str, list[str]]) -> tuple[int, list[str]]:
         """Bytes of the deepest path from a function, and the names along it. Raises FirmwareError."""

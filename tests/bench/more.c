@@ -120,7 +120,7 @@ static void measure_columns(const char *name, uint8_t columns, bool fast) {
         sd[k] = 1.0F;
     }
     selfcal_model_t model = record_narrow_model(fast, axis);
-    const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd};
+    const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd, NULL, NULL};
     model.regressors = columns > 0U ? &regressors : NULL;
     while (model.hypothesis->law->terms == 0U || model.hypothesis->law->term[0].kind != SELFCAL_WALK) {
         model.hypothesis++;

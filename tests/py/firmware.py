@@ -142,7 +142,7 @@ class Tap:
         self.intervals: list[int] = []  # place of the last sample of each bank sample
         self._missing = 0
         hooks = {
-            "selfcal_push": self._push,
+            "selfcal_push_with": self._push,
             "selfcal_push_moving": self._move,
             "selfcal_skip": self._skip,
             "selfcal_gate_push": self._see,

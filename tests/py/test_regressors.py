@@ -25,7 +25,6 @@ from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
-from selfcal.verbs.replay import replay
 
 from agreement import (
     MODEL as PLAIN_MODEL,
@@ -240,9 +239,6 @@ def test_identify_finds_what_is_in_the_record(tmp_path: Path) -> None:
             assert ours["sd"] == pytest.approx(exact["sd"], rel=0.03)
 
 
-def test_the_firmware_takes_no_regressors(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="gives its bank no regressors"):
-        replay(tmp_path / "log.csv", model=model_file(tmp_path, ENTRIES))
 
 
 def test_a_temperature_that_is_not_there_is_said(tmp_path: Path) -> None:

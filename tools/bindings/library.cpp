@@ -80,7 +80,8 @@ public:
             std::tie(reference_, coefficient_sd_) = *regressors;
             if (reference_.size() > SELFCAL_REGRESSORS_MAX || coefficient_sd_.size() != axes_.size() * reference_.size())
                 throw std::invalid_argument("regressors need a reference each and a prior for every axis");
-            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(), coefficient_sd_.data()};
+            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(), coefficient_sd_.data(),
+                           nullptr, nullptr};
             model_.regressors = &regressors_;
         }
         forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
@@ -400,6 +401,39 @@ private:
     selfcal_gate_t gate_{};
 };
 
+using SourceTuple = std::tuple<int, int, float>; // kind, channel, number
+
+// The values [n, sources] of regressors over channels [n, c], after missing_before [n] samples each.
+static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s, const Rows &channels,
+                                          const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before) {
+    std::vector<selfcal_source_t> sources;
+    for (const auto &[kind, channel, number] : tuples) {
+        if (channel < 0 || static_cast<size_t>(channel) >= std::max<size_t>(channels.shape(1), 1))
+            throw std::invalid_argument("a source is no channel");
+        sources.push_back({static_cast<selfcal_column_kind_t>(kind), static_cast<uint8_t>(channel), number});
+    }
+    const size_t n = missing_before.shape(0), p = sources.size();
+    if (channels.shape(0) != n || p == 0 || p > SELFCAL_REGRESSORS_MAX)
+        throw std::invalid_argument("channels must be [n, c] and missing_before [n]");
+    selfcal_regressors_t regressors{};
+    regressors.count = static_cast<uint8_t>(p);
+    regressors.source = sources.data();
+    selfcal_model_t model{};
+    model.dt_s = static_cast<float>(interval_s);
+    model.block = 1;
+    model.regressors = &regressors;
+    selfcal_former_t former;
+    if (selfcal_former_init(&former, &model) != SELFCAL_OK)
+        throw std::invalid_argument("sources cannot be");
+    auto *values = new float[n * p + 1];
+    nb::capsule owner(values, [](void *v) noexcept { delete[] static_cast<float *>(v); });
+    for (size_t i = 0; i < n; i++)
+        selfcal_form(&former, static_cast<uint32_t>(std::min<uint64_t>(missing_before.data()[i], UINT32_MAX)), nullptr,
+                     channels.data() + i * channels.shape(1), values + i * p);
+    const size_t shape[] = {n, p};
+    return {values, 2, shape, owner};
+}
+
 } // namespace MODULE_NAME
 
 NB_MODULE(MODULE_NAME, m) {
@@ -442,6 +476,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def_prop_ro("weight", &Bank::weight)
         .def_prop_ro("nodes", &Bank::nodes)
         .def_prop_ro("size", &Bank::size);
+    m.def("form", &MODULE_NAME::form);
     using MODULE_NAME::Gate;
     nb::class_<Gate>(m, "Gate")
         .def(nb::init<uint32_t, float, uint32_t, uint32_t, uint32_t, const std::vector<float> &, const std::vector<bool> &>())

@@ -11,11 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.model import Model, Regressor
-from selfcal.recording import Recording
+from selfcal.recording import Recording, as_float
 from selfcal.result import AxisResult
 
+#: `selfcal_column_kind_t`.
+_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP = range(6)
+#: Standard deviations from the mean to the 95 % quantile of a normal.
+HALF_90 = 1.6448536269514722
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -57,46 +62,63 @@ class Scored:
 
 
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
-    """float64[n, p]: every column of `regressors`, in the unit of each, at every row of the recording.
+    """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    Time is that since the first row, s. A column with a `window_s` is the mean over that time up to each row. A step is
-    1 from its time on. A rate is what the channel gained over the last `window_s`, in the first window what it gained
-    since the first row, over `window_s`. None needs a later value, so that a module can form them. Raises UserError for
-    a column that is absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. Time counts from the first row, s. A column with
+    a `window_s` is the mean over that time up to each row. A step is 1 from its time on. A rate is the channel's gain
+    over the last `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a
+    column that is absent or of another kind.
     """
-    found = [column for one in regressors for column in _columns(one, recording)]
-    return np.ascontiguousarray(np.column_stack(found)) if found else np.empty((recording.samples, 0))
+    if not regressors:
+        return np.empty((recording.samples, 0))
+    check_channels(regressors, recording)
+    channels = channels_of(regressors)
+    values = [as_float(recording.in_unit(name, unit)) for name, unit in channels]
+    rows = np.ascontiguousarray(np.column_stack(values) if values else np.empty((recording.samples, 0), np.float32))
+    sources = [source for one in regressors for source in sources_of(one, channels)]
+    missing = np.ascontiguousarray(recording.missing_before, np.uint64)
+    formed = _library32.form(sources, 1.0 / recording.rate_hz, rows, missing)
+    return np.ascontiguousarray(formed, np.float64)
 
 
-def _columns(one: Regressor, recording: Recording) -> list[NDArray[np.float64]]:
-    t = recording.time_s
+def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
+    """Raise UserError for a channel of the regressors that the recording has not."""
+    for name, _ in channels_of(regressors):
+        if name not in recording.columns:
+            needs = next(one.name for one in regressors if one.column == name)
+            raise UserError(
+                f"{recording.path}: there is no column '{name}', which the model's regressor '{needs}' needs "
+                f"(there are {', '.join(recording.columns)})"
+            )
+
+
+def channels_of(regressors: Sequence[Regressor]) -> list[tuple[str, str]]:
+    """Name and unit of every recorded channel that the regressors take, each once."""
+    named = ((one.column, one.unit.removesuffix("/s")) for one in regressors if one.kind == "rate")
+    plain = ((one.column, one.unit) for one in regressors if one.kind == "column")
+    return list(dict.fromkeys((*plain, *named)))
+
+
+def sources_of(one: Regressor, channels: Sequence[tuple[str, str]]) -> list[tuple[int, int, float]]:
+    """Kind, channel and number of each of its columns: `selfcal_source_t`."""
     if one.kind == "time":
-        return [t]
+        return [(_TIME, 0, 0.0)]
     if one.kind == "step":
-        return [(t >= one.time_s).astype(np.float64)]
+        return [(_STEP, 0, one.time_s)]
     if one.kind == "periodic":
-        turns = np.mod(one.frequency_hz * t, 1.0)
-        return [np.sin(2.0 * math.pi * turns), np.cos(2.0 * math.pi * turns)]
-    if one.column not in recording.columns:
-        raise UserError(
-            f"{recording.path}: there is no column '{one.column}', which the model's regressor '{one.name}' needs "
-            f"(there are {', '.join(recording.columns)})"
-        )
-    values = recording.in_unit(one.column, one.unit.removesuffix("/s") if one.kind == "rate" else one.unit)
-    if one.kind == "column":
-        return [trailing_mean(values, 1 if math.isnan(one.window_s) else round(one.window_s * recording.rate_hz))]
-    return [(values - np.interp(t - one.window_s, t, values)) / one.window_s]
+        return [(_SINE, 0, one.frequency_hz), (_COSINE, 0, one.frequency_hz)]
+    if one.kind == "rate":
+        return [(_RATE, channels.index((one.column, one.unit.removesuffix("/s"))), one.window_s)]
+    return [(_CHANNEL, channels.index((one.column, one.unit)), 0.0 if math.isnan(one.window_s) else one.window_s)]
 
 
 def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """float64[n]: mean of the last `window` values at each, of fewer at the beginning: a module can form it too."""
+    """float64[n]: mean of the last `window` values at each, of fewer at the beginning, as a module forms it."""
     if window <= 1:
         return values
-    offset = values[0]
-    total = np.concatenate([[0.0], np.cumsum(values - offset)])
-    end = np.arange(1, values.size + 1)
-    start = np.maximum(end - window, 0)
-    return np.asarray((total[end] - total[start]) / (end - start) + offset)
+    rows = np.ascontiguousarray(values[:, None], np.float32)
+    formed = _library32.form([(_CHANNEL, 0, float(window))], 1.0, rows, np.zeros(values.size, np.uint64))
+    return np.asarray(formed[:, 0], np.float64)
 
 
 def offered(model: Model, axis: str) -> Choice:
@@ -129,10 +151,10 @@ def combine(
     """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
     from scipy.special import logsumexp
 
-    ln_prior = np.array([_ln_prior(choices[-1], choice) for choice in choices])
+    ln_before = np.array([ln_prior(choices[-1], choice) for choice in choices])
     ln_law = np.log([hypotheses[law] for law in hypotheses])
     evidence = np.array([[result.log_evidence[law] for law in hypotheses] for result in results])
-    joint = ln_prior[:, None] + ln_law[None, :] + evidence
+    joint = ln_before[:, None] + ln_law[None, :] + evidence
     weight = np.exp(joint - logsumexp(joint))  # [subsets, laws]
     of_law, of_choice = weight.sum(axis=0), weight.sum(axis=1)
     mean = np.array([result.bias_mean if math.isfinite(result.bias_mean) else 0.0 for result in results])
@@ -140,7 +162,7 @@ def combine(
     bias = float(of_choice @ mean)
     combined = AxisResult(
         results[0].n,
-        {law: float(logsumexp(ln_prior + evidence[:, k])) for k, law in enumerate(hypotheses)},
+        {law: float(logsumexp(ln_before + evidence[:, k])) for k, law in enumerate(hypotheses)},
         {law: float(of_law[k]) for k, law in enumerate(hypotheses)},
         {law: results[int(np.argmax(joint[:, k]))].parameters[law] for k, law in enumerate(hypotheses)},
         bias,
@@ -164,8 +186,14 @@ def combine(
     return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
 
 
-def _ln_prior(regressors: Choice, choice: Choice) -> float:
+def ln_prior(regressors: Choice, choice: Choice) -> float:
+    """ln of the prior probability that of `regressors` those of the `choice` are in use, and no other."""
     return sum(math.log(one.probability if one in choice else 1.0 - one.probability) for one in regressors)
+
+
+def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coefficient:
+    """One whose posterior is normal."""
+    return Coefficient(column, unit, mean, sd, mean - HALF_90 * sd, mean, mean + HALF_90 * sd)
 
 
 def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:

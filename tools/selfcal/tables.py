@@ -14,6 +14,7 @@ from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
 from selfcal.model import Group, Model, Regressor
+from selfcal.regressors import channels_of, sources_of
 from selfcal.units import same_kind
 
 #: Hz; beyond these the bank interval has no meaning for a drift.
@@ -69,12 +70,17 @@ class AxisTable:
 
 @dataclass(frozen=True)
 class RegressorTable:
-    """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not."""
+    """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
+
+    `source`: kind and number (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds`: prior
+    odds that the regressor is in use; 0 for a second column of it."""
 
     name: str
     unit: str
     reference: float
     coefficient_sd: tuple[float, ...]
+    source: tuple[int, float, str, str] = (0, 0.0, "", "")
+    ln_odds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,13 @@ class Tables:
     def nodes(self) -> int:
         """Filters of all hypotheses."""
         return sum(h.nodes for h in self.hypotheses)
+
+    @property
+    def channels(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of what the regressors take beside the readings of these axes."""
+        axes = {(axis.name, axis.unit) for axis in self.axes}
+        taken = dict.fromkeys(column.source[2:] for column in self.regressors if column.source[2])
+        return tuple(one for one in taken if one not in axes)
 
     @property
     def term_nodes(self) -> int:
@@ -251,9 +264,16 @@ def make_tables(
             for name, probability in model.hypotheses.items()
         ),
         regressors=tuple(
-            RegressorTable(column, one.unit, one.reference, tuple(_coefficient_sd(model, one, name) for name in names))
+            RegressorTable(
+                column,
+                one.unit,
+                one.reference,
+                tuple(_coefficient_sd(model, one, name) for name in names),
+                _source(one, place),
+                math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0,
+            )
             for one in model.regressors
-            for column in one.columns
+            for place, column in enumerate(one.columns)
         ),
         half_life_s=model.half_life_s,
     )
@@ -264,6 +284,13 @@ def _priors(group: Group, law: str) -> tuple[tuple[float, float, bool], ...]:
     of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
     chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
     return tuple((math.log(p.min), math.log(p.max), p.law == "uniform") for p in chosen)
+
+
+def _source(regressor: Regressor, place: int) -> tuple[int, float, str, str]:
+    """Of a column by its place in the regressor."""
+    channels = channels_of((regressor,))
+    kind, _, number = sources_of(regressor, channels)[place]
+    return kind, number, *(channels[0] if channels else ("", ""))
 
 
 def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:

@@ -22,6 +22,8 @@ from selfcal.regressors import trailing_mean
 WIDE = 5.0
 #: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
 NODES = [24, 20]
+#: ... on the Cortex-M0, whose RAM holds one such law beside the random walk.
+SMALL_NODES = [12, 8]
 #: Windows of a channel's trailing mean, s.
 WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
@@ -45,6 +47,7 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
                 group["lsb"] = _digits(estimate["lsb"]["median"])
             elif finding.look.cause == "saturation":
                 group["range"] = _digits(abs(estimate["limit"]["median"]))
+    _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
     colored = any(one.state.extras.color for one in found.values())
     tree["simulate"] = {
@@ -54,6 +57,16 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
+
+
+def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
+    """Fewer nodes on the Cortex-M0 where its RAM needs them: beside a second column, or a law that is a sum."""
+    columns = sum(2 if entry["kind"] == "periodic" else 1 for entry in regressors)
+    nodes = tree["nodes"]
+    if "cortex-m0" in nodes and "cortex-m0-small" in nodes:
+        plain = ("random_walk", "gauss_markov")
+        if columns > 1 or any(law not in plain for law in nodes["cortex-m0"]):
+            nodes["cortex-m0"].update({law: nodes["cortex-m0-small"][law] for law in plain})
 
 
 def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> list[dict[str, Any]]:
@@ -119,7 +132,8 @@ def _law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any
     """Have the model one law more, with a prior of its parameter in every group and nodes on every target."""
     tree["hypotheses"].setdefault(law, 1)
     for target, nodes in tree["nodes"].items():
-        nodes.setdefault(law, NODES if target == "host" else list(nodes["gauss_markov"]))
+        own = {"host": NODES, "cortex-m0": SMALL_NODES}.get(target, nodes["gauss_markov"])
+        nodes.setdefault(law, list(own))
     for group in tree["groups"].values():
         own = dict(group["priors"]["sigma_m"]) if parameter == "B" else dict(prior)
         group["priors"].setdefault(parameter, own)

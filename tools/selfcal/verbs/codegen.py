@@ -11,7 +11,7 @@ from rich.console import Console
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.output import whole
-from selfcal.tables import AxisTable, Grid, HypothesisTable, Tables, gate_table, make_tables
+from selfcal.tables import AxisTable, Grid, HypothesisTable, RegressorTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in kernel_fixed.c.
@@ -74,6 +74,10 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_AXES {axes}U
 #define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
 #define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
+/* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units{_units(tables)}. */
+#define SELFCAL_MODEL_CHANNELS {len(tables.channels)}U
+/* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
+#define SELFCAL_MODEL_CHANNELS_READ {int(set(tables.channels) <= {("temp", "degC"), ("supply", "V")})}
 /* With SELFCAL_FIXED no record overflows (lib/kernel_fixed.c). The coarsest step of each axis that readings within
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
@@ -111,6 +115,9 @@ def _header(model: Model, tables: Tables) -> str:
 {_terms(tables)}
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
+#if SELFCAL_MODEL_CHANNELS > 0
+extern const char *const selfcal_model_channel_name[SELFCAL_MODEL_CHANNELS];
+#endif
 #if SELFCAL_MODEL_GATE
 extern const selfcal_gate_config_t selfcal_model_gate;
 #endif
@@ -129,6 +136,10 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
     return max(math.ceil(math.log2(span / FIXED_LIMIT)), math.floor(math.log2(sigma) + 1e-5) - FIXED_SIGMA_BITS)
+
+
+def _units(tables: Tables) -> str:
+    return "".join(f"; {name} [{unit}]" for name, unit in tables.channels)
 
 
 def _terms(tables: Tables) -> str:
@@ -157,8 +168,10 @@ def _source(model: Model, tables: Tables) -> str:
         code = f"{{&selfcal_forgetting_code, {_f(tables.half_life_s)}}}"
         parts += [f"static const selfcal_forgetting_t forgetting = {code};", ""]
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
+    channels = ", ".join(f'"{name}"' for name, _ in tables.channels)
     parts += [
         f"const char *const selfcal_model_axis_name[] = {{{names}}};",
+        *([f"const char *const selfcal_model_channel_name[] = {{{channels}}};"] if channels else []),
         "",
         "const selfcal_model_t selfcal_model = {",
         f"    0x{tables.id:08X}U, /* id */",
@@ -204,17 +217,29 @@ def _regressors(tables: Tables) -> list[str]:
         ", ".join(_f(column.coefficient_sd[axis]) for column in tables.regressors) for axis in range(len(tables.axes))
     )
     references = ", ".join(_f(column.reference) for column in tables.regressors)
+    odds = ", ".join(_f(column.ln_odds) for column in tables.regressors)
     return [
         "/* " + ", ".join(f"{column.name} [{column.unit}]" for column in tables.regressors) + " */",
         f"static const float reference[] = {{{references}}};",
         "static const float coefficient_sd[] = {",
         *(f"    {row}, /* {axis.name} */" for row, axis in zip(rows, tables.axes, strict=True)),
         "};",
+        "static const selfcal_source_t source[] = {",
+        *(f"    {_column_source(tables, column)}, /* {column.name} */" for column in tables.regressors),
+        "};",
+        f"static const float ln_odds[] = {{{odds}}};",
         "static const selfcal_regressors_t regressors = {",
-        f"    &selfcal_regressors_code, {len(tables.regressors)}U, reference, coefficient_sd,",
+        f"    &selfcal_regressors_code, {len(tables.regressors)}U, reference, coefficient_sd, source, ln_odds,",
         "};",
         "",
     ]
+
+
+def _column_source(tables: Tables, column: RegressorTable) -> str:
+    kind, number, name, unit = column.source
+    places = [*((axis.name, axis.unit) for axis in tables.axes), *tables.channels]
+    what = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP")[kind]
+    return f"{{SELFCAL_COLUMN_{what}, {places.index((name, unit)) if name else 0}U, {_f(number)}}}"
 
 
 def _gate(model: Model, tables: Tables) -> list[str]:

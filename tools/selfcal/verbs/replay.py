@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,20 @@ from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
 from selfcal.recording import Recording, Scale, as_float, load
-from selfcal.result import in_unit
+from selfcal.regressors import (
+    Choice,
+    Inclusion,
+    Scored,
+    check_channels,
+    coefficient_unit,
+    columns_of,
+    ln_prior,
+    normal_coefficient,
+    offered,
+)
+from selfcal.result import AxisResult, in_unit
 from selfcal.tables import Tables, bank_block, gate_table, make_tables
+from selfcal.units import factor as factor_of
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus
@@ -110,8 +122,6 @@ def replay(
         check_picture(plot)
     check_writable(json, plot)
     loaded_model = Model.load(model)
-    if loaded_model.regressors:
-        raise UserError(f"{loaded_model.path}: this firmware gives its bank no regressors; take `identify`")
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
@@ -223,13 +233,16 @@ def _complaint(said: str) -> str:
 
 def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
     """The recording as the firmware reads it (port/replay/replay.h): float32 in the model's units."""
-    rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("reading", "<f4", (len(axes),))])
+    units = [(name, model.group_of(name).unit) for name in axes]
+    channels = make_tables(model, recording.rate_hz, tuple(axes)).channels
+    check_channels(model.regressors, recording)
+    rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("value", "<f4", (len(axes) + len(channels),))])
     rows["missing"] = recording.missing_before
-    for index, name in enumerate(axes):
-        rows["reading"][:, index] = as_float(recording.in_unit(name, model.group_of(name).unit))
+    for index, (name, unit) in enumerate((*units, *channels)):
+        rows["value"][:, index] = as_float(recording.in_unit(name, unit))
     header = np.array(
-        [(MAGIC, len(axes), 0, recording.rate_hz, recording.samples)],
-        dtype=[("magic", "S8"), ("axes", "<u4"), ("zero", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
+        [(MAGIC, len(axes), len(channels), recording.rate_hz, recording.samples)],
+        dtype=[("magic", "S8"), ("axes", "<u4"), ("channels", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
     )
     with path.open("wb") as file:
         file.write(header.tobytes())
@@ -430,17 +443,62 @@ def _document(
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
     """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
-    tables = make_tables(model, recording.rate_hz, (name,))
+    regressors = offered(model, name)
+    tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))
     group, unit = model.group_of(name), recording.columns[name].unit
-    blocks = usable_blocks(as_float(recording.in_unit(name, group.unit)), recording.missing_before, tables, group)
+    columns = as_float(columns_of(regressors, recording))
+    samples = as_float(recording.in_unit(name, group.unit))
+    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
     if not history:
         raise UserError("too little rest for a report" if gate else "too short for a report")
-    result = history[-1].result(names_of(model))
+    result, scored = _with_coefficients(history[-1], model, regressors, unit)
     if not any(math.isfinite(p) for p in result.probability.values()):
         from selfcal.engines.library import outside_priors
 
         raise UserError(outside_priors(tables.axes[0]))
     judged = Judged({}, None)
     if not gate:
-        judged = with_lattice(judge(blocks, tables, group, result), recording, name, group)
-    return Identified(unit, group.unit, in_unit(result, group.unit, unit), judged, blocks.kept_out)
+        used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
+        judged = with_lattice(judge(blocks, tables, group, result, used), recording, name, group)
+    told = in_unit(result, group.unit, unit)
+    return Identified(unit, group.unit, told, judged, blocks.kept_out, replace(scored, result=told) if scored else None)
+
+
+def _with_coefficients(
+    report: AxisReport, model: Model, regressors: Choice, unit: str
+) -> tuple[AxisResult, Scored | None]:
+    """The report in the model's unit, and its regressors with coefficients per `unit`, the recording's.
+
+    The firmware compares no regressor with all that the axis has, and sends the likelier of the two. The evidence here
+    is over both, weighed by their priors, as `identify` weighs all subsets.
+    """
+    result = report.result(names_of(model))
+    if not regressors:
+        return result, None
+    told = report.coefficients(names_of(model))
+    columns = [column for one in regressors for column in one.columns]
+    probability = told[columns[0]][2] if columns[0] in told else 0.0
+    if not math.isfinite(probability):
+        probability = 0.0
+    sent = [told.get(column, (math.nan, math.nan, 0.0))[:2] for column in columns]
+    used = probability > 0.5
+    if used:
+        result = replace(result, coefficients={law: tuple(sent) for law in result.probability})
+    factor = factor_of(model.group_of(report.axis).unit, unit)
+    inclusion = {
+        one.name: Inclusion(
+            probability,
+            tuple(
+                normal_coefficient(column, coefficient_unit(unit, one.unit), mean * factor, sd * factor)
+                for column, (mean, sd) in zip(columns, sent, strict=True)
+                if column in one.columns
+            ),
+        )
+        for one in regressors
+    }
+    choices = ((), regressors)
+    # P(data) = P(data | sent) P(sent) / P(sent | data)
+    share = ln_prior(regressors, choices[used]) - math.log(max(probability, 1.0 - probability))
+    evidence = {law: value + share for law, value in result.log_evidence.items()}
+    result = replace(result, log_evidence=evidence)
+    return result, Scored(result, inclusion, choices, (1.0 - probability, probability), int(used))

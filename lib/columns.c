@@ -1,0 +1,212 @@
+/* The values of regressors, formed from raw channels sample by sample. Host and module run this code.
+ *
+ * A window of W samples is held in SELFCAL_COLUMN_BINS bins of S = ceil(W / SELFCAL_COLUMN_BINS) samples,
+ * and one bin more. So the memory does not grow with W.
+ * Mean over the window: the oldest bin counts by the part of it that lies within the window.
+ * Gain over the window: the value W samples ago lies on the line between the two bin ends beside it.
+ * Phase of a line: a product of integers modulo 2^64, which does not drift. */
+#include "internal.h"
+
+#define BINS (SELFCAL_COLUMN_BINS + 2U)
+#define TWO_PI R(6.283185307179586)
+
+static selfcal_wide_t interval_of(const selfcal_model_t *model) {
+    return (selfcal_wide_t)model->dt_s / (selfcal_wide_t)model->block;
+}
+
+/* How a column's window is cut: samples of it, and of a bin. */
+typedef struct {
+    uint32_t window, bin;
+} cut_t;
+
+static cut_t cut_of(const selfcal_former_t *self, const selfcal_source_t *source) {
+    const selfcal_wide_t samples = floor((selfcal_wide_t)source->number / interval_of(self->model) + 0.5);
+    cut_t cut = {samples > 1.0 ? (uint32_t)fmin(samples, 4e9) : 1U, 1U};
+    cut.bin = (cut.window + SELFCAL_COLUMN_BINS - 1U) / SELFCAL_COLUMN_BINS;
+    return cut;
+}
+
+static bool has_window(const selfcal_source_t *source) {
+    return (source->kind == SELFCAL_COLUMN_CHANNEL && source->number > 0.0F) || source->kind == SELFCAL_COLUMN_RATE;
+}
+
+static bool valid_source(const selfcal_source_t *source) {
+    switch (source->kind) {
+    case SELFCAL_COLUMN_TIME: return true;
+    case SELFCAL_COLUMN_CHANNEL: return source->number >= 0.0F && isfinite(source->number);
+    case SELFCAL_COLUMN_RATE:
+    case SELFCAL_COLUMN_SINE:
+    case SELFCAL_COLUMN_COSINE: return source->number > 0.0F && isfinite(source->number);
+    case SELFCAL_COLUMN_STEP: return source->number >= 0.0F && isfinite(source->number);
+    default: return false;
+    }
+}
+
+selfcal_status_t selfcal_former_init(selfcal_former_t *self, const selfcal_model_t *model) {
+    if (self == NULL || model == NULL || model->regressors == NULL || model->regressors->source == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    memset(self, 0, sizeof *self);
+    self->model = model;
+    const selfcal_regressors_t *regressors = model->regressors;
+    if (regressors->count > SELFCAL_REGRESSORS_MAX || model->block == 0U || !(model->dt_s > 0.0F)) {
+        return SELFCAL_BAD_MODEL;
+    }
+    for (uint8_t k = 0; k < regressors->count; k++) {
+        const selfcal_source_t *source = &regressors->source[k];
+        if (!valid_source(source)) {
+            return SELFCAL_BAD_MODEL;
+        }
+        selfcal_trail_t *trail = &self->trail[k];
+        if (has_window(source)) {
+            const cut_t cut = cut_of(self, source);
+            trail->window = cut.window;
+            trail->bin = cut.bin;
+        } else if (source->kind == SELFCAL_COLUMN_STEP) {
+            trail->step = (uint64_t)fmin(ceil((selfcal_wide_t)source->number / interval_of(model) - 1e-3), 1e18);
+        } else if (source->kind == SELFCAL_COLUMN_SINE || source->kind == SELFCAL_COLUMN_COSINE) {
+            const selfcal_wide_t turns = (selfcal_wide_t)source->number * interval_of(model); /* a sample */
+            trail->step = (uint64_t)((turns - floor(turns)) * 18446744073709551616.0);
+        }
+    }
+    return SELFCAL_OK;
+}
+
+void selfcal_former_pass(selfcal_former_t *self, uint64_t samples) {
+    self->samples += samples;
+}
+
+float selfcal_regressor_last(const selfcal_t *self, uint8_t k) {
+    const selfcal_column_t *column = &self->columns->column[k];
+    return (float)(column->last + column->offset + (selfcal_real_t)column->origin);
+}
+
+/* The bin `back` before the newest whole one. */
+static float bin_at(const selfcal_trail_t *trail, uint32_t back) {
+    return trail->ring[(trail->bins - 1U - back) % BINS];
+}
+
+static void close_bin(selfcal_trail_t *trail, float value) {
+    trail->ring[trail->bins % BINS] = value;
+    trail->bins++;
+    if (trail->bins == 2U * BINS) { /* so that it never wraps: only its place in the ring counts from here on */
+        trail->bins = BINS;
+    }
+    trail->in_bin = 0;
+    trail->sum = 0.0F;
+}
+
+/* Mean of the last samples, a window of them or fewer at the beginning; all are taken about the first one. */
+static float trailing_mean(selfcal_trail_t *trail, float value, bool first) {
+    if (first) {
+        trail->first = value;
+    }
+    trail->sum += value - trail->first;
+    trail->in_bin++;
+    float sum = trail->sum;
+    uint32_t count = trail->in_bin;
+    for (uint32_t back = 0; back < trail->bins && back < BINS && count < trail->window; back++) {
+        const uint32_t room = trail->window - count, taken = room < trail->bin ? room : trail->bin;
+        sum += bin_at(trail, back) * ((float)taken / (float)trail->bin);
+        count += taken;
+    }
+    if (trail->in_bin == trail->bin) {
+        close_bin(trail, trail->sum);
+    }
+    return trail->first + sum / (float)count;
+}
+
+/* The channel at a bin's end within a step from `last` to `value`, `ahead` of `stride` samples after `last`. */
+static float between(float last, float value, uint64_t ahead, uint64_t stride) {
+    return last + (value - last) * ((float)ahead / (float)stride);
+}
+
+/* What the channel gained over the last window; over a shorter time, at the beginning, from its first value. */
+static float gained(selfcal_trail_t *trail, float value, bool first, uint64_t stride) {
+    if (first) {
+        trail->first = trail->last = value;
+        close_bin(trail, value); /* the ring holds the values at bin ends, in_bin counts samples since the newest */
+        return 0.0F;
+    }
+    const uint64_t bin = trail->bin, most = (uint64_t)BINS * bin;
+    uint64_t ahead = bin - trail->in_bin; /* samples from the last one to the next bin end */
+    if (stride > most && ahead + most < stride) { /* a long gap: older ends leave the ring anyway */
+        ahead += (stride - most - ahead) / bin * bin;
+    }
+    for (; ahead <= stride; ahead += bin) {
+        close_bin(trail, between(trail->last, value, ahead, stride));
+    }
+    trail->in_bin = (uint32_t)(bin - (ahead - stride));
+    trail->last = value;
+    /* The window's beginning lies `back` samples before the newest bin end. */
+    const uint32_t back = trail->window - (trail->in_bin < trail->window ? trail->in_bin : trail->window);
+    const uint32_t whole = back / trail->bin, part = back % trail->bin;
+    if (whole + (part > 0U ? 1U : 0U) >= trail->bins) {
+        return value - trail->first;
+    }
+    const float newer = bin_at(trail, whole);
+    const float older = part > 0U ? bin_at(trail, whole + 1U) : newer;
+    return value - (newer + (older - newer) * ((float)part / (float)trail->bin));
+}
+
+static float wave(uint64_t phase, bool cosine) {
+    const selfcal_real_t turns = (selfcal_real_t)(phase >> 40) * (selfcal_real_t)(1.0 / 16777216.0);
+    const selfcal_real_t angle = TWO_PI * turns;
+    return (float)(cosine ? r_cos(angle) : r_sin(angle));
+}
+
+/* The reading or channel that a column takes; 0 for a column of time alone. */
+static float reading_of(const selfcal_source_t *source, const selfcal_model_t *model, const float sample[],
+                        const float channels[]) {
+    if (source->kind != SELFCAL_COLUMN_CHANNEL && source->kind != SELFCAL_COLUMN_RATE) {
+        return 0.0F;
+    }
+    return source->channel < model->axes ? sample[source->channel] : channels[source->channel - model->axes];
+}
+
+void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[], const float channels[],
+                  float values[]) {
+    const selfcal_model_t *model = self->model;
+    const bool first = !self->begun;
+    const uint64_t stride = (uint64_t)missing + 1U;
+    self->samples += first ? missing : stride;
+    for (uint8_t k = 0; k < model->regressors->count; k++) {
+        const selfcal_source_t *source = &model->regressors->source[k];
+        selfcal_trail_t *trail = &self->trail[k];
+        const float raw = reading_of(source, model, sample, channels);
+        switch (source->kind) {
+        case SELFCAL_COLUMN_TIME:
+            values[k] = (float)((selfcal_real_t)self->samples * (selfcal_real_t)interval_of(model));
+            break;
+        case SELFCAL_COLUMN_CHANNEL:
+            values[k] = has_window(source) && isfinite(raw) ? trailing_mean(trail, raw, first) : raw;
+            break;
+        case SELFCAL_COLUMN_RATE:
+            values[k] = isfinite(raw) ? gained(trail, raw, first, stride) / source->number : raw;
+            break;
+        case SELFCAL_COLUMN_STEP: values[k] = self->samples >= trail->step ? 1.0F : 0.0F; break;
+        default: values[k] = wave(trail->step * self->samples, source->kind == SELFCAL_COLUMN_COSINE); break;
+        }
+    }
+    self->begun = true;
+}
+
+void selfcal_mix_coefficients(const selfcal_report_t *report, const selfcal_model_t *model,
+                              const selfcal_coefficients_t coefficients[], float probability,
+                              selfcal_sent_coefficient_t sent[]) {
+    for (uint8_t k = 0; k < model->regressors->count; k++) {
+        selfcal_wide_t weight = 0.0, mean = 0.0, square = 0.0;
+        for (uint8_t h = 0; h < model->hypotheses; h++) {
+            const selfcal_wide_t p = (selfcal_wide_t)report->hypothesis[h].probability;
+            const selfcal_wide_t m = (selfcal_wide_t)coefficients[h].mean[k], s = (selfcal_wide_t)coefficients[h].sd[k];
+            if (p > 0.0 && isfinite(coefficients[h].mean[k])) {
+                weight += p;
+                mean += p * m;
+                square += p * (m * m + s * s);
+            }
+        }
+        sent[k].mean = weight > 0.0 ? (float)(mean / weight) : NAN;
+        sent[k].sd = weight > 0.0 ? (float)sqrt(fmax(square / weight - (mean / weight) * (mean / weight), 0.0)) : NAN;
+        sent[k].probability = probability;
+    }
+}
