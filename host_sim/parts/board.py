@@ -1,4 +1,4 @@
-"""The board: processor, sensor, bus, wired as GUIDE.md says under "The module"."""
+"""The board: processor, sensor, bus, wired as port/README.md says under "Wiring"."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-/* What the parts of this target give each other. Pins: GUIDE.md, "The module". */
+/* What the parts of this target give each other. Pins: port/README.md, "Wiring". */
 #ifndef BOARD_H
 #define BOARD_H
 

@@ -1,4 +1,4 @@
-/* The application on an STM32F405 with an ADIS16405: wiring and flashing in GUIDE.md, "The module". */
+/* The application on an STM32F405 with an ADIS16405: wiring and flashing in port/README.md. */
 #include "board.h"
 #include "stm32f405.h"
 

@@ -22,8 +22,9 @@ import image_sizes
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "bench"
 REFERENCE = Path(__file__).with_name("counts.json")
-GUIDE = ROOT / "GUIDE.md"
-#: Where the guide has the table.
+DOCUMENT = ROOT / "tests" / "README.md"
+#: Where the document has the table, whose lines are as long as its others.
+LINE = 120
 TABLE = re.compile(r"(<!-- python tests/bench/bench.py --table -->\n).*(\n<!-- end of the table -->)", re.DOTALL)
 GROWTH = Fraction(2, 100)
 #: s; an image that takes longer hangs.
@@ -281,7 +282,7 @@ def table(bench: Bench) -> str:
         shares["push"][target] = f"{float(seconds * (push + bank / figures['facts']['block'])):.2%}"
         shares["bank"][target] = f"{float(seconds * bank):.1%}"
     clocks = ", ".join(f"{MACHINES[target].systick_hz // 10**6} MHz" for target in targets)
-    row(f"share of the core ({clocks}), six axes at {float(RATE_HZ)} Hz averaged to 1 Hz", shares["push"])
+    row(f"share of the core ({clocks}), averaged to 1 Hz", shares["push"])
     row("… with every sample a bank sample", shares["bank"])
     per("the dearest push, averaged to 1 Hz", "push.worst")
     per("the dearest push, every sample a bank sample, filters settled", "bank.steady.worst_push")
@@ -368,11 +369,16 @@ def table(bench: Bench) -> str:
     number("flash", "sizes", "firmware.flash")
     number("RAM of the variables", "sizes", "firmware.ram")
     number("stack, worst case by the call graph, interrupts upon it", "sizes", "firmware.stack")
-    heading = ["", *(f"{target.capitalize().replace('-m', '-M')}" for target in targets)]
-    width = max(len(title) for title, _ in rows)
-    lines = [f"| {heading[0]:{width}} |" + "".join(f" {name:>13} |" for name in heading[1:])]
-    lines += [f"|{'-' * (width + 2)}|" + f"{'-' * 14}:|" * len(targets)]
-    lines += [f"| {title:{width}} |" + "".join(f" {cell:>13} |" for cell in cells) for title, cells in rows]
+    heading = ["", *(target.removeprefix("cortex-").replace("m4f", "M4F").replace("m0", "M0") for target in targets)]
+    width = LINE - 14 * len(targets) - 4
+
+    def line(title: str, cells: list[str]) -> str:
+        """Aligned where there is room."""
+        aligned = f"| {title:{width}} |" + "".join(f" {cell:>11} |" for cell in cells)
+        return aligned if len(aligned) <= LINE else f"| {' | '.join([title, *cells])} |"
+
+    lines = [line(heading[0], heading[1:]), f"|{'-' * (width + 2)}|" + f"{'-' * 12}:|" * len(targets)]
+    lines += [line(title, cells) for title, cells in rows]
     return "\n".join(lines)
 
 
@@ -402,7 +408,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--table", action="store_true", help="print counts.json as markdown; measure nothing")
     parser.add_argument("--host", action="store_true", help="measure ns on this machine as well")
-    parser.add_argument("--accept", action="store_true", help="write counts.json and the guide's table anew")
+    parser.add_argument("--accept", action="store_true", help="write counts.json and the table of tests/README.md anew")
     arguments = parser.parse_args()
     if arguments.table:
         print(table(read_reference()))
@@ -418,10 +424,10 @@ def main() -> int:
         print(f"\n{host_table(host)}")
     if arguments.accept:
         REFERENCE.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
-        guide, found = TABLE.subn(lambda match: match[1] + table(now) + match[2], GUIDE.read_text(encoding="utf-8"))
+        text, found = TABLE.subn(lambda match: match[1] + table(now) + match[2], DOCUMENT.read_text(encoding="utf-8"))
         if found != 1:
-            raise BenchError(f"{GUIDE.name}: no place for the table")
-        GUIDE.write_text(guide, encoding="utf-8")
+            raise BenchError(f"{DOCUMENT}: no place for the table")
+        DOCUMENT.write_text(text, encoding="utf-8")
         return 0
     before = read_reference()
     if before["compiler"] not in ("", now["compiler"]):

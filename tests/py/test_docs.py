@@ -11,53 +11,77 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 from pathlib import Path
 
 from selfcal.verbs.codegen import codegen
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
+DOCUMENTS = (
+    *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
+    *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md"),
+)
 WALKTHROUGH = ROOT / "tools" / "README.md"
+#: Columns of a document.
+WIDTH = 120
 COMMAND = "    .venv/bin/selfcal "
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 def executed(text: str, folder: Path) -> str:
-    """A document whose indented commands are run in `folder`, one after the other, each with its output below it. A
-    command that has no output in the document gets none."""
+    """A document whose indented commands are run in `folder`, one after the other, each with its output below it, long
+    lines wrapped. A command that has no output in the document gets none."""
     lines, found, at = text.splitlines(), list[str](), 0
     while at < len(lines):
         found.append(lines[at])
         at += 1
         if not found[-1].startswith(COMMAND):
             continue
+        command = found[-1]
+        while command.endswith("\\"):
+            command = command[:-1] + lines[at]
+            found.append(lines[at])
+            at += 1
         end = at
         while end < len(lines) and not lines[end].startswith(COMMAND) and (not lines[end] or lines[end][:4] == "    "):
             end += 1
-        command = found[-1].replace(COMMAND, f"{sys.executable} -m selfcal.cli ").replace("tools/", f"{ROOT}/tools/")
+        command = command.replace(COMMAND, f"{sys.executable} -m selfcal.cli ").replace("tools/", f"{ROOT}/tools/")
         done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, (command, done.stderr)
         if any(lines[at:end]):
-            printed = [f"    {line}".rstrip() for line in done.stdout.rstrip().splitlines()]
+            printed = [part for line in done.stdout.rstrip().splitlines() for part in wrapped(f"    {line}".rstrip())]
             found += ["", *printed, ""]
             at = end
     return "\n".join(found) + "\n"
 
 
-def worded(line: str) -> str:
-    """A line without its numbers, and without the width that they have given it."""
-    return re.sub(r"─+", "─", " ".join(NUMBER.sub("#", line).split()))
+def wrapped(line: str) -> list[str]:
+    """A line of an output as a document has it."""
+    indent = " " * (len(line) - len(line.lstrip()) + 2)
+    return (
+        [line]
+        if len(line) <= WIDTH
+        else textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    )
+
+
+def words(text: str) -> list[str]:
+    """A text without its numbers and without the places of its line ends. Lines of tables have the width that their
+    numbers give them."""
+    return re.sub(r"─+", "─", NUMBER.sub("#", text)).split()
+
+
+def assert_alike(said: str, printed: str) -> None:
+    """Words exactly, numbers to 2 %: other compilers round otherwise."""
+    assert words(said) == words(printed)
+    for a, b in zip(NUMBER.findall(said), NUMBER.findall(printed), strict=True):
+        assert math.isclose(float(a), float(b), rel_tol=0.02, abs_tol=2e-4), (a, b)
 
 
 def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
-    """Words exactly, numbers to 2 %: other compilers round otherwise. The text's own figure of the JSON, too."""
+    """The text's own figure of the JSON, too."""
     text = WALKTHROUGH.read_text(encoding="utf-8")
-    now = executed(text, tmp_path)
-    for said, printed in zip(text.splitlines(), now.splitlines(), strict=True):
-        assert worded(said) == worded(printed)
-        for a, b in zip(NUMBER.findall(said), NUMBER.findall(printed), strict=True):
-            assert math.isclose(float(a), float(b), rel_tol=0.02, abs_tol=2e-4), (said, printed)
+    assert_alike(text, executed(text, tmp_path))
     best = [
         max(json.loads((tmp_path / name).read_text(encoding="utf-8"))["axes"]["gx"]["log_evidence"].values())
         for name in ("before.json", "after.json")
@@ -66,55 +90,87 @@ def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
     assert told is not None and math.isclose(float(told[1]), best[1] - best[0], rel_tol=0.01)
 
 
-def test_the_guide_has_the_telemetry_table_of_the_dbc() -> None:
-    table = subprocess.run(
-        [sys.executable, "-m", "selfcal.frames_codegen", "--table"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert table in (ROOT / "GUIDE.md").read_text(encoding="utf-8")
-
-
-def test_the_guide_has_the_cost_table_of_the_bench() -> None:
+def test_the_cost_table_is_the_one_of_the_bench() -> None:
     bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), "--table"]
     table = subprocess.run(bench, capture_output=True, text=True, check=True).stdout.strip()
-    assert table in (ROOT / "GUIDE.md").read_text(encoding="utf-8")
+    assert table in (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_guide_s_program_compiles(tmp_path: Path) -> None:
-    """As a function's body, with warnings as errors, against the header of its rate; against that of another it does
-    not."""
-    guide = (ROOT / "GUIDE.md").read_text(encoding="utf-8")
-    programs = re.findall(r"^```c\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
-    program = next(text for text in programs if "selfcal_model.h" in text)
-    lines = program.splitlines()
-    includes = [line for line in lines if line.startswith("#include")]
-    body = [line for line in lines if not line.startswith("#include")]
-    declared = ["void fault(void);", "void read_sensor(float sample[]);", "int run(uint8_t axis);"]
-    source = tmp_path / "program.c"
-    source.write_text("\n".join([*includes, *declared, "int run(uint8_t axis) {", *body, "return 0;", "}"]))
-    flags = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-fsyntax-only"]
-    command = ["cc", *flags, f"-I{ROOT / 'lib'}", f"-I{tmp_path}", str(source)]
-    codegen(None, tmp_path, rate=100.0)
-    subprocess.run(command, check=True)
+def blocks(document: Path, language: str) -> list[str]:
+    """The blocks of a document that are fenced as in `language`."""
+    text = document.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def shell(command: str, folder: Path) -> str:
+    """The output of a command of a document, which stands in a checkout with its package installed."""
+    command = command.replace(".venv/bin/selfcal ", f"{sys.executable} -m selfcal.cli ")
+    done = subprocess.run(["bash", "-ec", command], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (command, done.stdout, done.stderr)
+    return done.stdout
+
+
+def test_the_product_is_built_and_prints_as_printed(tmp_path: Path) -> None:
+    """lib/README.md as printed: its program as C99, as C++17 and by CMake, each with the output that stands there. The
+    program itself has no warning."""
+    for name in ("lib", "tools"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    document = ROOT / "lib" / "README.md"
+    (tmp_path / "product.c").write_text(blocks(document, "c")[0], encoding="utf-8")
+    (tmp_path / "CMakeLists.txt").write_text(blocks(document, "cmake")[0], encoding="utf-8")
+    as_c, as_cpp, by_cmake = blocks(document, "sh")
+    said = blocks(document, "text")[0]
+    feed = as_c.splitlines()[-1]
+    shell(as_c, tmp_path)
+    assert_alike(said, shell(feed, tmp_path))
+    shell(as_cpp, tmp_path)
+    assert_alike(said, shell(feed, tmp_path))
+    shell(by_cmake, tmp_path)
+    assert_alike(said, shell(feed.replace("./product", "build/product"), tmp_path))
+    strict = "-Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror -fsyntax-only -Ilib -Itables product.c"
+    shell(f"cc -std=c99 {strict}; c++ -std=c++17 -x c++ {strict}", tmp_path)
+
+
+def test_the_product_refuses_tables_of_another_rate(tmp_path: Path) -> None:
+    program = tmp_path / "product.c"
+    program.write_text(blocks(ROOT / "lib" / "README.md", "c")[0], encoding="utf-8")
     codegen(None, tmp_path)
+    command = ["cc", "-std=c99", "-fsyntax-only", f"-I{ROOT / 'lib'}", f"-I{tmp_path}", str(program)]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode != 0
     assert "the tables are for another sampling rate" in done.stderr
 
 
+def anchors(document: Path) -> set[str]:
+    """What a link into a document may name: its headings, as forges write them."""
+    headings = re.findall(r"^#+ (.+)$", document.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 def test_links_of_the_documents_lead_somewhere() -> None:
-    for document in ("README.md", "GUIDE.md", "CONTRIBUTING.md", "tools/README.md", "tests/README.md"):
-        text = (ROOT / document).read_text(encoding="utf-8")
-        for link in re.findall(r"\]\(([^)#]+)", text):
-            assert (ROOT / document).parent.joinpath(link).exists(), f"{document}: {link}"
+    for name in DOCUMENTS:
+        document = ROOT / name
+        for link in re.findall(r"\]\(([^)]+)", document.read_text(encoding="utf-8")):
+            path, _, anchor = link.partition("#")
+            target = document.parent / path if path else document
+            assert target.exists(), f"{name}: {link}"
+            assert not anchor or anchor in anchors(target), f"{name}: {link}"
 
 
-def test_commands_of_the_readme_exist() -> None:
+def test_verbs_of_the_documents_exist() -> None:
     """Every verb that the documents call is one of the command's."""
     listed = subprocess.run([sys.executable, "-m", "selfcal.cli", "--help"], capture_output=True, text=True, check=True)
-    for document in ("README.md", "GUIDE.md", "tools/README.md"):
-        text = (ROOT / document).read_text(encoding="utf-8")
+    for name in DOCUMENTS:
+        text = (ROOT / name).read_text(encoding="utf-8")
         for verb in re.findall(r"(?:^|`|/)selfcal ([a-z]+)", text, re.MULTILINE):
-            assert re.search(rf"\b{verb}\b", listed.stdout), f"{document}: selfcal {verb}"
+            assert re.search(rf"\b{verb}\b", listed.stdout), f"{name}: selfcal {verb}"
+
+
+def test_lines_of_the_documents_fit() -> None:
+    models = [str(path.relative_to(ROOT)) for path in (ROOT / "tools" / "selfcal" / "models").glob("*.yaml")]
+    for name in (*DOCUMENTS, *models):
+        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1):
+            assert len(line) <= WIDTH, f"{name}:{number}: {len(line)} columns"
 
 
 if __name__ == "__main__":

@@ -165,9 +165,9 @@ def test_the_images_keep_their_budgets(capsys: pytest.CaptureFixture[str], monke
         ("cortex-m0", build_flag(bytes(16))),
     ],
 )
-def test_images_of_the_guide_keep_the_budgets(target: str, flags: str) -> None:
-    """With all that can be built in, as the guide says it."""
-    elf = image(f"guide-{target}-{len(flags)}", flags, target=target)
+def test_images_with_settings_keep_the_budgets(target: str, flags: str) -> None:
+    """With all that can be built in (port/README.md, Settings)."""
+    elf = image(f"settings-{target}-{len(flags)}", flags, target=target)
     configured, budget = Image(elf), image_sizes.read_budget(target)
     assert configured.flash() <= budget["flash"]
     assert configured.ram() <= budget["ram"]

@@ -59,10 +59,10 @@ def test_a_name_like_an_option_is_a_file() -> None:
 
 
 def test_help_names_what_the_documents_call() -> None:
-    """`make help` has every goal that README, GUIDE and CONTRIBUTING tell the reader to type."""
+    """`make help` has every goal that the documents tell the reader to type."""
     said = make("help").stdout
     listed = set(re.findall(r"^make ([a-z]+)", said, re.MULTILINE))
-    documents = "".join((ROOT / name).read_text() for name in ("README.md", "GUIDE.md", "CONTRIBUTING.md"))
+    documents = "".join(path.read_text() for path in (*ROOT.glob("*.md"), *ROOT.glob("*/*.md")))
     called = set(re.findall(r"(?:`|^ {4})make ([a-z]+)", documents, re.MULTILINE))
     assert called <= listed
     assert {"run", "test", "firmware", "lock"} <= listed

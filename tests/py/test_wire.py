@@ -56,9 +56,11 @@ def changed_dbc(old: str, new: str) -> cantools.database.can.Database:
 
 
 def test_committed_files_are_the_generated_ones() -> None:
-    """`python -m selfcal.frames_codegen` writes both."""
+    """`python -m selfcal.frames_codegen` writes them."""
     assert DBC.read_text() == dbc()
     assert (ROOT / "lib" / "selfcal_frames.h").read_text() == frames_codegen.header(load_dbc())
+    wire = (ROOT / "lib" / "WIRE.md").read_text(encoding="utf-8")
+    assert wire == frames_codegen.page(wire, load_dbc())
 
 
 def test_names_of_a_model_are_symbols_of_a_dbc() -> None:

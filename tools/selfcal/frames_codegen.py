@@ -1,13 +1,13 @@
 """The frame format for standard tools, for C and for the docs, from its one source, `frames.dbc`.
 
-python -m selfcal.frames_codegen            write lib/selfcal.dbc and lib/selfcal_frames.h
-python -m selfcal.frames_codegen --table    print the telemetry table (Markdown)
+python -m selfcal.frames_codegen    write lib/selfcal.dbc, lib/selfcal_frames.h and the lists of lib/WIRE.md
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -25,6 +25,18 @@ COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
 #: Those that modules send.
 SENT = ("", "_H0", "_COEFFICIENTS")
+#: Headings of lib/WIRE.md, by what follows an axis's name or by message.
+HEADINGS = {
+    "": "Axis",
+    "_H0": "Hypothesis",
+    "_COEFFICIENTS": "Coefficients of regressors",
+    "_ADEQUACY": "Adequacy",
+    STATUS: "Status",
+    CORRECTED: "Corrected sample",
+    ANSWER: "Answer to a command",
+}
+#: The line of lib/WIRE.md that the lists follow.
+MARK = "<!-- The rest is generated: python -m selfcal.frames_codegen -->\n"
 #: Signals of columns after the first, which C reaches by the number of the column.
 LATER = re.compile(r"c[1-9]_")
 
@@ -214,14 +226,21 @@ def _of_message(message: Message, name: str) -> list[str]:
     return lines if lines[-1] == "" else [*lines, ""]
 
 
+def _entry(head: str, text: str) -> str:
+    """An item of a list, as long lines as the documents have."""
+    return textwrap.fill(
+        f"- {head}: {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
+
+
 def table(database: Database) -> str:
-    """The telemetry table for the docs, as Markdown."""
+    """Every signal of every message for lib/WIRE.md, as Markdown lists."""
     check(database)
-    lines = ["| field of every frame | bits | meaning |", "|---|---|---|", "| `value` | 0 to 31 | by item, see below |"]
+    lines = ["Every frame:", "", _entry("bits 0 to 31, `value`", "as the item says")]
     status = database.get_message_by_name(STATUS)
     for name, (start, length) in COMMON.items():
         comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
-        lines.append(f"| `{name}` | {start} to {start + length - 1} | {comment} |")
+        lines.append(_entry(f"bits {start} to {start + length - 1}, `{name}`", comment))
     titles = {}
     for suffix in OF_AXIS:
         ids = [database.get_message_by_name(a.upper() + suffix).frame_id for a in AXES]
@@ -232,39 +251,43 @@ def table(database: Database) -> str:
         name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
     }
     for name, title in titles.items():
-        lines += ["", title, "", "| item | signal | type | unit | meaning |", "|---|---|---|---|---|"]
+        lines += ["", f"### {HEADINGS[name.removeprefix(AXES[0].upper())]}", "", *textwrap.wrap(title, 120), ""]
         suffix = name.removeprefix(AXES[0].upper())
         theirs = [database.get_message_by_name(AXES[-1].upper() + suffix)] if suffix in OF_AXIS else []
         accel = {field.name: field.unit for message in theirs for field in fields(message)}
         for field in fields(database.get_message_by_name(name)):
             kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
-            kind += _bits(field)
-            unit = field.unit
-            if accel.get(field.name, unit) != unit:
-                unit += f"; {accel[field.name]}"
+            unit = f", {field.unit}" if field.unit else ""
+            if accel.get(field.name, field.unit) != field.unit:
+                unit += f" (accelerometers: {accel[field.name]})"
             meaning = field.comment + (f": {field.choices}" if field.choices else "")
-            lines.append(f"| {field.item} | `{field.name}` | {kind} | {unit} | {meaning} |")
+            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{_bits(field)}{unit}", meaning))
     command = database.get_message_by_name(COMMAND)
-    lines += ["", f"`0x{command.frame_id:X}` COMMAND, from the host"]
-    lines += ["", "| signal | bits | meaning |", "|---|---|---|"]
+    lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
     for signal in command.signals:
         choices = ", ".join(f"{number} {word}" for number, word in (signal.choices or {}).items())
         meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
-        lines.append(f"| `{signal.name}` | {signal.start} to {signal.start + signal.length - 1} | {meaning} |")
+        lines.append(_entry(f"bits {signal.start} to {signal.start + signal.length - 1}, `{signal.name}`", meaning))
     return "\n".join(lines) + "\n"
 
 
+def page(text: str, database: Database) -> str:
+    """lib/WIRE.md, its lists made anew. Raises UserError if it has no place for them."""
+    head, mark, _ = text.partition(MARK)
+    if not mark:
+        raise UserError(f"lib/WIRE.md: no line '{MARK.strip()}'")
+    return head + mark + "\n" + table(database)
+
+
 def main() -> None:
-    """Write DBC file and header, or print the table."""
+    """Write DBC file, header and page."""
     parser = argparse.ArgumentParser(prog="python -m selfcal.frames_codegen", description=__doc__)
-    parser.add_argument("--table", action="store_true", help="print the telemetry table instead of writing the files")
-    arguments = parser.parse_args()
+    parser.parse_args()
     try:
-        if arguments.table:
-            print(table(load_dbc()), end="")
-        else:
-            (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")
-            (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
+        wire = ROOT / "lib" / "WIRE.md"
+        wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
+        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")
+        (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
     except UserError as error:
         parser.exit(2, f"selfcal: error: {error}\n")
 

@@ -240,7 +240,7 @@ class View:
         return Text(f"{said}, end of the log" if end else said, "bold")
 
     def _status(self, module: Module, width: int) -> list[Text]:
-        """What the status says that is not 0, by its signals' names (GUIDE.md, What the status says); trouble first."""
+        """What the status says that is not 0, by its signals' names (port/README.md); trouble first."""
         said: list[Text] = []
         for name, value in list(module.decoder.status.items()):
             if name not in UNTOLD and value != 0.0:
