@@ -3,20 +3,24 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
-#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]   effects hidden in recordings: are they named?
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]
+#                               effects hidden in recordings: are they named?
 #   make soak                   a record of 10^8 bank samples
-#   make tolerances             what must agree with what: one table of all that was measured; fails where a tolerance is not kept
+#   make tolerances             all that must agree, as one table; fails where a tolerance is not kept
 #   make calibration            ranks of the truth in the bank's posterior over thousands of records, every law
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
-#   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]   random calls of the library under sanitizers, 10^7 executions
-#   make firmware [TARGET=...] [CFLAGS=...] [ACCEPT=1]   build/TARGET/selfcal.elf, .bin, .hex for each board; bytes, stack; fails above its budget
+#   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]
+#                               random calls of the library under sanitizers, 10^7 executions
+#   make firmware [TARGET=...] [CFLAGS=...] [NODE=n] [ACCEPT=1]
+#                               build/TARGET/selfcal.elf, .bin, .hex of each board; sizes; fails above a budget
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 #   make setup                  the set-up alone
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
-#   make lock [UPGRADE=1 | UPGRADE=name]   versions and hashes of the Python packages, from the names in tools/pyproject.toml
+#   make lock [UPGRADE=1 | UPGRADE=name]
+#                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
 # Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
 
@@ -25,17 +29,18 @@ BUILD := build
 VENV := .venv
 BIN := $(VENV)/bin
 RECORDING ?= tests/data/simulated_adis16405.npz
-# A file's name is data: make expands nothing in it, here or in a make below, and the shell takes it from the environment.
+# A file's name is data: make expands nothing in it, here or in a make below. The shell takes it from the environment.
 ifeq ($(origin RECORDING),command line)
 MAKEOVERRIDES :=
 endif
 override RECORDING := $(value RECORDING)
 export RECORDING
 
-include port/arm.mk
+include port/boards.mk port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all help setup system python lock run posix quick test hidden soak tolerances emulate calibration c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden c-tests check clean
+.PHONY: soak tolerances emulate calibration campaigns
 
 all: setup
 
@@ -59,12 +64,14 @@ system:
 
 python: $(PACKAGE)
 
+PIP_INSTALL = $(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off
+
 ifdef SETTING_UP
 # Of stated hashes, and nothing that would have to be built by what has none. The venv's own pip is replaced as well.
 $(VENV)/requirements.stamp: tools/requirements.txt | system
 	@echo "Python packages into $(VENV) (a minute or two)"
 	@$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements.txt
+	$(PIP_INSTALL) --requirement tools/requirements.txt
 	@touch $@
 
 # Installed in place: Python sources need no new set-up, C and C++ ones do.
@@ -84,23 +91,27 @@ else
 $(PACKAGE) $(UNITY): setup ;
 endif
 
-# Versions and hashes anew, from the names in tools/pyproject.toml. What has a version keeps it: UPGRADE=1 takes the newest of all, UPGRADE=numpy of one.
+# Versions and hashes anew, from the names in tools/pyproject.toml. A package that has a version keeps it: UPGRADE=1
+# takes the newest of all, UPGRADE=numpy of one.
+UV_COMPILE = ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes \
+             --custom-compile-command "make lock" \
+             $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %))
 lock:
 	@mkdir -p $(BUILD) && $(PYTHON) -m venv --clear $(BUILD)/lock
-	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: --requirement tools/setup/lock.txt
-	cd tools && ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group dev --custom-compile-command "make lock" \
-	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements.txt pyproject.toml
-	cd tools && for group in $(OPTIONAL); do ../$(BUILD)/lock/bin/uv pip compile --quiet --universal --generate-hashes --group $$group \
-	    --python-version 3.11 --constraint requirements.txt --custom-compile-command "make lock" \
-	    $(if $(filter 1,$(UPGRADE)),--upgrade,$(UPGRADE:%=--upgrade-package %)) --output-file requirements-$$group.txt || exit 1; done
+	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: \
+	    --requirement tools/setup/lock.txt
+	cd tools && $(UV_COMPILE) --group dev --output-file requirements.txt pyproject.toml
+	cd tools && for group in $(OPTIONAL); do $(UV_COMPILE) --group $$group \
+	    --python-version 3.11 --constraint requirements.txt --output-file requirements-$$group.txt || exit 1; done
 
 # Packages that few need, each group by itself: `make setup-rivals`, `make setup-cluster`.
 OPTIONAL := rivals cluster
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
-	$(BIN)/python -m pip install --require-hashes --only-binary :all: --progress-bar off --requirement tools/requirements-$*.txt
+	$(PIP_INSTALL) --requirement tools/requirements-$*.txt
 
-$(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py tools/selfcal/models/*.yaml)
+$(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
+                          $(wildcard tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
 
 # ---------------------------------------------------------------------------------------------------------------- run
@@ -116,13 +127,15 @@ posix: $(MODEL)/selfcal_model.c
 # -------------------------------------------------------------------------------------------------------------- tests
 
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
+WARNINGS_DOUBLE := $(filter-out -Wdouble-promotion,$(WARNINGS))
 INCLUDES := -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL)
 TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
-TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,$(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
+TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,\
+                 $(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -139,27 +152,30 @@ PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdi
 
 # Seeds from the date unless SEED is given.
 hidden: setup
-	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) $(SEED:%=--seed %) \
-	    $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
+	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) \
+	    $(SEED:%=--seed %) $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
 
 # SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup
-	@$(LONG) $(BIN)/python tests/py/tolerances.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
+	@$(LONG) $(BIN)/python tests/py/tolerances.py \
+	    $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup
 	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
 
 # Records of each law and length; the fast subset of `make test` has 60.
 calibration: setup
-	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ $(PYTEST) -s tests/py/test_calibration.py
+	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
+	    $(PYTEST) -s tests/py/test_calibration.py
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
-	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py tests/py/test_hostile.py
+	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py \
+	    tests/py/test_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
@@ -198,49 +214,52 @@ $(eval $(call C_TESTS,fixed32))
 .PHONY: fuzz
 KERNEL ?= float
 FUZZ := $(BUILD)/fuzz/$(KERNEL)
-FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_TERMS_MAX=3 -DSELFCAL_HYPOTHESES_MAX=6 -DSELFCAL_GRID_MAX=6 -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 \
-              -DSELFCAL_SIGMA_CELLS=8 -DSELFCAL_HISTOGRAM=32 -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
+FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_TERMS_MAX=3 -DSELFCAL_HYPOTHESES_MAX=6 -DSELFCAL_GRID_MAX=6 \
+              -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 -DSELFCAL_SIGMA_CELLS=8 -DSELFCAL_HISTOGRAM=32 \
+              -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
 RUNS ?= 10000000
 
-# RUNS executions, or SECONDS seconds, from what was found before on. What fails is left in build/fuzz/KERNEL: run fuzz_api there on it.
+# RUNS executions, or SECONDS seconds, beginning with the inputs found before. A failing input is left in
+# build/fuzz/KERNEL: run fuzz_api there on it.
 fuzz: $(FUZZ)/fuzz_api
 	@mkdir -p $(FUZZ)/corpus
-	ASAN_OPTIONS=quarantine_size_mb=1:detect_leaks=0 $(FUZZ)/fuzz_api -max_len=400 -timeout=20 -artifact_prefix=$(FUZZ)/ -print_final_stats=1 \
-	    -entropic=0 -verbosity=0 $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
+	ASAN_OPTIONS=quarantine_size_mb=1:detect_leaks=0 $(FUZZ)/fuzz_api -max_len=400 -timeout=20 \
+	    -artifact_prefix=$(FUZZ)/ -print_final_stats=1 -entropic=0 -verbosity=0 \
+	    $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
 
 # -march=native: fused multiply-adds are no calls.
 $(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
 	@mkdir -p $(@D)
-	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib $(FUZZ_SIZES) $(patsubst fixed%,-DSELFCAL_FIXED=%,$(filter fixed%,$*)) \
+	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib $(FUZZ_SIZES) \
+	    $(patsubst fixed%,-DSELFCAL_FIXED=%,$(filter fixed%,$*)) \
 	    '-DSELFCAL_ASSERT(condition)=((condition) ? (void)0 : __builtin_trap())' \
-	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all \
-	    $(filter %.c,$^) -lm -o $@
+	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-recover=all \
+	    -fno-sanitize-coverage=trace-cmp $(filter %.c,$^) -lm -o $@
 
 # ----------------------------------------------------------------------------------------------------------- firmware
 
 .PHONY: firmware firmware-images flash
-FIRMWARE := stm32f405 cortex-m0
-WANTED := $(filter $(or $(TARGET),$(FIRMWARE)),$(FIRMWARE))
-CORE_stm32f405 := cortex-m4f
-CORE_cortex-m0 := cortex-m0
+WANTED := $(filter $(or $(TARGET),$(BOARDS)),$(BOARDS))
+NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no CFLAGS
 
 firmware: setup firmware-images $(if $(ACCEPT),bench-images)
-	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(FIRMWARE)))$(BIN)/python tests/bench/image_sizes.py $(WANTED)
-	@$(if $(ACCEPT),$(if $(TARGET)$(CFLAGS),$(error ACCEPT=1 takes the figures of all images as they are: no TARGET, no CFLAGS)))
+	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py $(WANTED)
+	@$(if $(ACCEPT),$(if $(TARGET)$(CFLAGS),$(error $(NOT_ALL))))
 	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
 
 define FIRMWARE_IMAGE
 .PHONY: image-$(1)
 image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
-	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) TARGET=$(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
+	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) \
+	    TARGET=$(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
 $(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
 endef
-$(foreach target,$(FIRMWARE),$(eval $(call FIRMWARE_IMAGE,$(target))))
+$(foreach target,$(BOARDS),$(eval $(call FIRMWARE_IMAGE,$(target))))
 firmware-images: $(WANTED:%=image-%)
 
 flash: setup
-	@tools/setup/flash.sh "$(TARGET)" $(FIRMWARE)
+	@tools/setup/flash.sh "$(TARGET)"
 
 # -------------------------------------------------------------------------------------------------------------- bench
 
@@ -262,6 +281,7 @@ bench: setup bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O
 bench-counts: bench-images firmware-images
 	@$(BIN)/python tests/bench/bench.py
 
+BENCH_LINK := arm-none-eabi-gcc -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
@@ -269,14 +289,15 @@ $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
-	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),$(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
+	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),\
+	    $(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
 $(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float more
 $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
-	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
-	    $$(addprefix $$(@D)/objects/,$$(addsuffix .o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model))) -lm -o $$@
+	$(BENCH_LINK) $(ARM_$(1)) -Wl,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
+	    $$(patsubst %,$$(@D)/objects/%.o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model)) -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
 # The same without the assembly, and by 32-bit products instead of 16-bit ones.
@@ -290,22 +311,25 @@ MORE_regressors :=
 MORE_sums := -DSELFCAL_TERMS_MAX=3
 define BENCH_MORE
 bench-images: $(BENCH)/$(1)/$(2).elf
-$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk tests/bench/image.ld
+$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk \
+                        tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS='$(MORE_$(2))'
-	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),$(addprefix tests/bench/,count.c image.c more.c record.c) \
-	    $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
-	arm-none-eabi-gcc $(ARM_$(1)) -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
+	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),\
+	    $(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
+	$(BENCH_LINK) $(ARM_$(1)) -Wl,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))
 
 $(BENCH)/host/O2/bench: HOST := -O2
 $(BENCH)/host/O3-avx2/bench: HOST := -O3 -mavx2 -mfma
-$(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/bench/record.c $(wildcard lib/*.c) $(MODEL)/selfcal_model.c \
-                       $(BENCH_H) $(wildcard host_sim/*.hpp)
+$(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/bench/record.c $(wildcard lib/*.c) \
+                       $(MODEL)/selfcal_model.c $(BENCH_H) $(wildcard host_sim/*.hpp)
 	@mkdir -p $(@D)
-	cd $(@D) && gcc $(HOST) -std=c99 -ffp-contract=off $(WARNINGS) -I$(BACK)/lib -I$(BACK)/$(MODEL) -c $(filter %.c,$(^:%=$(BACK)/%))
-	g++ $(HOST) -std=c++17 $(filter-out -Wdouble-promotion,$(WARNINGS)) -Ilib -Ihost_sim -I$(MODEL) -isystem /usr/include/eigen3 $(filter %.cpp,$^) $(@D)/*.o -pthread -o $@
+	cd $(@D) && gcc $(HOST) -std=c99 -ffp-contract=off $(WARNINGS) -I$(BACK)/lib -I$(BACK)/$(MODEL) \
+	    -c $(filter %.c,$(^:%=$(BACK)/%))
+	g++ $(HOST) -std=c++17 $(WARNINGS_DOUBLE) -Ilib -Ihost_sim -I$(MODEL) -isystem /usr/include/eigen3 \
+	    $(filter %.cpp,$^) $(@D)/*.o -pthread -o $@
 
 # ------------------------------------------------------------------------------------------------------------- checks
 
@@ -318,46 +342,57 @@ C_ALL := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/posix/*.c) $(MODEL
 # each COMPILER+FLAGS,FILES: every file by itself, so that every complaint is seen
 each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$failed
 
+GCC := gcc -std=c99 -O2 -c -o /dev/null $(INCLUDES)
 check-gcc: $(MODEL)/selfcal_model.c
-	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
-	$(call each,gcc -std=c99 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) $(INCLUDES) -DSELFCAL_REAL_DOUBLE -c -o /dev/null,$(C_ALL))
-	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -c -o /dev/null,$(wildcard lib/*.c))
-	$(call each,gcc -std=c99 -O2 $(WARNINGS) $(INCLUDES) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED=16 -c -o /dev/null,$(wildcard lib/*.c))
+	$(call each,$(GCC) $(WARNINGS),$(C_ALL))
+	$(call each,$(GCC) $(WARNINGS_DOUBLE) -DSELFCAL_REAL_DOUBLE,$(C_ALL))
+	$(call each,$(GCC) $(WARNINGS) -DSELFCAL_TERMS_MAX=3,$(wildcard lib/*.c))
+	$(call each,$(GCC) $(WARNINGS) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED=16,$(wildcard lib/*.c))
 
 check-clang: $(MODEL)/selfcal_model.c
-	$(call each,clang -std=c99 -O2 $(WARNINGS) $(INCLUDES) -c -o /dev/null,$(C_ALL))
+	$(call each,clang -std=c99 -O2 -c -o /dev/null $(INCLUDES) $(WARNINGS),$(C_ALL))
 
-# Firmware that is for one core alone. A folder that the emulators share is compiled for both.
-EMBEDDED_cortex-m4f := $(wildcard port/qemu/*.c port/stm32f405/*.c)
-EMBEDDED_cortex-m0 := $(wildcard port/qemu/*.c port/cortex-m0/*.c)
-
-# What a Cortex-M4F and a Cortex-M0 get.
-check-arm: $(BUILD)/stm32f405/model/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f) -O2 $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/stm32f405/model) -DQEMU_NETDUINOPLUS2 -c -o /dev/null,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m4f) $(BUILD)/stm32f405/model/selfcal_model.c)
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0) -O2 $(ARM_COMPILE) $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT -c -o /dev/null,$(wildcard lib/*.c port/app/*.c port/replay/*.c) $(EMBEDDED_cortex-m0) $(BUILD)/cortex-m0/model/selfcal_model.c)
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m4f-portable) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
-	$(call each,arm-none-eabi-gcc $(ARM_cortex-m0-32bit) -O2 $(ARM_COMPILE) $(INCLUDES) -c -o /dev/null,$(wildcard lib/*.c))
+# Every board with its core and its model; a folder that the emulators share is compiled for each core.
+MACHINE_cortex-m4f := -DQEMU_NETDUINOPLUS2
+MACHINE_cortex-m0 := -DQEMU_MICROBIT
+EMBEDDED = $(wildcard port/qemu/*.c port/$(1)/*.c)
+INCLUDES_OF = $(INCLUDES:-I$(MODEL)=-I$(BUILD)/$(1)/model) $(MACHINE_$(CORE_$(1)))
+ARM_C := $(wildcard lib/*.c port/app/*.c port/replay/*.c)
+ARM_GCC := arm-none-eabi-gcc -O2 -c -o /dev/null $(ARM_COMPILE)
+check-arm: $(BOARDS:%=check-arm-%)
+	$(call each,$(ARM_GCC) $(ARM_cortex-m4f-portable) $(INCLUDES),$(wildcard lib/*.c))
+	$(call each,$(ARM_GCC) $(ARM_cortex-m0-32bit) $(INCLUDES),$(wildcard lib/*.c))
+.PHONY: $(BOARDS:%=check-arm-%)
+$(BOARDS:%=check-arm-%): check-arm-%: $(BUILD)/%/model/selfcal_model.c
+	$(call each,$(ARM_GCC) $(ARM_$(CORE_$*)) $(call INCLUDES_OF,$*),$(ARM_C) $(call EMBEDDED,$*) $<)
 
 check-c++:
-	$(call each,g++ -std=c++17 -O2 $(filter-out -Wdouble-promotion,$(WARNINGS)) -isystem /usr/include/eigen3 -c -o /dev/null,$(wildcard host_sim/*.cpp))
+	$(call each,g++ -std=c++17 -O2 $(WARNINGS_DOUBLE) -isystem /usr/include/eigen3 -c -o /dev/null,\
+	    $(wildcard host_sim/*.cpp))
 
 # The compiler's own headers do not know newlib's; integers stand for addresses in firmware.
 TIDY := clang-tidy --quiet
 TIDY_ARM := --checks=-performance-no-int-to-ptr
-TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(shell echo "#include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h"))
+STRING_H := $(shell echo "\#include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h")
+TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(STRING_H))
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
-check-tidy: $(MODEL)/selfcal_model.c $(BUILD)/cortex-m0/model/selfcal_model.c
+TIDY_CPU_cortex-m4f := -mcpu=cortex-m4
+TIDY_CPU_cortex-m0 := -mcpu=cortex-m0
+check-tidy: $(MODEL)/selfcal_model.c $(BOARDS:%=check-tidy-%)
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
 	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16 -DSELFCAL_TERMS_MAX=3)
-	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m4f) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m4 $(INCLUDES) -DQEMU_NETDUINOPLUS2)
-	$(call tidy,$(TIDY) $(TIDY_ARM) $(EMBEDDED_cortex-m0) -- $(TIDY_ARM_FLAGS) -mcpu=cortex-m0 $(INCLUDES:-I$(MODEL)=-I$(BUILD)/cortex-m0/model) -DQEMU_MICROBIT)
+.PHONY: $(BOARDS:%=check-tidy-%)
+$(BOARDS:%=check-tidy-%): check-tidy-%: $(BUILD)/%/model/selfcal_model.c
+	$(call tidy,$(TIDY) $(TIDY_ARM) $(call EMBEDDED,$*) -- \
+	    $(TIDY_ARM_FLAGS) $(TIDY_CPU_$(CORE_$*)) $(call INCLUDES_OF,$*))
 
 # lib/ has no heap, no I/O and no double but selfcal_wide_t. Comments do not count.
 BANNED := (malloc|calloc|realloc|free|alloca|[a-z]*printf|puts|putchar|fopen|exit|abort)[[:space:]]*\(
 check-tokens:
 	@failed=0; for file in lib/*.[ch]; do \
 	    gcc -fpreprocessed -dD -E -P $$file 2>/dev/null > $(BUILD)/tokens; \
-	    if grep -nE '\<$(BANNED)' $(BUILD)/tokens || grep -nE '\<double\>' $(BUILD)/tokens | grep -vE 'typedef double (selfcal_wide_t|selfcal_real_t);'; \
+	    if grep -nE '\<$(BANNED)' $(BUILD)/tokens || grep -nE '\<double\>' $(BUILD)/tokens | \
+	        grep -vE 'typedef double (selfcal_wide_t|selfcal_real_t);'; \
 	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
 
 check-ruff: $(PACKAGE)
@@ -365,8 +400,9 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py tests/bench/bench.py tests/bench/image_sizes.py
-	@cd tools && ../$(BIN)/mypy --no-error-summary ../tests/hidden/generator.py ../tests/hidden/judge.py ../tests/hidden/rivals.py
+	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
+	    tests/bench/bench.py tests/bench/image_sizes.py
+	@cd tools && ../$(BIN)/mypy --no-error-summary $(addprefix ../tests/hidden/,generator.py judge.py rivals.py)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

@@ -1,11 +1,14 @@
-# An image for a board. A target's own file sets TARGET, CORE and IMAGE_CFLAGS and includes this one; it is called with
+# An image for a board of boards.txt. A board's own file sets TARGET and IMAGE_CFLAGS and includes this one:
 #   make -f port/TARGET/TARGET.mk TARGET MODEL_DIR=DIR OUT=DIR [CFLAGS=...]
-# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`); makes OUT/selfcal.elf, .bin, .hex and .map, and beside
-# the objects what gcc says of their stacks (.su).
-include port/arm.mk
+# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`). Makes OUT/selfcal.elf, .bin, .hex and .map,
+# and beside the objects gcc's statements of their stacks (.su).
+include port/boards.mk port/arm.mk
+CORE := $(CORE_$(TARGET))
 
 $(if $(OUT),,$(error OUT=DIR is wanted))
 PROGRAM_FLAGS := $(strip $(IMAGE_CFLAGS) $(CFLAGS) $(NODE_FLAGS))
+# Between single quotes of the shell.
+QUOTED_FLAGS = $(subst ','\'',$(PROGRAM_FLAGS))
 IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c)
 IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/$(TARGET)/*.h)
 
@@ -13,20 +16,23 @@ IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/$(TARGET)/*.h)
 $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
 
 $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h \
-                    port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/library.mk port/arm.mk $(OUT)/flags
+                    port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/library.mk port/arm.mk \
+                    $(OUT)/flags
 	@rm -rf $(OUT)/objects
-	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(PROGRAM_FLAGS))'
+	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects \
+	    'PROGRAM_FLAGS=$(QUOTED_FLAGS)'
 	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app \
 	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
-	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings \
-	    $(OUT)/objects/*.o -lm -o $@
+	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld \
+	    -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings $(OUT)/objects/*.o -lm -o $@
 
-# Other flags, another image: touched when they change. The compiler reads them there, so that no log shows a command key. Who can read an
-# image has its key: the folder of one that has any is its owner's alone.
+# Other flags, another image: touched when they change. The compiler reads them there, so that no log shows a command
+# key. Whoever can read an image has its key: the folder of an image with a key is its owner's alone.
 .PHONY: flags
 $(OUT)/flags: flags
-	@mkdir -p $(OUT) && $(if $(findstring APP_COMMAND_KEY,$(PROGRAM_FLAGS)),chmod go= $(OUT) &&) umask 077 && touch -a $@ && chmod 600 $@ && \
-	    { printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$(PROGRAM_FLAGS))' > $@; }
+	@mkdir -p $(OUT) && $(if $(findstring APP_COMMAND_KEY,$(PROGRAM_FLAGS)),chmod go= $(OUT) &&) \
+	    umask 077 && touch -a $@ && chmod 600 $@ && \
+	    { printf '%s\n' '$(QUOTED_FLAGS)' | cmp -s - $@ || printf '%s\n' '$(QUOTED_FLAGS)' > $@; }
 
 $(OUT)/selfcal.bin: $(OUT)/selfcal.elf
 	arm-none-eabi-objcopy -O binary $< $@

@@ -1,12 +1,15 @@
-# The library for a core, compiled once for all programs that share its flags; it knows neither the model nor the settings of the application.
+# The library for a core, compiled once for all programs that share its flags. It knows neither the model nor the
+# settings of the application.
 #   make -f port/library.mk objects CORE=CORE OUT=DIR [PROGRAM_FLAGS=...]
-# puts its objects, and what gcc says of their stacks (.su), into DIR.
+# puts its objects, and gcc's statements of their stacks (.su), into DIR.
 include port/arm.mk
 
-LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out -DAPP_% -DSELFCAL_NODE=% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c,$(PROGRAM_FLAGS)))
+NOT_THE_LIBRARYS := -DAPP_% -DSELFCAL_NODE=% -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c
+LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out $(NOT_THE_LIBRARYS),$(PROGRAM_FLAGS)))
 LIBRARY_SOURCES := $(wildcard lib/*.c lib/*.h) port/arm.mk
 # Named by the content of all that it is made of: no time stamp takes old objects for new ones.
-LIBRARY := build/library/$(CORE)-$(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES); } | sha256sum | cut -c1-16)
+LIBRARY_HASH := $(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES); } | sha256sum)
+LIBRARY := build/library/$(CORE)-$(shell echo $(LIBRARY_HASH) | cut -c1-16)
 
 # The lock: programs may be made at the same time.
 .PHONY: objects

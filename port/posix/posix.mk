@@ -1,5 +1,5 @@
 # The firmware for the host: make -f port/posix/posix.mk posix MODEL_DIR=DIR OUT=DIR [AS=cortex-m4f|cortex-m0]
-# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen`); makes OUT/selfcal-posix, with AS configured as for that core.
+# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen`). Makes OUT/selfcal-posix, configured as for the core AS.
 # MODEL_FLAGS: sizes that the model needs beyond the configured ones.
 include port/arm.mk
 
@@ -12,6 +12,7 @@ posix: $(OUT)/selfcal-posix
 
 $(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h
 	@mkdir -p $(OUT)
-	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) $(CONFIG_$(AS)) $(MODEL_FLAGS) $(NODE_FLAGS) $(POSIX_CFLAGS) \
+	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) \
+	    $(CONFIG_$(AS)) $(MODEL_FLAGS) $(NODE_FLAGS) $(POSIX_CFLAGS) \
 	    -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
 	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm

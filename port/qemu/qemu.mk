@@ -9,7 +9,7 @@ QEMU_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/replay/*.h port
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
 QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
-# 4 KB more than the part's 32: the recording's buffers and a stack twice as large, which the image itself does not have.
+# 4 KB more than the part's 32: the recording's buffers and a stack twice as large, which an image does not have.
 QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
 
 .PHONY: qemu
@@ -17,8 +17,10 @@ qemu: $(OUT)/selfcal-qemu.elf
 
 $(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/library.mk port/arm.mk
 	@rm -rf $(OUT)/objects
-	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects 'PROGRAM_FLAGS=$(subst ','\'',$(MODEL_FLAGS) $(QEMU_CFLAGS))'
-	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(MODEL_FLAGS) $(NODE_FLAGS) $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
+	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects \
+	    'PROGRAM_FLAGS=$(subst ','\'',$(MODEL_FLAGS) $(QEMU_CFLAGS))'
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(MODEL_FLAGS) $(NODE_FLAGS) \
+	    $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
 	    -I$(MODEL_DIR),$(QEMU_SOURCES) $(filter %.c,$(QEMU_CFLAGS)),$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
 	    $(OUT)/objects/*.o -lm -o $@

@@ -68,14 +68,22 @@ class Machine:
     report_s: int  # its default time between reports, BOARD_REPORT_MS
 
 
+def _board(core: str, *, image: bool = True) -> tuple[int, str, int]:
+    """Clock, image and time between reports of the first board with a core."""
+    name, (_, clock_hz, report_s) = next(item for item in image_sizes.BOARDS.items() if item[1][0] == core)
+    return clock_hz, name if image else "", report_s
+
+
 MACHINES = {
-    "cortex-m4f": Machine("netduinoplus2", (), 168_000_000, "stm32f405", 10),
+    "cortex-m4f": Machine("netduinoplus2", (), *_board("cortex-m4f")),
     # ... without the assembly kernel.
-    "cortex-m4f-portable": Machine("netduinoplus2", (), 168_000_000, "", 10),
+    "cortex-m4f-portable": Machine("netduinoplus2", (), *_board("cortex-m4f", image=False)),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
-    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x9000"), 16_000_000, "cortex-m0", 600),
+    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x9000"), *_board("cortex-m0")),
     # ... and by 32-bit products instead of 16-bit ones.
-    "cortex-m0-32bit": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x9000"), 16_000_000, "", 600),
+    "cortex-m0-32bit": Machine(
+        "microbit", ("-global", "nrf51-soc.sram-size=0x9000"), *_board("cortex-m0", image=False)
+    ),
 }
 
 #: What a bank that reports and sends cannot be without; the rest is linked by those who call it.

@@ -33,7 +33,13 @@ from elftools.elf.sections import SymbolTableSection
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build"
-TARGETS = ("stm32f405", "cortex-m0")
+#: The boards of port/boards.txt by name: core, clock in Hz, seconds between reports.
+BOARDS = {
+    words[0]: (words[1], int(words[2]), int(words[3]))
+    for line in (ROOT / "port" / "boards.txt").read_text(encoding="utf-8").splitlines()
+    if (words := line.split()) and words[0][0] != "#"
+}
+TARGETS = tuple(BOARDS)
 #: What a processor pushes on an exception and may add to align: without and with an FPU (ARMv7-M ARM B1.5.7).
 EXCEPTION = {False: 32 + 4, True: 104 + 4}
 KINDS = ("flash", "ram", "stack")

@@ -23,15 +23,16 @@ from selfcal.verbs.codegen import codegen
 from selfcal.wire import AxisReport, Decoder
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "host_sim"))
+sys.path[:0] = [str(ROOT / "host_sim"), str(ROOT / "tests" / "bench")]
 
 parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup")
 Board = parts.Board
 NrfBoard = parts.NrfBoard
-CORES = {"stm32f405": "cortex-m4f", "cortex-m0": "cortex-m0"}
+import image_sizes  # noqa: E402  of tests/bench
 from unicorn import UC_HOOK_CODE, Uc  # noqa: E402  after the check that it is there
 from unicorn import arm_const as arm  # noqa: E402
 
+CORES = {name: core for name, (core, _, _) in image_sizes.BOARDS.items()}
 T = TypeVar("T")
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 #: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;

@@ -261,7 +261,7 @@ def flash(
         program.chmod(0o755)
     for name in ("sh", "basename"):
         (folder / name).symlink_to(f"/bin/{name}" if Path(f"/bin/{name}").exists() else f"/usr/bin/{name}")
-    command = ["/bin/sh", str(ROOT / "tools" / "setup" / "flash.sh"), *arguments, "stm32f405", "cortex-m0"]
+    command = ["/bin/sh", str(ROOT / "tools" / "setup" / "flash.sh"), *arguments]
     env = {**os.environ, "PATH": str(folder), **environment}
     return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
 

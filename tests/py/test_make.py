@@ -84,7 +84,15 @@ echo $said begins >>log; sleep 0.3; echo $said ends >>log
 
 def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
     """Three are begun together, of which one uses the package at once; each step of the set-up is done once."""
-    for part in ("Makefile", "port/arm.mk", "tools/requirements.txt", "tools/pyproject.toml", "tools/CMakeLists.txt"):
+    for part in (
+        "Makefile",
+        "port/boards.txt",
+        "port/boards.mk",
+        "port/arm.mk",
+        "tools/requirements.txt",
+        "tools/pyproject.toml",
+        "tools/CMakeLists.txt",
+    ):
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / part, tmp_path / part)
     shutil.copytree(ROOT / "tools" / "setup", tmp_path / "tools" / "setup")

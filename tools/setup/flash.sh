@@ -1,29 +1,25 @@
 #!/bin/sh
-# Write build/TARGET/selfcal into a module: flash.sh TARGET KNOWN... (make flash TARGET=...), by the first that is there of openocd,
-# st-flash and dfu-util. FLASHER names one of them; OPENOCD_INTERFACE is openocd's file for the probe.
+# Write build/TARGET/selfcal into a module: flash.sh TARGET (make flash TARGET=...), by the first writer of port/boards.txt
+# that is there. FLASHER names one of them; OPENOCD_INTERFACE is openocd's file for the probe.
 set -u
 target=$1
-shift
-case " $* " in
-*" $target "*) ;;
-*)
-    echo "make flash TARGET=..., one of: $*" >&2
-    exit 2
-    ;;
-esac
 
-case $target in
-stm32f405)
-    known="openocd st-flash dfu-util"
-    interface=${OPENOCD_INTERFACE:-interface/stlink.cfg}
-    chip=target/stm32f4x.cfg
-    ;;
-*)
-    known=openocd
-    interface=${OPENOCD_INTERFACE:-interface/cmsis-dap.cfg}
-    chip=target/nrf51.cfg
-    ;;
-esac
+boards='' known='' interface='' chip=''
+while read -r board core clock report part probe writers; do
+    case $board in '' | \#*) continue ;; esac
+    boards="$boards $board"
+    if [ "$board" = "$target" ]; then
+        known=$writers
+        interface=${OPENOCD_INTERFACE:-$probe}
+        chip=$part
+    fi
+done <port/boards.txt
+if [ -z "$known" ]; then
+    echo "make flash TARGET=..., one of:$boards" >&2
+    exit 2
+fi
+IFS=, && set -- $known && IFS=' '
+known="$*"
 
 flasher=
 for name in ${FLASHER:-$known}; do

@@ -1,0 +1,4 @@
+# The boards of boards.txt: BOARDS, and for each CORE_BOARD.
+BOARD_LINES := $(shell sed '/^\#/d' port/boards.txt | awk '{ print $$1 ":" $$2 }')
+BOARDS := $(foreach line,$(BOARD_LINES),$(firstword $(subst :, ,$(line))))
+$(foreach line,$(BOARD_LINES),$(eval CORE_$(subst :, := ,$(line))))
