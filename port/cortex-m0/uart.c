@@ -1,20 +1,14 @@
 /* Telemetry as SLCAN on UART0. */
 #include "board.h"
 #include "nrf51.h"
-#include "slcan.h"
+#include "slcan_line.h"
 
-enum { OUT_BYTES = 256, IN_BYTES = 64 }; /* powers of two */
-
-static slcan_t slcan;
-static volatile uint8_t out[OUT_BYTES], in[IN_BYTES];
-static volatile uint32_t out_head, out_tail, in_head, in_tail; /* count up for ever; the handler moves out_tail and in_head */
+static volatile uint8_t out[256], in[64];
+static slcan_line_t line = SLCAN_LINE(out, in);
 static volatile bool sending;
-static volatile uint32_t lost_in;
-static uint32_t dropped;
 
 void uart_init(void)
 {
-    slcan_init(&slcan);
     GPIO_OUTSET = BIT(PIN_TX);
     GPIO_PIN_CNF(PIN_TX) = GPIO_OUTPUT;
     GPIO_PIN_CNF(PIN_RX) = GPIO_INPUT | GPIO_PULL_UP; /* an open line is idle */
@@ -31,56 +25,37 @@ void uart_init(void)
 /* The next byte into the transmitter, if there is one. With the UART's interrupt kept out. */
 static void send_next(void)
 {
-    sending = out_tail != out_head;
+    uint8_t byte;
+    sending = slcan_line_next(&line, &byte);
     if (sending) {
-        const uint8_t byte = out[out_tail % OUT_BYTES];
-        out_tail++;
         UART0_TXD = byte;
     }
 }
 
-static bool put(const char *bytes, uint32_t count)
+static void start(void)
 {
-    if (OUT_BYTES - (out_head - out_tail) < count) {
-        return false;
-    }
-    for (uint32_t i = 0; i < count; i++) {
-        out[(out_head + i) % OUT_BYTES] = (uint8_t)bytes[i];
-    }
-    out_head += count;
     irq_off();
     if (!sending) {
         send_next();
     }
     irq_on();
-    return true;
 }
 
 bool uart_send(const selfcal_frame_t *frame)
 {
-    if (!slcan.open) {
-        dropped++;
-        return true;
-    }
-    char line[SLCAN_FRAME_BYTES];
-    slcan_encode(frame, line);
-    return put(line, sizeof line);
+    const bool taken = slcan_line_send(&line, frame);
+    start();
+    return taken;
 }
 
 void uart_poll(void)
 {
-    while (in_tail != in_head) {
-        char answer[SLCAN_ANSWER_BYTES];
-        const size_t count = slcan_receive(&slcan, in[in_tail % IN_BYTES], answer);
-        in_tail++;
-        (void)put(answer, (uint32_t)count); /* an answer that finds no room is left out */
+    while (slcan_line_poll(&line)) {
 #ifdef APP_COMMAND_KEY
-        if (slcan.came) {
-            slcan.came = false;
-            module_command(slcan.data);
-        }
+        module_command(line.slcan.data);
 #endif
     }
+    start();
 }
 
 bool uart_sent(void)
@@ -90,8 +65,8 @@ bool uart_sent(void)
 
 void uart_tell(selfcal_module_t *told)
 {
-    told->frames_dropped = dropped;
-    told->bus_off_count = lost_in;
+    told->frames_dropped = line.dropped;
+    told->bus_off_count = line.lost;
 }
 
 void uart_handler(void)
@@ -99,17 +74,11 @@ void uart_handler(void)
     if (UART0_ERROR != 0U) {
         UART0_ERROR = 0U;
         UART0_ERRORSRC = UART0_ERRORSRC; /* ones clear it */
-        lost_in++;
+        line.lost++;
     }
     if (UART0_RXDRDY != 0U) {
         UART0_RXDRDY = 0U; /* before the byte is taken: the next one sets it again */
-        const uint8_t byte = (uint8_t)UART0_RXD;
-        if (in_head - in_tail < IN_BYTES) {
-            in[in_head % IN_BYTES] = byte;
-            in_head++;
-        } else {
-            lost_in++;
-        }
+        slcan_line_received(&line, (uint8_t)UART0_RXD);
     }
     if (UART0_TXDRDY != 0U) {
         UART0_TXDRDY = 0U;
