@@ -1,12 +1,14 @@
 /* Commands over the telemetry's wire: the COMMAND message of selfcal.dbc, built in only with APP_COMMAND_KEY.
  *
- * The host asks for a challenge and gets a random number; the command's tag must be the low 32 bits of SipHash-2-4, under a key of
- * 128 bits that both know, over that number and the command. A challenge is good for one try and COMMAND_CHALLENGE_MS; asked for again
- * before that it is the same one. After a new challenge and after a wrong tag there is no other for COMMAND_PAUSE_MS. So a frame that is
- * recorded does nothing unless its challenge comes again, once in 2^32 of them: who has recorded k commands and keeps asking waits
- * 136/k years. A random tag has one chance in 2^32 a try: trying them all takes 136 years.
- * What it does not give: secrecy; protection of a key that is read out of the flash; service while somebody floods the wire or sends
- * wrong tags.
+ * PROTOCOL  The host asks for a challenge and gets a random number. The command's tag must be the low 32 bits of
+ *   SipHash-2-4, under a key of 128 bits that both know, over this number and the command. A challenge is good for one
+ *   try and COMMAND_CHALLENGE_MS. Until then the same one is given to whoever asks. After a new challenge, and after a
+ *   wrong tag, there is no other for COMMAND_PAUSE_MS.
+ * STRENGTH  A recorded frame does nothing unless its challenge comes again, once in 2^32 challenges. Whoever has
+ *   recorded k commands and keeps asking waits 136/k years. A random tag has one chance in 2^32 a try: all tags take
+ *   136 years.
+ * LIMITS  No secrecy. No protection of a key that is read out of the flash. No service while somebody floods the wire
+ *   or sends wrong tags.
  *
  * SipHash: Aumasson & Bernstein, INDOCRYPT 2012, 489-508. */
 #ifndef COMMAND_H
@@ -40,14 +42,15 @@ typedef struct {
 /* SipHash-2-4 of 8 bytes, given as one little-endian number. */
 uint64_t command_siphash(const uint64_t key[2], uint64_t message);
 
-/* Whether there is a challenge to answer, `challenge` of the structure: the one that is open, or a new one, the random `number`. False:
- * not so soon after another or a wrong tag. */
+/* Opens a challenge, the random `number`, unless one is open. True: `challenge` of the structure may be answered.
+ * False: not so soon after another challenge or a wrong tag. */
 bool command_open(command_t *self, uint32_t number, uint32_t now_ms);
 
-/* To be called more often than the time comes round: what is over stays so. */
+/* Ends what is over. Call it more often than the time comes round. */
 void command_pass(command_t *self, uint32_t now_ms);
 
-/* Checks the tag of a command and uses up the challenge. Returns SELFCAL_ANSWER_RESULT_DONE, _NO_CHALLENGE or _WRONG_TAG. */
+/* Checks the tag of a command and uses up the challenge.
+ * Returns SELFCAL_ANSWER_RESULT_DONE, _NO_CHALLENGE or _WRONG_TAG. */
 uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms);
 
 #endif

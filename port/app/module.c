@@ -7,8 +7,8 @@
 #define BOARD_GATE 1
 #endif
 
-/* Seconds of running between saves of the state. A save erases one of two slots; those bear 10 000 erases (STM32F405) or 20 000
- * (nRF51822), so that four saves a day wear the flash out in 13 years or 27. */
+/* Seconds of running between saves of the state. A save erases one of two slots. A slot bears 10 000 erases
+ * (STM32F405) or 20 000 (nRF51822): four saves a day wear the flash out in 13 years or 27. */
 #ifndef BOARD_SAVE_PERIOD_S
 #define BOARD_SAVE_PERIOD_S 21600U
 #endif
@@ -20,7 +20,7 @@ static app_t app;
 static slots_t slots;
 static const module_board_t *board;
 
-/* --------------------------------------------------------------------------------------------------------------- port */
+/* ------------------------------------------------------------------------------------------------------------- port */
 
 static uint32_t port_time_ms(void *context)
 {
@@ -42,7 +42,7 @@ static void port_idle(void *context)
 
 static const port_t port = {NULL, port_time_ms, sensor_sample, port_send, port_idle};
 
-/* ------------------------------------------------------------------------------------------------------------- module */
+/* ----------------------------------------------------------------------------------------------------------- module */
 
 static void module_tell(void *context, selfcal_module_t *told)
 {
@@ -101,8 +101,8 @@ static const port_module_t module = {
     BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 
-/* Fed once in 100 ms at most, and only if the ticks go on (a main loop that turns without its interrupts is not healthy) and the
- * application is well. */
+/* Fed once in 100 ms at most, and only if the application is healthy and the ticks go on: a main loop that turns
+ * without its interrupts is not healthy. */
 static void feed(void)
 {
     static uint32_t fed;

@@ -1,5 +1,5 @@
-/* A module: the application with its sensor, saved state and watchdog, on a board that gives what is its own. The main() of
- * every board with an ADIS16405 ends in module_run(). One a program. */
+/* A module: the application with its sensor, saved state and watchdog. A board gives the rest as callbacks.
+ * The main() of every board with an ADIS16405 ends in module_run(). One a program. */
 #ifndef MODULE_H
 #define MODULE_H
 

@@ -1,7 +1,6 @@
-/* SLCAN, the Lawicel text protocol: CAN frames over a serial line, as python-can's `slcan` and slcand speak it. This end
- * is the adapter; its bus carries telemetry only, so commands that transmit are refused, but for the COMMAND message in an image
- * with commands.
- * No I/O here: bytes go in, bytes to write come out. */
+/* SLCAN, the Lawicel text protocol: CAN frames over a serial line, as python-can's `slcan` and slcand speak it.
+ * This end is the adapter. Its bus carries telemetry only, so lines that transmit are refused. The one exception is the
+ * COMMAND message in an image with commands. No I/O here: bytes go in, bytes to write come out. */
 #ifndef SLCAN_H
 #define SLCAN_H
 
@@ -33,10 +32,14 @@ typedef struct {
 
 void slcan_init(slcan_t *self);
 
-/* Takes one byte from the host. Returns how many bytes of `answer` are to be written back: 0 within a line. A line ends in
- * CR, or in CR and LF. C closes; O and L open, also when open, L for listening only: no command is taken; S0 to S8 and an empty
- * line are accepted and change nothing; V, v and N are answered; anything else is answered BEL. With commands, a line of the
- * module's COMMAND message ("t2088" of node 0, and 16 hexadecimal digits) on an open channel is a command. */
+/* Takes one byte from the host. Returns the bytes of `answer` to write back: 0 within a line. A line ends in CR,
+ * or in CR and LF.
+ *   C               closes the channel
+ *   O, L            open it, also when it is open; with L no command is taken
+ *   S0 to S8, none  are accepted and change nothing
+ *   V, v, N         are answered
+ *   t2088...        a COMMAND message (here of node 0) with 16 hexadecimal digits, on an open channel, with commands
+ *   anything else   is answered BEL */
 size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]);
 
 /* The frame as a line, without a terminating zero. */

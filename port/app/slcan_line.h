@@ -1,7 +1,8 @@
-/* SLCAN on a serial line that interrupts serve: a ring of bytes each way between the main loop and the interrupt's handler.
+/* SLCAN on a serial line that interrupts serve: a ring of bytes each way between the main loop and the interrupt's
+ * handler.
  *
- * The main loop calls slcan_line_send() and slcan_line_poll(), the handler slcan_line_received() and slcan_line_next().
- * The board starts its transmitter after the first two. */
+ * The main loop calls slcan_line_send() and slcan_line_poll(), the handler slcan_line_received() and
+ * slcan_line_next(). The board starts its transmitter after the first two. */
 #ifndef SLCAN_LINE_H
 #define SLCAN_LINE_H
 
@@ -29,8 +30,8 @@ typedef struct {
 /* Takes a frame, or drops it on a closed channel. False: no room, offer it again. */
 bool slcan_line_send(slcan_line_t *line, const selfcal_frame_t *frame);
 
-/* Looks at the bytes that came, up to the first command. True: a command is in `line->slcan.data`; call again. An answer
- * that finds no room is left out. */
+/* Looks at the bytes that came, up to the first command. True: a command is in `line->slcan.data`; call again. An
+ * answer that finds no room is left out. */
 bool slcan_line_poll(slcan_line_t *line);
 
 /* True once the handler has taken all bytes. */

@@ -78,7 +78,8 @@ static bool blank(const slots_t *self, uint32_t slot)
     return erased == SLOTS_HEADER_BYTES;
 }
 
-/* Where no slot has a header and one has what is left of it, that is a state of no bytes: to be refused, not to be passed over. */
+/* Where no slot has a header and one has what is left of it, that is a state of no bytes: to be refused, not to be
+ * passed over. */
 const void *slots_stored(void *context, bool older, size_t *length)
 {
     const slots_t *self = context;

@@ -1,7 +1,8 @@
-/* Saved state in two slots of flash in turn: each save erases one of them and writes a header of 32 bytes and the state.
+/* Saved state in two slots of flash in turn. Each save erases one slot and writes the state and a header of 32
+ * bytes.
  *
- * The header is written last and its checksum is its last word, so a save that a power cut ends anywhere leaves a slot that is
- * refused, and the other slot, which was not touched, is the newest. No I/O here: a board gives the memory. */
+ * The header is written last, and its checksum is its last word. So a power cut at any instant of a save leaves a
+ * slot that is refused. The other slot was not touched and is the newest. No I/O here: a board gives the memory. */
 #ifndef SLOTS_H
 #define SLOTS_H
 
@@ -30,13 +31,15 @@ typedef struct {
 
 /* The following are callbacks of port_module_t; `context` is a slots_t with its `memory` set. */
 
-/* The newest state whose save reached its end, or NULL; `older`: the one before it. Whether it is still what was written its own
- * checksum tells. If there is none, but a slot that was written and has no whole header, a state of length 0, for start-up to refuse. */
+/* The newest state whose save reached its end, or NULL; `older`: the one before it. The state's own checksum tells
+ * whether it is still as it was written. With no such state, but a slot that was written and has no whole header,
+ * the length is 0: start-up refuses that. */
 const void *slots_stored(void *context, bool older, size_t *length);
 
-/* A save: begin erases the slot of the older state, put appends, end writes the header if the state is `whole`. Until the header's last
- * word is written the newest state stays what it was. With `keep_older`, or a newest state that has been damaged, the one before it is
- * kept instead, where there is one. False: the memory refused, or is full; the save is void. */
+/* A save: begin erases the slot of the older state, put appends, end writes the header if the state is `whole`.
+ * Until the header's last word is written the newest state stays as it was. With `keep_older`, or a damaged newest
+ * state, the one before it is kept instead, where there is one. False: the memory refused, or is full; the save is
+ * void. */
 bool slots_begin(void *context, bool keep_older);
 bool slots_put(void *context, const void *bytes, size_t count);
 bool slots_end(void *context, bool whole);

@@ -1,4 +1,5 @@
-/* What the parts of this target give each other. Pins are those of a BBC micro:bit's edge connector and of its USB bridge. */
+/* What the parts of this target give each other. Pins are those of a BBC micro:bit's edge connector and of its USB
+ * bridge. */
 #ifndef BOARD_H
 #define BOARD_H
 
@@ -21,8 +22,8 @@ enum {
 
 /* clock.c */
 
-/* 16 MHz by the crystal (by the internal oscillator if it does not start), microseconds and milliseconds by TIMER0, and the
- * watchdog: 8 s by the nominal 32 kHz oscillator, only stopped by a reset. */
+/* 16 MHz by the crystal (by the internal oscillator if it does not start), microseconds and milliseconds by TIMER0,
+ * and the watchdog: 8 s by the nominal 32 kHz oscillator, only stopped by a reset. */
 void clock_init(void);
 
 /* Time since start. The last is for interrupt handlers too, modulo 2^32. */

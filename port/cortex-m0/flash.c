@@ -1,5 +1,6 @@
-/* Saved state at the end of the code flash (port/app/slots.h), by the NVMC: a page of 1 KB is erased in 22.3 ms, a word written in 46 us at
- * most, and the processor stands still meanwhile, for it runs from the same flash (nRF51 Series Reference Manual 3.0, NVMC). */
+/* Saved state at the end of the code flash (port/app/slots.h), by the NVMC. A page of 1 KB is erased in 22.3 ms, a word
+ * written in 46 us at most. The processor runs from the same flash and stands still meanwhile (nRF51 Series Reference
+ * Manual 3.0, NVMC). */
 #include "board.h"
 #include "nrf51.h"
 
@@ -8,7 +9,8 @@ enum { SLOT_STRIDE = 0x8000 };
 
 /* Pages of a slot that a state of this model can take. */
 enum {
-    SLOT_PAGES = (SLOTS_HEADER_BYTES + SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) + NVMC_PAGE_BYTES - 1) / NVMC_PAGE_BYTES
+    SLOT_BYTES = SLOTS_HEADER_BYTES + SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES),
+    SLOT_PAGES = (SLOT_BYTES + NVMC_PAGE_BYTES - 1) / NVMC_PAGE_BYTES
 };
 typedef char the_state_fits_its_slot[SLOT_PAGES * NVMC_PAGE_BYTES <= SLOT_STRIDE ? 1 : -1];
 

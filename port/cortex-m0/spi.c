@@ -1,5 +1,5 @@
-/* ADIS16405 on SPI0, mode 3, 1 MHz, or 250 kHz in the sensor's slow mode. Registers one frame at a time and polled; bursts byte by
- * byte from the interrupt: this SPI has no DMA, and TXD holds one byte in waiting. */
+/* ADIS16405 on SPI0, mode 3, 1 MHz, or 250 kHz in the sensor's slow mode. Registers one frame at a time and polled;
+ * bursts byte by byte from the interrupt: this SPI has no DMA, and TXD holds one byte in waiting. */
 #include "board.h"
 #include "sensor.h"
 #include "nrf51.h"

@@ -80,7 +80,8 @@ static int wall_wait_ms(const host_t *host)
     struct timespec now;
     (void)clock_gettime(CLOCK_MONOTONIC, &now);
     const double wall = (double)(now.tv_sec - host->start.tv_sec) + 1e-9 * (double)(now.tv_nsec - host->start.tv_nsec);
-    const double wait = (double)(host->replay.passed - host->passed_at_start) / host->replay.rate_hz / host->speed - wall;
+    const double passed = (double)(host->replay.passed - host->passed_at_start) / host->replay.rate_hz;
+    const double wait = passed / host->speed - wall;
     return wait > 0.0 ? (int)ceil(fmin(wait, 1.0) * 1000.0) : 0;
 }
 

@@ -1,12 +1,12 @@
-/* The application on an emulated board (QEMU's netduinoplus2: Cortex-M4F; microbit: Cortex-M0). A recording, read through
- * semihosting, takes the sensor's place; telemetry leaves through the emulated UART as SLCAN.
+/* The application on an emulated board (QEMU's netduinoplus2: Cortex-M4F; microbit: Cortex-M0). A recording, read
+ * through semihosting, takes the sensor's place; telemetry leaves through the emulated UART as SLCAN.
  *
- * Arguments (-semihosting-config arg=...): a word, the recording's file (port/replay/replay.h), the report period in ms, and "gate" to
- * keep motion out.
+ * Arguments (-semihosting-config arg=...): a word, the recording's file (port/replay/replay.h), the report period in
+ * ms, and "gate" to keep motion out.
  * Says SELFCAL_UART on the console once it listens.
- * Time is the recording's, so every run sends the same bytes. It stands still until the host opens the channel; the emulator
- * ends when the host has closed it after the last frame. Exit code: 0; 1 if the host never came or never closed; 2 for bad
- * arguments or a bad recording; 3 for a fault of the processor. */
+ * Time is the recording's, so every run sends the same bytes. It stands still until the host opens the channel; the
+ * emulator ends when the host has closed it after the last frame. Exit code: 0; 1 if the host never came or never
+ * closed; 2 for bad arguments or a bad recording; 3 for a fault of the processor. */
 #include "app.h"
 #include "replay.h"
 #include "semihost.h"

@@ -26,13 +26,13 @@ void board_reset(void);
 typedef struct {
     uint32_t hclk_hz, pclk1_hz, pclk2_hz;
     uint32_t tim2_hz;
-    bool crystal; /* false: HSE did not start, and the internal oscillator (1 %) serves: too coarse for CAN at 500 kbit/s and more */
+    bool crystal; /* false: HSE did not start, and HSI serves: 1 %, too coarse for CAN at 500 kbit/s and more */
 } board_clock_t;
 
 extern board_clock_t board_clock;
 
-/* 168 MHz from the crystal (BOARD_HSE_HZ), from HSI if that does not start, HSI itself if the PLL does not lock; never waits
- * longer than about 20 ms. */
+/* 168 MHz from the crystal (BOARD_HSE_HZ), from HSI if that does not start, HSI itself if the PLL does not lock;
+ * never waits longer than about 20 ms. */
 void clock_init(void);
 
 /* Time since start: for the main loop; the last for interrupt handlers too, modulo 2^32. */
@@ -63,8 +63,8 @@ void sensor_burst_handler(void);
 #ifndef BOARD_CAN_KBITPS
 #define BOARD_CAN_KBITPS 500
 #endif
-#if BOARD_CAN_KBITPS != 0 && (BOARD_CAN_KBITPS < 125 || BOARD_CAN_KBITPS > 1000 || 42000 % BOARD_CAN_KBITPS != 0 || BOARD_CAN_KBITPS == 240 || \
-                              BOARD_CAN_KBITPS == 336)
+#if BOARD_CAN_KBITPS != 0 && (BOARD_CAN_KBITPS < 125 || BOARD_CAN_KBITPS > 1000 || 42000 % BOARD_CAN_KBITPS != 0 || \
+                              BOARD_CAN_KBITPS == 240 || BOARD_CAN_KBITPS == 336)
 #error "BOARD_CAN_KBITPS: 125 to 1000, and a whole part of 42 MHz with 8 to 20 quanta in a bit; or 0"
 #endif
 #ifndef BOARD_USART_BAUD
@@ -79,7 +79,8 @@ typedef struct {
     uint32_t bus_offs; /* CAN: times the controller left the bus; USART: bytes lost on reception */
 } wire_counters_t;
 
-/* False: the bit rate cannot be made exactly from this clock, or the controller does not answer. Then nothing is sent. */
+/* False: the bit rate cannot be made exactly from this clock, or the controller does not answer. Then nothing is
+ * sent. */
 bool can_init(uint32_t bit_per_s);
 bool can_send(const selfcal_frame_t *frame);
 bool can_sent(void); /* no frame waits in a mailbox */
@@ -101,7 +102,7 @@ void usart_handler(void);
 /* A random number of the RNG's; false: it has none, for want of a clock or by its own checks. 1 ms at most. */
 bool rng_number(uint32_t *number);
 
-/* --------------------------------------------------------------------------------------------- watchdog, reset cause */
+/* -------------------------------------------------------------------------------------------- watchdog, reset cause */
 
 /* Reads and clears the reset flags. */
 reset_cause_t watchdog_reset_cause(void);

@@ -1,5 +1,5 @@
-/* Telemetry on bxCAN: CAN1, RX PB8, TX PB9. Without commands no filter is active, so nothing is received (RM0090 32.7.4); with them
- * one is, for the command's identifier alone.
+/* Telemetry on bxCAN: CAN1, RX PB8, TX PB9. Without commands no filter is active, so nothing is received (RM0090
+ * 32.7.4). With commands one filter is, for the command's identifier alone.
  * Frames leave in the order they were taken (TXFP). Bus-off ends by itself after 128 x 11 recessive bits (ABOM). */
 #include "board.h"
 #include "command.h"
@@ -33,7 +33,7 @@ uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s)
         const uint32_t error = point > 875U ? point - 875U : 875U - point;
         if (error < best_error) {
             best_error = error;
-            best = (ts2 - 1U) << CAN_BTR_TS2_POS | (ts1 - 1U) << CAN_BTR_TS1_POS | (prescaler - 1U); /* SJW one quantum */
+            best = (ts2 - 1U) << CAN_BTR_TS2_POS | (ts1 - 1U) << CAN_BTR_TS1_POS | (prescaler - 1U); /* SJW: 1 */
         }
     }
     return best;
@@ -80,7 +80,8 @@ bool can_init(uint32_t bit_per_s)
 #endif
     CAN_IER = CAN_IER_TMEIE | CAN_IER_BOFIE | CAN_IER_ERRIE;
     CAN_MCR = CAN_MCR_TXFP | CAN_MCR_ABOM;
-    /* With the bus held dominant this does not come about yet; mailboxes may be filled all the same and go out when it does. */
+    /* With the bus held dominant this does not come about yet; mailboxes may be filled all the same and go out when
+     * it does. */
     (void)await_initialisation(false);
     irq_enable(IRQ_CAN1_TX);
     irq_enable(IRQ_CAN1_SCE);
@@ -140,8 +141,8 @@ void can_poll(void)
 #endif
 }
 
-/* Wakes the main loop, which fills the mailbox. A request that ends without TXOK was aborted; one that was on the bus then may
- * still have been heard (section 32.7.1). */
+/* Wakes the main loop, which fills the mailbox. A request that ends without TXOK was aborted; one that was on the
+ * bus then may still have been heard (section 32.7.1). */
 void can_tx_handler(void)
 {
     const uint32_t ended = CAN_TSR;

@@ -1,5 +1,5 @@
-/* Clocks: 168 MHz by the PLL; TIM2 counts microseconds, SysTick wakes the main loop each millisecond. RM0090 7.2 and 7.3,
- * figure 21. */
+/* Clocks: 168 MHz by the PLL; TIM2 counts microseconds, SysTick wakes the main loop each millisecond. RM0090 7.2 and
+ * 7.3, figure 21. */
 #include "board.h"
 #include "stm32f405.h"
 
@@ -16,7 +16,8 @@ enum { HSE_HZ = BOARD_HSE_HZ, HSI_HZ = 16000000, PLL_HZ = 168000000 };
 board_clock_t board_clock;
 static volatile uint32_t ticks;
 
-/* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16 MHz. */
+/* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16
+ * MHz. */
 static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
 {
     for (uint32_t turn = 0; turn < 60000U; turn++) {
@@ -56,7 +57,7 @@ void clock_init(void)
         board_clock.pclk2_hz = PLL_HZ / 4U;
         board_clock.tim2_hz = PLL_HZ / 2U; /* twice PCLK1 where that is divided, section 7.2 */
         if (board_clock.crystal) {
-            RCC_CR |= RCC_CR_CSSON; /* a crystal that stops raises NMI, which records and resets: the next start takes HSI */
+            RCC_CR |= RCC_CR_CSSON; /* a crystal that stops raises NMI, which resets: the next start takes HSI */
         }
     } else {
         RCC_CFGR = 0U;

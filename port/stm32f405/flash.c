@@ -1,5 +1,5 @@
-/* Saved state in the two last sectors of the flash (port/app/slots.h). RM0090 3.6: erase sets every bit, programming clears bits; both
- * stall reads of the flash, so the processor stands still meanwhile. */
+/* Saved state in the two last sectors of the flash (port/app/slots.h). RM0090 3.6: erase sets every bit, programming
+ * clears bits; both stall reads of the flash, so the processor stands still meanwhile. */
 #include "board.h"
 #include "stm32f405.h"
 
@@ -15,7 +15,8 @@ static bool await_idle(void)
             return false;
         }
     }
-    const uint32_t errors = FLASH_SR & (FLASH_SR_OPERR | FLASH_SR_WRPERR | FLASH_SR_PGAERR | FLASH_SR_PGPERR | FLASH_SR_PGSERR);
+    const uint32_t errors =
+        FLASH_SR & (FLASH_SR_OPERR | FLASH_SR_WRPERR | FLASH_SR_PGAERR | FLASH_SR_PGPERR | FLASH_SR_PGSERR);
     FLASH_SR = errors; /* cleared by writing 1 */
     return errors == 0U;
 }

@@ -49,8 +49,8 @@ static void board_tell(selfcal_module_t *told)
 
 static const module_board_t board_calls = {
     &bus, &flash_memory, BOARD_REPORT_MS, clock_ms, clock_ticks, BOARD_CAN_KBITPS > 0 ? can_send : usart_send,
-    BOARD_CAN_KBITPS > 0 ? can_sent : usart_sent, BOARD_CAN_KBITPS > 0 ? can_poll : usart_poll, board_sleep, watchdog_feed, board_tell,
-    rng_number, board_reset,
+    BOARD_CAN_KBITPS > 0 ? can_sent : usart_sent, BOARD_CAN_KBITPS > 0 ? can_poll : usart_poll, board_sleep,
+    watchdog_feed, board_tell, rng_number, board_reset,
 };
 
 int main(void)

@@ -6,7 +6,8 @@ static bool next(uint32_t *number)
 {
     const uint32_t start = clock_us32();
     while ((RNG_SR & RNG_SR_DRDY) == 0U) {
-        if ((RNG_SR & (RNG_SR_CECS | RNG_SR_SECS)) != 0U || clock_us32() - start > 300U) { /* a number takes 40 periods of the clock */
+        /* A number takes 40 periods of the clock. */
+        if ((RNG_SR & (RNG_SR_CECS | RNG_SR_SECS)) != 0U || clock_us32() - start > 300U) {
             return false;
         }
     }
@@ -20,7 +21,8 @@ bool rng_number(uint32_t *number)
     RCC_AHB2ENR |= RCC_AHB2ENR_RNG;
     (void)RCC_AHB2ENR;
     RNG_CR = RNG_CR_RNGEN;
-    /* The first number after it is switched on is only for comparison; two equal ones are a failure (section 24.3.1). */
+    /* The first number after it is switched on is only for comparison; two equal ones are a failure (section
+     * 24.3.1). */
     const bool done = next(&before) && next(number) && *number != before;
     RNG_CR = 0U;
     return done;

@@ -1,5 +1,6 @@
-/* ADIS16405 on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. Registers one
- * frame at a time and polled; bursts by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+/* ADIS16405 on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. Registers
+ * one frame at a time and polled; bursts by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3
+ * sends). */
 #include "board.h"
 #include "sensor.h"
 #include "stm32f405.h"
@@ -29,7 +30,8 @@ void spi_init(void)
 
     select_sensor(false);
     spi_reset_line(NULL, false);
-    /* PA5 to PA7 alternate function 5; PA4 and PB1 outputs; PB0 an input, pulled down: a missing sensor gives no edges. */
+    /* PA5 to PA7 alternate function 5; PA4 and PB1 outputs; PB0 an input, pulled down: a missing sensor gives no
+     * edges. */
     GPIO_AFR(GPIOA, 5U) = (GPIO_AFR(GPIOA, 5U) & ~0xFFF00000U) | 0x55500000U;
     GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~(0xFFU << 8)) | 0xA9U << 8;
     GPIO_OSPEEDR(GPIOA) |= 0x55U << 8;
@@ -40,14 +42,16 @@ void spi_init(void)
     while (rate < 7U && board_clock.pclk2_hz >> (rate + 1U) > SENSOR_SCK_MAX_HZ) {
         rate++;
     }
-    SPI1_CR1 = SPI_CR1_CPHA | SPI_CR1_CPOL | SPI_CR1_MSTR | rate << SPI_CR1_BR_POS | SPI_CR1_SSI | SPI_CR1_SSM | SPI_CR1_DFF16;
+    SPI1_CR1 = SPI_CR1_CPHA | SPI_CR1_CPOL | SPI_CR1_MSTR | rate << SPI_CR1_BR_POS | SPI_CR1_SSI | SPI_CR1_SSM |
+               SPI_CR1_DFF16;
     SPI1_CR1 |= SPI_CR1_SPE;
 
     SYSCFG_EXTICR1 = (SYSCFG_EXTICR1 & ~0xFU) | 1U; /* EXTI0 is PB0 */
     EXTI_RTSR |= BIT(READY_PIN);
     EXTI_PR = BIT(READY_PIN);
     EXTI_IMR |= BIT(READY_PIN);
-    /* They wait for the sensor, 180 us in slow mode, in which two bytes come on a line of 115200 baud: the USART cannot wait as long. */
+    /* Both wait for the sensor, 180 us in slow mode. Two bytes come in that time on a line of 115200 baud: the USART
+     * cannot wait as long. */
     irq_give_way(IRQ_EXTI0);
     irq_give_way(IRQ_DMA2_STREAM0);
     irq_enable(IRQ_EXTI0);
