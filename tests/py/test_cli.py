@@ -75,8 +75,13 @@ def test_identify_loads_no_scipy_optimize() -> None:
 
 
 def test_verbs_are_functions() -> None:
+    """The command's verbs are the files, and no module has the name of one: that would hide the function."""
+    listed = set(re.findall(r"^  ([a-z]+) ", run("--help").stdout.partition("Commands:")[2], re.MULTILINE))
+    assert listed == set(selfcal.VERBS)
+    folder = Path(selfcal.__file__).parent
     for verb in selfcal.VERBS:
         assert callable(getattr(selfcal, verb))
+        assert not (folder / verb).exists() and not (folder / f"{verb}.py").exists()
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = selfcal.nonsense
 

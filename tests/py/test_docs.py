@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -88,6 +89,17 @@ def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
     ]
     told = re.search(r"has gained ([0-9.]+) nats", text)
     assert told is not None and math.isclose(float(told[1]), best[1] - best[0], rel_tol=0.01)
+
+
+def test_the_python_example_runs(tmp_path: Path) -> None:
+    """As printed, with the number that stands behind its `print`."""
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    shutil.copy(ROOT / "tools" / "selfcal" / "models" / "default.yaml", tmp_path / "my.yaml")
+    example = blocks(ROOT / "tools" / "README.md", "python")[0]
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
+    told = re.search(r"^print.*# ([0-9.]+)$", example, re.MULTILINE)
+    assert told is not None and math.isclose(float(done.stdout), float(told[1]), rel_tol=0.02)
+    assert (tmp_path / "my.csv").exists() and (tmp_path / "tables" / "selfcal_model.c").exists()
 
 
 def test_the_cost_table_is_the_one_of_the_bench() -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 from test_wire import spoil
 
 from selfcal import cli
-from selfcal.dbc import PLACE_NAMES
+from selfcal.dbc_file import PLACE_NAMES
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.model import Model

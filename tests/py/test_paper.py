@@ -11,7 +11,7 @@ import pytest
 
 from selfcal.errors import UserError
 from selfcal.model import Model
-from selfcal.paper import section3, section4
+from selfcal.paper_figures import section3, section4
 from selfcal.verbs.paper import paper, show
 
 from conftest import SHARED_DATA, run

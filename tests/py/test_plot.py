@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from matplotlib import pyplot
 
-from selfcal.dbc import BY_PLACE, Names
+from selfcal.dbc_file import BY_PLACE, Names
 from selfcal.model import Model
 from selfcal.plot import plot_run
 from selfcal.wire import AxisReport, names_of

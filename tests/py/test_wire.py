@@ -26,7 +26,7 @@ import pytest
 from numpy.typing import NDArray
 
 from selfcal import frames_codegen
-from selfcal.dbc import Names, dbc
+from selfcal.dbc_file import Names, dbc
 from selfcal.errors import UserError
 from selfcal.wire import AXES, AxisReport, Decoder, Statistics, Streams, crc12, frame_crc, load_dbc, open_bus
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-VERBS = ("codegen", "identify", "monitor", "montecarlo", "replay", "rivals", "simulate")
+#: A verb is a file of `verbs` with a function of its name.
+VERBS = tuple(sorted(path.stem for path in Path(__file__).with_name("verbs").glob("[a-z]*.py")))
 
 
 def __getattr__(name: str) -> Any:

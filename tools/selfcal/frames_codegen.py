@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
-from selfcal.dbc import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
+from selfcal.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
 from selfcal.errors import UserError
 from selfcal.units import parameter_unit
 from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc

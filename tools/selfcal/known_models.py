@@ -9,7 +9,7 @@ from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 
-from selfcal.dbc import BY_PLACE, Names
+from selfcal.dbc_file import BY_PLACE, Names
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.tables import Tables, make_tables

@@ -14,7 +14,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from selfcal.dbc import BY_PLACE, PLACE_NAMES, Names
+from selfcal.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.units import parameter_unit, typeset
 from selfcal.wire import OFF_GRID, AxisReport, Decoder, Statistics, Streams, axis_unit, status_text
 

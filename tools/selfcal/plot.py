@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.dbc import BY_PLACE, PLACE_NAMES, Names
+from selfcal.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.errors import UserError, printable
 from selfcal.output import whole
 from selfcal.units import factor, known, parameter_unit, same_kind, typeset

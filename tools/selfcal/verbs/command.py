@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from selfcal.dbc import NODE_IDS, NODES
+from selfcal.dbc_file import NODE_IDS, NODES
 from selfcal.errors import UserError
 from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of, open_bus, serial_ports
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from selfcal.dbc import COLUMNS, HYPOTHESES, NODES
-from selfcal.dbc import dbc as text_of
+from selfcal.dbc_file import COLUMNS, HYPOTHESES, NODES
+from selfcal.dbc_file import dbc as text_of
 from selfcal.document import check_writable
 from selfcal.errors import UserError
 from selfcal.model import Model

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from selfcal.dbc import NODES
+from selfcal.dbc_file import NODES
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import load

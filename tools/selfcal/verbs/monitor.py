@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.console import Console
 
 from selfcal.checks import Judged
-from selfcal.dbc import NODES, Names
+from selfcal.dbc_file import NODES, Names
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError

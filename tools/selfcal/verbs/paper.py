@@ -19,8 +19,8 @@ from selfcal.document import check_writable
 from selfcal.errors import UserError, note, printable
 from selfcal.model import Model
 from selfcal.output import write_text
-from selfcal.paper import section3, section4
-from selfcal.paper.told import Told
+from selfcal.paper_figures import section3, section4
+from selfcal.paper_figures.told import Told
 
 #: Where the real recordings are looked for, beside the repository.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))

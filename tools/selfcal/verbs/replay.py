@@ -23,7 +23,7 @@ from rich.console import Console
 
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_lattice
-from selfcal.dbc import HYPOTHESES
+from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError, note

@@ -14,8 +14,8 @@ from selfcal.diagnosis.chart import Band, Curve, Figure, Panel
 from selfcal.methods.allan import fit
 from selfcal.methods.problem import HALF_90, Problem, Value
 from selfcal.model import Model, Prior
-from selfcal.paper.section3 import PAPER, over_time
-from selfcal.paper.told import Told
+from selfcal.paper_figures.section3 import PAPER, over_time
+from selfcal.paper_figures.told import Told
 from selfcal.recording import as_float, load
 from selfcal.result import AxisResult
 from selfcal.tables import make_tables

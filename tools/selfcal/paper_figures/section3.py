@@ -16,7 +16,7 @@ from selfcal.laws import NAMED
 from selfcal.methods.allan import curve
 from selfcal.methods.problem import Problem
 from selfcal.model import DEFAULT, Model
-from selfcal.paper.told import Told
+from selfcal.paper_figures.told import Told
 from selfcal.result import AxisResult
 from selfcal.spread import Row, spread
 from selfcal.tables import make_tables
