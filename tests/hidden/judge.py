@@ -335,6 +335,7 @@ def command_line(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--records", type=int, default=20, help="records a cause and size")
     parser.add_argument("--seed", type=int, default=today, help="today's date if not given")
     parser.add_argument("--rate", type=float, help="Hz: this rate alone")
+    parser.add_argument("--processes", type=int, default=2, help="records at a time")
     return parser
 
 
@@ -359,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.save:
         options.save.mkdir(parents=True, exist_ok=True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    answers = run(work, answer, options.detector, options.save)
+    answers = run(work, answer, options.detector, options.save, processes=options.processes)
     options.out.write_text(json.dumps(answers, default=float) + "\n")
     lines, gains = requirements(answers), held_out(answers)
     faults = Counter(each["error"] for each in answers if "error" in each)
