@@ -137,6 +137,12 @@ def _provisional(
     return one.state
 
 
+def _wild(state: State, record: Record) -> float:
+    """Share of the samples that are outliers beyond doubt: they make an axis loud by itself."""
+    looks = noise.outliers(state, record)
+    return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
+
+
 def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
@@ -146,11 +152,12 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         quieted = pool.map(lambda state: _provisional(state, record, advance), states.values())
         quiet = dict(zip(states, quieted, strict=True))
-    moved = integrity.motion(replace(record, axes=quiet)) if len(states) > 1 else {}
+    wild = {name: _wild(state, record) for name, state in quiet.items()}
+    moved = integrity.motion(replace(record, axes=quiet), wild) if len(states) > 1 else {}
     if moved:
         # A jump of several axes is loud on them as well. Motion is loud beside the jump that fits it best.
         quiet |= {name: _provisional(quiet[name], record, advance, (step.looks,)) for name in moved}
-        moved = integrity.motion(replace(record, axes=quiet))
+        moved = integrity.motion(replace(record, axes=quiet), wild)
     if moved:
         mask = next(iter(moved.values()))[1]
         for name in states:
