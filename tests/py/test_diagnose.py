@@ -92,6 +92,19 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     assert sums.coefficients()[0] == pytest.approx(c, rel=1e-5, abs=1e-6)
 
 
+def test_a_column_of_zeros_has_no_coefficient() -> None:
+    """A step that comes later than the samples. Truth: the same without the column."""
+    random = np.random.default_rng(0)
+    y, more = random.standard_normal(300).cumsum(), random.standard_normal((6, 300)).cumsum(axis=1)
+    terms, theta = Terms(walk=True), np.array([-1.0])
+    columns = [np.vstack([np.ones(300), more]), np.vstack([np.ones(300), more, np.zeros(300)])]
+    without, beside = (
+        run_filter(Series(y, 1.0, np.ones(300), each), terms, theta)[0][0].coefficients() for each in columns
+    )
+    assert beside[0] == pytest.approx([*without[0], 0.0], rel=1e-9)
+    assert beside[2] == pytest.approx(without[2])
+
+
 def test_a_fit_finds_the_parameters() -> None:
     """Truth: the numbers that the record was drawn with; four standard errors of N, and a factor of 1.5 of K."""
     random = np.random.default_rng(3)
@@ -199,6 +212,38 @@ def test_a_jump_of_two_axes_is_no_motion_and_stands_where_it_is(tmp_path: Path) 
         assert time["q05"] - 0.5 < place - 0.5 < time["q95"] + 0.5
         assert time["sd"] >= 0.28  # no better than between two readings
         assert abs(amplitude["median"] - size) < 3.0 * amplitude["sd"]
+
+
+@pytest.mark.parametrize("seed", [3, 20])
+def test_two_jumps_are_told_apart(seed: int, tmp_path: Path) -> None:
+    """Two jumps of much the same worth. Truth: their times; the interval of one holds nothing of the other."""
+    random = np.random.default_rng(seed)
+    y = 0.1 * random.standard_normal(3000) + 0.005 * random.standard_normal(3000).cumsum()
+    y[900:] += 0.25
+    y[2100:] += 0.25
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 1.0)
+    findings = diagnose(tmp_path / "log.npz", axes=["gx"])["axes"]["gx"]["findings"]
+    assert [finding["cause"] for finding in findings] == ["step", "step"]
+    times = sorted((finding["estimate"]["time_s"] for finding in findings), key=lambda time: float(time["median"]))
+    for time, place in zip(times, (900, 2100), strict=True):
+        assert place - 20.0 < time["q05"] < time["q95"] < place + 20.0
+
+
+@pytest.mark.parametrize("seed", [12, 37])
+def test_outliers_of_one_axis_move_no_other(seed: int, tmp_path: Path) -> None:
+    """Six axes of white noise, one in a hundred samples of the last 5 to 8 times as wide. The seeds are those of 40 in
+    which the other axes are the loudest beside an outlier by chance."""
+    random = np.random.default_rng(seed)
+    n = 2500
+    values = 0.1 * random.standard_normal((6, n))
+    wild = random.random(n) < 0.01
+    values[5, wild] *= random.uniform(5.0, 8.0, wild.sum())
+    axes = dict(zip(("gx", "gy", "gz", "ax", "ay", "az"), values, strict=True))
+    units = {name: "deg/s" if name[0] == "g" else "m/s^2" for name in axes}
+    save(tmp_path / "log.npz", {name: (units[name], row) for name, row in axes.items()}, 1.0)
+    document = diagnose(tmp_path / "log.npz", axes=["gx", "az"])
+    assert document["axes"]["gx"]["findings"] == []
+    assert [finding["cause"] for finding in document["axes"]["az"]["findings"]] == ["outliers"]
 
 
 def test_what_no_cause_explains_is_told_with_its_statistic(tmp_path: Path) -> None:

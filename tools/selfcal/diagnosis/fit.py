@@ -59,8 +59,11 @@ class Sums:
     def coefficients(self) -> tuple[Array, Array, float]:
         """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares."""
         A, B = self.G[1:, 1:], self.G[1:, 0]
-        scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
+        # A column of zeros, a step later than these samples, has no coefficient.
+        size = np.sqrt(np.maximum(np.diag(A), 0.0))
+        scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 1e-150)
+        both = np.outer(scale, scale)
+        inverse = np.linalg.pinv(A * both, rcond=1e-10, hermitian=True) * both
         c = inverse @ B
         return c, inverse, max(float(self.G[0, 0] - B @ c), 1e-300)
 
