@@ -246,6 +246,20 @@ def test_outliers_of_one_axis_move_no_other(seed: int, tmp_path: Path) -> None:
     assert [finding["cause"] for finding in document["axes"]["az"]["findings"]] == ["outliers"]
 
 
+def test_shaken_accelerometers_move_no_gyroscope(tmp_path: Path) -> None:
+    """Three bursts of 5 s on the accelerometers alone. Truth: the axes that were shaken."""
+    random = np.random.default_rng(2)
+    values = 0.1 * random.standard_normal((6, 3000))
+    for place in (600, 1500, 2400):
+        values[3:, place : place + 5] *= 3.0
+    axes = dict(zip(("gx", "gy", "gz", "ax", "ay", "az"), values, strict=True))
+    units = {name: "deg/s" if name[0] == "g" else "m/s^2" for name in axes}
+    save(tmp_path / "log.npz", {name: (units[name], row) for name, row in axes.items()}, 1.0)
+    found = diagnose(tmp_path / "log.npz")["axes"]
+    causes = {name: [finding["cause"] for finding in axis["findings"]] for name, axis in found.items()}
+    assert causes == {name: [] if name[0] == "g" else ["motion"] for name in axes}
+
+
 def test_what_no_cause_explains_is_told_with_its_statistic(tmp_path: Path) -> None:
     """White noise with an echo of itself 157 samples later, and with a line that sweeps; the third axis is clean."""
     random = np.random.default_rng(8)

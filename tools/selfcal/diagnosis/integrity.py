@@ -30,6 +30,11 @@ MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
 #: Samples of which the level of an axis takes means at least: the median of single squares is off by 10 % at 1 Hz, and
 #: two axes that are both taken for too quiet look moved.
 LEVEL_BLOCK = 20
+#: How much of the others' energy an axis may show where it moves.
+SENSITIVITIES = (1.0, 0.5, 0.25)
+#: Nats that speak for motion of the gyroscopes, or of the accelerometers, where the others move. The bursts are those
+#: in which all together are loudest.
+KIND_LEAST = 2.0
 #: Pieces at most: they take 3 KB each.
 PIECES_MOST = 40_000
 #: ln of the evidence for motion that is told. Of 264 clean records at 1 Hz two show more than 2: 3.6 and 4.4.
@@ -219,9 +224,10 @@ def motion(record: Record, wild: Mapping[str, float]) -> dict[str, tuple[Look, M
         mask[max(0, a - pad) : b + pad] = True
     found: dict[str, tuple[Look, Mask]] = {}
     for k, name in enumerate(names):
-        shown = [(a, b) for a, b in joined if _shares(power[:, a:b], k)]
-        if not shown:
+        kind = np.array([record.axes[other].unit == record.axes[name].unit for other in names])
+        if _louder(power, joined, kind) < KIND_LEAST or _louder(power, joined, np.arange(len(names)) == k) < 0.0:
             continue
+        shown = [(a, b) for a, b in joined if _shares(power[:, a:b], k)] or joined
         look = Look(
             "motion",
             sum(_burst(power[k, a:b]) for a, b in joined),
@@ -321,6 +327,18 @@ def _excess(mean: Array) -> Array:
 
 def _burst(power: Array) -> float:
     return 0.5 * power.size * float(_excess(power.mean()))
+
+
+def _louder(power: Array, bursts: list[tuple[int, int]], own: Mask) -> float:
+    """ln of the likelihood that the axes `own` are louder in the bursts, in proportion to the others [axes, n], over
+    that of rest; infinite without others."""
+    if own.all():
+        return math.inf
+    mean = np.array([power[own, a:b].mean() for a, b in bursts])
+    others = np.array([max(1.0, float(power[~own, a:b].mean())) for a, b in bursts])
+    size = np.array([b - a for a, b in bursts])
+    ratio = 1.0 + np.outer(SENSITIVITIES, others - 1.0)
+    return 0.5 * float(own.sum()) * float(((mean * (1.0 - 1.0 / ratio) - np.log(ratio)) @ size).max())
 
 
 def _shares(power: Array, k: int) -> bool:
