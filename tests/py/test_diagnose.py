@@ -348,6 +348,20 @@ def test_identify_names_the_strongest_suspicion(tmp_path: Path) -> None:
     axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert not axes["gx"]["adequate"] and axes["gx"]["suspicion"] == "periodic"
     assert axes["gy"]["adequate"] and "suspicion" not in axes["gy"]
+    assert "more_laws" not in axes["gx"]
+
+
+def test_identify_weighs_more_laws_where_the_drift_does_not_fit(tmp_path: Path) -> None:
+    """1/f noise, which no law of the default model is."""
+    default = DEFAULT.read_text(encoding="utf-8")
+    (tmp_path / "model.yaml").write_text(default.replace("rate_hz: 10.0", f"rate_hz: {RATE_HZ}"), encoding="utf-8")
+    simulate(tmp_path / "model.yaml", tmp_path / "log.npz", seed=2, effects=["flicker:axis=gx,B=0.2"])
+    done = run("identify", "log.npz", "--axis", "gx", "--json", "found.json", cwd=tmp_path)
+    axis = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]["gx"]
+    assert not axis["adequate"]
+    assert set(axis["hypotheses"]) == {"constant", "random_walk", "gauss_markov"}
+    assert max(axis["more_laws"], key=axis["more_laws"].__getitem__) == "flicker"
+    assert "\nwith the laws of sums.yaml: gx: flicker " in done.stdout
 
 
 def test_compare_tells_what_changed_and_no_more(tmp_path: Path) -> None:

@@ -124,6 +124,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
     suspected = [f"{name}: {axis['suspicion'].replace('_', ' ')}" for name, axis in axes.items() if "suspicion" in axis]
     if suspected:
         failed.append(f"strongest suspicion: {'; '.join(suspected)}")
+    for name, axis in axes.items():
+        if "more_laws" in axis:
+            laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
+            told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
+            failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
         failed.append(f"why, and what mends it: selfcal diagnose {printable(recording['path'])}")
     return table, [*kept, *failed]

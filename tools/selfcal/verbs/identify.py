@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from selfcal.checks import coefficients_of, judge, with_lattice
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
-from selfcal.model import Model
+from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
@@ -29,6 +30,8 @@ from selfcal.tables import make_tables
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
+#: Suspicions that a sum of drifts, or coloured noise, may be.
+SLOW = ("flicker", "colored_noise", "ramp", "step")
 
 
 def identify(
@@ -102,6 +105,9 @@ def identify(
             rate_hz = loaded_model.bank_rate_hz if decimate is None else decimate
             for name, cause in suspicions(recording, loaded_model, doubtful, rate_hz).items():
                 document["axes"][name]["suspicion"] = cause
+            if model is None:
+                progress.update(task, description="more laws")
+                _weigh_more_laws(document, recording, doubtful, decimate)
     if json is not None:
         write_json(document, json)
     if export is not None:
@@ -112,6 +118,19 @@ def identify(
         plot_allan(document, plot, datasheet=datasheet)
         console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
     return document
+
+
+def _weigh_more_laws(
+    document: dict[str, Any], recording: Recording, names: Sequence[str], decimate: float | None
+) -> None:
+    """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them."""
+    more = Model.load(DEFAULT.parent / "sums.yaml")
+    for name in names:
+        axis = document["axes"][name]
+        if axis.get("suspicion", "flicker") in SLOW:
+            with suppress(UserError):  # a record too long for these laws
+                found = identify_axis(recording, name, more, "library", decimate)
+                axis["more_laws"] = to_document(recording, {name: found})["axes"][name]["hypotheses"]
 
 
 def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tuple[str, ...]:
