@@ -14,7 +14,9 @@ namespace {
 constexpr double pi = 3.14159265358979323846;
 
 // What a stream of random numbers is for. Axis streams are numbered axis * 16 + purpose.
-enum Purpose : std::uint64_t { white, drift, flicker, outliers, motion, temperature, supply, missing, intervals, earlier };
+enum Purpose : std::uint64_t {
+    white, drift, flicker, outliers, motion, temperature, supply, missing, intervals, earlier
+};
 
 Random stream(std::uint64_t seed, std::size_t axis, Purpose purpose) { return Random(seed, axis * 16 + purpose); }
 
@@ -170,7 +172,8 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
                 value += x += term.deviation * axis.drift * std::sqrt(dt_s) * random.normal();
             }
         } else {
-            GaussMarkov x(deviation(axis.law, term, axis.drift, axis.second), bandwidth(term, axis.second), dt_s, random);
+            const double sd = deviation(axis.law, term, axis.drift, axis.second);
+            GaussMarkov x(sd, bandwidth(term, axis.second), dt_s, random);
             for (double &value : out) {
                 value += x.next();
             }
@@ -179,7 +182,8 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
     return out;
 }
 
-// White noise e becomes (e_i + theta e_(i - block)) / (1 + theta): so the means of `block` samples are a moving average of theirs.
+// White noise e becomes (e_i + theta e_(i - block)) / (1 + theta): then means of `block` samples are a moving average
+// of the means of e.
 void average(std::vector<double> &noise, double spectral_ratio, double sd, std::size_t block, Random random) {
     const double theta = (spectral_ratio - 1.0) / (spectral_ratio + 1.0);
     for (std::size_t i = noise.size(); i-- > 0;) {

@@ -13,8 +13,8 @@ namespace {
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr double ln_2pi = 1.8378770664093454836;
 
-// x_i as a linear system: state' = transition state + noise of covariance `step`, `start` that of the state at the instant
-// before the first sample, `output` what of it is read, `level` what of that is drift.
+// x_i as a linear system: state' = transition state + noise of covariance `step`. `start` is the covariance of the
+// state at the instant before the first sample. The reading has `output` times the state, the drift `level` times it.
 struct Drift {
     Eigen::MatrixXd transition, step, start;
     Eigen::RowVectorXd output, level;
@@ -170,7 +170,9 @@ Posterior combine(std::size_t laws, const std::vector<Node> &nodes, const std::v
     out.covariance.assign(laws, Eigen::Matrix3d::Zero());
     out.bias_mean.assign(laws, 0.0);
     out.bias_var.assign(laws, 0.0);
-    const auto value = [&](std::size_t j) { return Eigen::Vector3d(nodes[j].drift, nodes[j].second, nodes[j].sigma_v); };
+    const auto value = [&](std::size_t j) {
+        return Eigen::Vector3d(nodes[j].drift, nodes[j].second, nodes[j].sigma_v);
+    };
     for (std::size_t j = 0; j < nodes.size(); ++j) { // (12), (13), not yet over Pr(H = h_k | Y_i)
         const auto k = nodes[j].hypothesis;
         out.weight[j] /= sum;
@@ -205,7 +207,8 @@ double bandwidth(const Term &term, double second) { return term.stated ? term.ba
 
 double deviation(const Law &law, const Term &term, double drift, double second) {
     const double own = term.deviation * drift * (term.by_ratio ? second : 1.0);
-    const bool beside_walk = std::any_of(law.terms.begin(), law.terms.end(), [](const Term &other) { return other.walk; });
+    const auto walks = [](const Term &other) { return other.walk; };
+    const bool beside_walk = std::any_of(law.terms.begin(), law.terms.end(), walks);
     return beside_walk ? own / std::sqrt(bandwidth(term, second)) : own;
 }
 
@@ -229,7 +232,9 @@ Filtered run_filter(const Record &record, const Law &law, const Node &node, doub
 
 std::vector<Filtered> run_filters(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes) {
     std::vector<Filtered> out(nodes.size());
-    parallel_for(nodes.size(), [&](std::size_t j) { out[j] = run_filter(record, laws[nodes[j].hypothesis], nodes[j]); });
+    parallel_for(nodes.size(), [&](std::size_t j) {
+        out[j] = run_filter(record, laws[nodes[j].hypothesis], nodes[j]);
+    });
     return out;
 }
 

@@ -3,7 +3,7 @@
 // against, so it takes none of lib/'s short cuts and shares no code with it. Equation numbers are the paper's.
 //
 // One axis, sampled every dt:  y_i = x0 + x_i + v_i  (22),  x0 ~ N(bias mean, P0),  v_i ~ N(0, r_i sigma_v^2).
-// Known disturbances z (temperature, time, ...) enter as the paper's bias does, as constant states with a row of H each:
+// Known disturbances z (temperature, time, ...) enter as the paper's bias does: constant states with a row of H each.
 // y_i = x0 + x_i + c' z_i + v_i,  c ~ N(0, diag(sd^2)).
 // Two deviations from the print:
 //   - the Gauss-Markov noise gain is the exact sigma_m sqrt(1 - phi^2); the printed one,
@@ -23,11 +23,12 @@ namespace selfcal_reference {
 // The law of x_i: a sum of terms, each a random walk or a Gauss-Markov process, with the drift parameter d (K, sigma_m
 // or B) of the node. The paper's laws have one term or none; its filter takes any linear law.
 //   walk:   x_i = x_(i-1) + deviation d sqrt(dt) w_i
-//   markov: deviation d is its standard deviation, and `bandwidth` times the node's alpha (if stated: 1/s) its bandwidth.
+//   markov: its standard deviation is deviation d, its bandwidth `bandwidth` times the node's alpha (if stated: 1/s).
 //           Beside a walk, where d is a K, its standard deviation is deviation d / sqrt(bandwidth).
 //   by_ratio: the node's second parameter multiplies the deviation.
-// Coloured noise: instead of v_i (e_i + theta e_(i-1)) / (1 + theta), e_i ~ N(0, r_i sigma_v^2) (r = 1 where a sample is
-// missing), stated by the second parameter (1 + theta) / (1 - theta), the spectrum's amplitude at 0 Hz over that at 1/(2 dt).
+// Coloured noise: (e_i + theta e_(i-1)) / (1 + theta) instead of v_i, e_i ~ N(0, r_i sigma_v^2), r = 1 where a sample
+// is missing. The second parameter is (1 + theta) / (1 - theta): the spectrum's amplitude at 0 Hz over its amplitude at
+// 1/(2 dt).
 struct Term {
     bool walk = true;
     double deviation = 1.0;
@@ -76,7 +77,8 @@ struct Filtered {
     double ln_p;
     Eigen::VectorXd mean;
     Eigen::MatrixXd covariance;
-    double now_mean, now_var; // of x0 + x_i + c' z_i (a moving average is no part of x_i), with z of the last sample that is not missing
+    // Of x0 + x_i + c' z_i (a moving average is no part of x_i), with z of the last sample that is not missing.
+    double now_mean, now_var;
 };
 
 // One filter over the whole record. If `standardized` is not null it receives nu_i / sqrt(s_i) [n], NaN where missing.

@@ -204,7 +204,9 @@ def test_six_axes_at_the_full_rate_fit(core: str) -> None:
         (lambda data: data[:-1], "the recording is shorter than it says"),
     ],
 )
-def test_the_firmware_says_what_is_wrong_with_its_rows(damage, complaint, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_the_firmware_says_what_is_wrong_with_its_rows(  # type: ignore[no-untyped-def]
+    damage, complaint, tmp_path, monkeypatch
+) -> None:
     model, axes = Model.load(), ("gz",)
     recording = part(tmp_path, 10.0, axes)
     written = write_rows

@@ -200,7 +200,8 @@ def test_a_dbc_with_a_model_s_names_reads_the_frames_of_its_node() -> None:
             assert entry.name.startswith("M5_")
             values = entry.decode(bytes(frame.data), decode_choices=False)
             assert isinstance(values, dict)
-            decoded |= {f"{entry.name}.{name}": float(value) for name, value in values.items()}  # type: ignore[arg-type]
+            for name, value in values.items():
+                decoded[f"{entry.name}.{name}"] = float(value)  # type: ignore[arg-type]
         if sent.message == "STATUS":
             continue
         for k, law in enumerate(NAMES.hypotheses):

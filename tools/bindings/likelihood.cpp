@@ -230,7 +230,8 @@ template <int D> struct Filter {
         for (int a = 0; a < D; a++)
             for (int b = a; b < D; b++) {
                 const int before = b > 0 ? b - 1 : 0, after = b < D - 1 ? b + 1 : b;
-                P[a][b] = P[b][a] = in.Q[a * D + b] + FA[a][before] * below[b] + FA[a][b] * on[b] + FA[a][after] * above[b];
+                P[a][b] = P[b][a] =
+                    in.Q[a * D + b] + FA[a][before] * below[b] + FA[a][b] * on[b] + FA[a][after] * above[b];
             }
         if (in.driver >= 0)
             P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[i] - 1.0);
@@ -410,7 +411,12 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
                 throw std::invalid_argument("F must be block diagonal with blocks of one or two states");
     const int c = static_cast<int>(p) + 1;
     const std::size_t m = marks.size();
-    Sums out{fresh(m * c * c), fresh(m), fresh(m), fresh(m * c * d), innovations ? fresh(n * c) : nullptr, innovations ? fresh(n) : nullptr};
+    Sums out{fresh(m * c * c),
+             fresh(m),
+             fresh(m),
+             fresh(m * c * d),
+             innovations ? fresh(n * c) : nullptr,
+             innovations ? fresh(n) : nullptr};
     Out G = array(out.G, {m, std::size_t(c), std::size_t(c)}), D = array(out.D, {m}), counted = array(out.counted, {m});
     Out x = array(out.x, {m, std::size_t(c), d});
     Out white = array(innovations ? out.white : fresh(0), {innovations ? n : 0, std::size_t(c)});

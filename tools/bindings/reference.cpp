@@ -83,7 +83,8 @@ sr::Law law_of(const LawTuple &t) {
     sr::Law law;
     law.coloured_noise = std::get<1>(t);
     for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : std::get<0>(t)) {
-        if (!(deviation > 0.0) || !std::isfinite(deviation) || (!walk && !(bandwidth > 0.0 && std::isfinite(bandwidth))))
+        const bool has_bandwidth = walk || (bandwidth > 0.0 && std::isfinite(bandwidth));
+        if (!(deviation > 0.0) || !std::isfinite(deviation) || !has_bandwidth)
             throw std::invalid_argument("deviations and bandwidths of a law must be positive");
         law.terms.push_back({walk, deviation, bandwidth, stated, by_ratio});
     }
@@ -108,19 +109,20 @@ std::vector<sr::Law> laws_of(const std::vector<LawTuple> &tuples) {
 
 sr::Node node(const std::vector<sr::Law> &laws, int hypothesis, double drift, double second, double sigma_v) {
     if (hypothesis < 0 || hypothesis >= static_cast<int>(laws.size()))
-        throw std::invalid_argument("hypothesis must be 0 to " + std::to_string(laws.size() - 1) + ", an index into the laws");
+        throw std::invalid_argument("hypothesis must be 0 to " + std::to_string(laws.size() - 1) +
+                                    ", an index into the laws");
     const sr::Node out{static_cast<std::size_t>(hypothesis), drift, second, sigma_v};
     const sr::Law &law = laws[out.hypothesis];
-    const bool has_second = law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), [](const sr::Term &term) {
-                                return term.by_ratio || (!term.walk && !term.stated);
-                            });
+    const auto takes_second = [](const sr::Term &term) { return term.by_ratio || (!term.walk && !term.stated); };
+    const bool has_second =
+        law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), takes_second);
     if (!(sigma_v > 0.0) || (!law.terms.empty() && !(drift >= 0.0)) || (has_second && !(second > 0.0)))
         throw std::invalid_argument("sigma_v and alpha or a ratio must be positive, drift at least 0");
     return out;
 }
 
-std::vector<sr::Node> node_list(const std::vector<sr::Law> &laws, const Laws &hypothesis, const Vector &drift, const Vector &second,
-                                const Vector &sigma_v) {
+std::vector<sr::Node> node_list(const std::vector<sr::Law> &laws, const Laws &hypothesis, const Vector &drift,
+                                const Vector &second, const Vector &sigma_v) {
     const std::size_t m = hypothesis.shape(0);
     if (drift.shape(0) != m || second.shape(0) != m || sigma_v.shape(0) != m)
         throw std::invalid_argument("hypothesis, drift, second and sigma_v must have one length");
@@ -237,8 +239,9 @@ NB_MODULE(_reference, m) {
     m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
     m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a,
           "second"_a, "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
-    m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a, "second"_a,
-          "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+    m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a,
+          "second"_a, "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(),
+          "coefficient_sd"_a = nb::none());
     m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "second"_a,
           "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
 

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Write build/TARGET/selfcal into a module: flash.sh TARGET (make flash TARGET=...), by the first writer of port/boards.txt
-# that is there. FLASHER names one of them; OPENOCD_INTERFACE is openocd's file for the probe.
+# Write build/TARGET/selfcal into a module: flash.sh TARGET (make flash TARGET=...), by the first writer of
+# port/boards.txt that is there. FLASHER names one of them; OPENOCD_INTERFACE is openocd's file for the probe.
 set -u
 target=$1
 
@@ -36,7 +36,8 @@ fi
 
 make --no-print-directory firmware || exit 1
 image=build/$target/selfcal
-echo "$flasher writes $image$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../; s/^ *\(.\)/ \1/' "build/$target/flags" 2>/dev/null)"
+flags=$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../; s/^ *\(.\)/ \1/' "build/$target/flags" 2>/dev/null)
+echo "$flasher writes $image$flags"
 case $flasher in
 openocd) exec openocd -f "$interface" -f "$chip" -c "program $image.elf verify reset exit" ;;
 st-flash) exec st-flash --reset write "$image.bin" 0x08000000 ;;
