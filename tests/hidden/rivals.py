@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.tsoutliers:
         print(tsoutliers(work))
         return 0
-    answers = run(work, textbook)
+    answers = run(work, textbook, processes=options.processes)
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "rivals.json").write_text(json.dumps(answers, default=float) + "\n")
     print(table(answers))

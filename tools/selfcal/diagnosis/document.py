@@ -83,7 +83,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         "cause": look.cause,
         "words": words.sentence(look.cause, estimate),
         "evidence_gain_nats": look.gain,
-        "net_nats": look.net,
+        "net_nats": min(look.net, look.gain),  # a search of less than one look is paid for by nothing
         "estimate": estimate,
         "when": list(look.when) if look.when else None,
         "found_in_round": finding.round,

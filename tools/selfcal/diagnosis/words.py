@@ -52,6 +52,15 @@ NEXT: Mapping[str, str] = {
 LABELS = {"time_s": "at", "frequency_hz": "frequency", "width_hz": "half width"}
 
 
+def _rounded(value: float, half: float) -> str:
+    """A value to the second digit of its uncertainty; 6 digits without one."""
+    if not (half > 0.0 and math.isfinite(half) and value != 0.0):
+        return f"{value:.6g}"
+    first = math.floor(math.log10(abs(value)))
+    digits = max(2, first + 1, first - math.floor(math.log10(half)) + 2)
+    return f"{value:#.{digits}g}".removesuffix(".")
+
+
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     """The cause with its size."""
     parts = []
@@ -61,7 +70,7 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             half = 0.5 * (value["q95"] - value["q05"])
             unit = "" if value["unit"] == "1" else f" {value['unit']}"
             spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
-            parts.append(f"{label} {value['median']:.6g}{spread}{unit}")
+            parts.append(f"{label} {_rounded(value['median'], half)}{spread}{unit}")
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
