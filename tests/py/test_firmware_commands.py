@@ -326,11 +326,11 @@ def test_the_serial_line_loses_nothing_beside_the_sensor(baud: int, rate_hz: flo
         board.run(25.0 * 10.0 / baud + 1.7e-3)
     board.run(0.02)
     assert bytes(board.text).count(b"z\r") == trials
-    assert board.value("lost_in") == board.usart.overruns == 0
+    assert board.value("line.lost") == board.usart.overruns == 0
     board.usart.host_baud = 0.8 * baud  # a host at a wrong rate
     board.usart.say(b"O\r" * 50)
     board.run(100.0 * 10.0 / baud + 0.01)
-    assert board.value("lost_in") > 10  # half of them end without a stop bit
+    assert board.value("line.lost") > 10  # half of them end without a stop bit
     assert board.machine.violations == []
     assert tap.wrong() == tap.misplaced(0) == 0
 
