@@ -265,7 +265,7 @@ flash: setup
 
 .PHONY: bench bench-counts bench-images
 BENCH := $(BUILD)/bench
-BENCH_C := $(wildcard lib/*.c tests/bench/*.c) port/app/app.c
+BENCH_C := $(wildcard lib/*.c tests/bench/*.c) $(wildcard port/app/app*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
 ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
@@ -293,7 +293,7 @@ $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c
 	    $(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
-$(BENCH)/$(1)/image.elf: LEFT_OUT := module app more
+$(BENCH)/$(1)/image.elf: LEFT_OUT := module app% more
 $(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float more
 $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
 	$(BENCH_LINK) $(ARM_$(1)) -Wl,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \

@@ -1,5 +1,5 @@
-/* What the application needs of a target: one const struct of callbacks with their context. None of them may block for
- * longer than the sensor's queue lasts. */
+/* A target gives the application one const struct of callbacks with their context. None of them may block for longer
+ * than the sensor's queue lasts. */
 #ifndef PORT_H
 #define PORT_H
 
@@ -9,8 +9,8 @@
 
 #include "selfcal.h"
 
-/* Place of an axis of the model among gx gy gz ax ay az, the order of the sensor's channels and of the bits in commands and telemetry;
- * PORT_AXES: it is none of them. */
+/* Place of an axis among gx gy gz ax ay az: the order of the sensor's channels, and of the bits in commands and
+ * telemetry. PORT_AXES: it is none of them. */
 enum { PORT_AXES = 6 };
 unsigned port_axis(const char *name);
 
@@ -31,38 +31,39 @@ typedef struct {
      * samples while a report is worked out. */
     port_sample_t (*sample)(void *context, float reading[], uint32_t *missing);
 
-    /* Takes a frame for the wire, in order; false: no room, the same frame is offered again later. With nobody listening
-     * the port takes frames and drops them. */
+    /* Takes a frame for the wire, in order. False: no room, the same frame is offered again later. With nobody
+     * listening the port takes frames and drops them. */
     bool (*send)(void *context, const selfcal_frame_t *frame);
 
     /* Nothing to do until the next sample or until the wire has room: sleep. */
     void (*idle)(void *context);
 } port_t;
 
-/* What a module has beside; a program on a host does without. The memory for saved state is two slots in turn, so that the one before
- * the newest is still there. */
+/* A module has these beside; a program on a host does without. The memory for saved state is two slots in turn, so the
+ * state before the newest is still there. */
 typedef struct {
     void *context;
 
-    /* Fills in what the target knows: reset, clock, sensor, wire. */
+    /* Fills in reset, clock, sensor and wire. */
     void (*tell)(void *context, selfcal_module_t *module);
 
     /* The newest saved state that is whole, or the one before it; NULL: there is none. */
     const void *(*stored)(void *context, bool older, size_t *length);
 
-    /* A save: begin, put until all is put, end, also after one of the others has failed (then the state is not `whole`); false: it
-     * has failed and what was saved before stands: the newest state, or with `keep_older` the one before it. May block for 2 s;
-     * samples lost meanwhile are counted by the sensor's driver. */
+    /* A save: begin, put until all is put, end. End comes also after a failure; the state is not `whole` then.
+     * False: the save has failed, and the state saved before stands: the newest, or with `keep_older` the one before
+     * it. May block for 2 s; the sensor's driver counts the samples lost meanwhile. */
     bool (*save_begin)(void *context, bool keep_older);
     bool (*save_put)(void *context, const void *bytes, size_t count);
     bool (*save_end)(void *context, bool whole);
 
-    /* Has the sensor add `wanted` to each axis of the model, as nearly as it can, reads that back, and says in `got` what it adds
-     * now; kept through a restart of the sensor. Samples of before are given no more. False: it cannot, and adds what it did. */
+    /* Has the sensor add `wanted` to each axis of the model, as nearly as it can, and reads back into `got` what it
+     * adds. Kept through a restart of the sensor. Older samples are given no more.
+     * False: it cannot, and adds the same as before. */
     bool (*write_offsets)(void *context, const float wanted[], float got[]);
 
-    /* For commands: a random number, false if there is none; whether all frames that were sent have left; and a restart. NULL without
-     * commands. */
+    /* For commands, else NULL: a random number, false if there is none; true once all frames that were sent have left;
+     * a restart. */
     bool (*random)(void *context, uint32_t *number);
     bool (*sent)(void *context);
     void (*restart)(void *context);

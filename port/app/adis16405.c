@@ -24,7 +24,8 @@ enum {
 #define DIAG_OVER_RANGE 0x0010U
 #define DIAG_FATAL (DIAG_SELF_TEST | 0x0043U) /* and flash checksum 6, supply above 5.25 V 1, below 4.75 V 0 */
 
-/* Stands while the sensor is set up: a reset that nobody asked for shows by its absence, one that was lost by its presence. */
+/* Stands while the sensor is set up: a reset that nobody asked for shows by its absence, one that was lost by its
+ * presence. */
 #define MARK 0x15A5U
 
 /* A burst word. */
@@ -36,29 +37,31 @@ enum { SUPPLY_WORD = 0, FIRST_CHANNEL = 1, TEMPERATURE_WORD = 10 };
 /* With a side channel's 12 bits: it has been read. */
 #define SIDE_READ 0x8000U
 
-/* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no motion,
- * and with nothing to compare with what could be a negative reading is refused. */
+/* Full range is 6000 LSB at every setting. A lost sign bit adds 2^13: a step of half of that within a sample is no
+ * motion, and with nothing to compare with what could be a negative reading is refused. */
 enum { SIGN_STEP = 4096 };
-/* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones once XGYRO_OFF is not
- * negative. Not of those beyond all the sensor can read, 350 deg/s. */
+/* Of such readings in a row so many within SIGN_STEP of each other are a rotation: the anomaly strikes single ones
+ * once XGYRO_OFF is not negative. Not of those beyond all the sensor can read, 350 deg/s. */
 enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000, SIGN_UNSURE = 8192 - SIGN_BEYOND };
-/* Readings of DIAG_STAT in a row, 0.1 s apart, that excuse missing samples; starts that MARK ends before its registers are believed. */
+/* Readings of DIAG_STAT in a row, 0.1 s apart, that excuse missing samples; starts that MARK ends before its
+ * registers are believed. */
 enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
-/* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel). From the third in a
- * row on they are withheld, the sixteenth is a fault. */
+/* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel).
+ * From the third in a row on they are withheld, the sixteenth is a fault. */
 enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16 };
 enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor that is stuck still gives none */
 #define RESET_PULSE_US 1000U
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
 #define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
-/* Samples further apart than this and 1.5 periods, or closer than 3/4 of one: something else may have reset the sensor, which takes 170 ms
- * and leaves a rate of its own. What follows is taken once the settings have been found to stand. */
+/* Samples further apart than this and 1.5 periods, or closer than 3/4 of one: something else may have reset the
+ * sensor, which takes 170 ms and leaves a rate of its own. What follows is taken once the settings have been found
+ * to stand. */
 #define DOUBT_US 100000U
-/* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does to the settings what
- * is looked for. They take 5 words, 0.2 ms (0.9 ms in slow mode, which a quarter of its period holds), and wait for room between two
- * bursts; five times so long at most, then at the cost of a sample. */
+/* Between readings of the settings without a cause. Seldom, since a bit error makes a write of a read, and that does
+ * to the settings what is looked for. They take 5 words, 0.2 ms (0.9 ms in slow mode, which a quarter of its period
+ * holds), and wait for room between two bursts; five times so long at most, then at the cost of a sample. */
 #define CHECK_US 10000000U
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
@@ -66,9 +69,9 @@ enum { CHECKS_TRIED = 3 };
 #define BACKOFF_MIN_US 100000U
 #define BACKOFF_MAX_US 10000000U
 enum { PROVEN_SAMPLES = 1000 };
-/* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones are not taken: the
- * sensor's clock is another. After a start none is taken before one that is in its place. Steps beyond two periods and a half tell
- * nothing: the 5 % that the clock may be off add up. */
+/* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones
+ * are not taken: the sensor's clock is another. After a start none is taken before one that is in its place. Steps
+ * beyond two periods and a half tell nothing: the 5 % that the clock may be off add up. */
 enum { OFF_RATE_TAKEN = 3 };
 
 enum { STEP_PULSE, STEP_BOOT, STEP_SELF_TEST };
@@ -154,9 +157,10 @@ static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
            read_surely(self, address, &found) && offset_value(channel, found) == value;
 }
 
-/* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs (the anomaly): it is
- * taken for 0, and the bank finds so much more bias. With MARK the reset did not come about, and the registers hold what was added before;
- * a part with MARK in its own flash, improbable as it is, must not be refused for ever. */
+/* After a reset: what the registers hold, and then what has been added to that. An XGYRO_OFF below 0 loses signs
+ * (the anomaly): it is taken for 0, and the bank finds so much more bias. With MARK the reset did not come about,
+ * and the registers hold what was added before; a part with MARK in its own flash, improbable as it is, must not be
+ * refused for ever. */
 static bool restore_offsets(adis16405_t *self)
 {
     uint16_t word;
@@ -262,7 +266,7 @@ bool adis16405_init(adis16405_t *self, const adis16405_bus_t *bus, const adis164
     return true;
 }
 
-/* -------------------------------------------------------------------------------------------------- interrupt handlers */
+/* ----------------------------------------------------------------------------------------------- interrupt handlers */
 
 static void start_burst(adis16405_t *self)
 {
@@ -356,7 +360,7 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
     self->head = head + 1U;
 }
 
-/* --------------------------------------------------------------------------------------------------------- main loop */
+/* -------------------------------------------------------------------------------------------------------- main loop */
 
 float adis16405_temperature(const adis16405_t *self)
 {
@@ -370,7 +374,8 @@ float adis16405_supply(const adis16405_t *self)
     return (side & SIDE_READ) != 0U ? 2.418e-3F * (float)(side & 0xFFFU) : NAN;
 }
 
-/* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died is left. */
+/* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died
+ * is left. */
 static void hold(adis16405_t *self)
 {
     const uint32_t start = self->bus->time_us32(self->bus->context);
@@ -422,7 +427,8 @@ bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], fl
         self->tail = self->head;
         bool done = true;
         for (size_t channel = 0; channel < ADIS16405_AXES && done; channel++) {
-            done = added[channel] == self->added[channel] || write_offset(self, channel, self->base[channel] + added[channel]);
+            done = added[channel] == self->added[channel] ||
+                   write_offset(self, channel, self->base[channel] + added[channel]);
         }
         self->settling = (uint8_t)(2U + (2U << (self->filter & 7U)));
         expect(self, self->bus->time_us(self->bus->context));
@@ -465,13 +471,14 @@ static void start_on(adis16405_t *self, uint64_t now)
         }
         if (!read_surely(self, PRODUCT_ID, &value) || value != PRODUCT) {
             fail(self, ADIS16405_ABSENT, now);
-        } else if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, self->filter) ||
-                   !write_register(self, ALM_CTRL, 0U) || !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
+        } else if (!write_register(self, SMPL_PRD, self->sample_period) ||
+                   !write_register(self, SENS_AVG, self->filter) || !write_register(self, ALM_CTRL, 0U) ||
+                   !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
             fail(self, ADIS16405_SET_UP, now);
         } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
             fail(self, ADIS16405_SELF_TEST, now);
         } else {
-            enter(self, STEP_SELF_TEST, self->bus->time_us(self->bus->context)); /* the set-up took 20 ms in slow mode */
+            enter(self, STEP_SELF_TEST, self->bus->time_us(self->bus->context)); /* the set-up took 20 ms if slow */
         }
         return;
     default: break;
@@ -544,8 +551,8 @@ static void watch(adis16405_t *self, uint64_t now)
             fail(self, ADIS16405_STATUS, now);
             return;
         }
-        if (read && (bits & DIAG_OVER_RANGE) != 0U && self->excuses < EXCUSES) { /* the samples are refused, the sensor is well */
-            self->excuses++;
+        if (read && (bits & DIAG_OVER_RANGE) != 0U && self->excuses < EXCUSES) {
+            self->excuses++; /* the samples are refused, the sensor is well */
             expect(self, now);
         }
     }

@@ -1,20 +1,19 @@
 /* Driver of the ADIS16405 inertial sensor, without a target: SPI and time come through callbacks.
  *
- * The sensor raises data-ready once a sample. The driver then reads the burst twice: a burst has no checksum, but the
- * output registers stand still until the next sample, so whatever the wires did to one reading shows as a difference
- * between the two. A sample is delivered only if
+ * READING  The sensor raises data-ready once a sample. The driver then reads the burst twice. A burst has no checksum,
+ *   but the output registers stand still until the next sample: damage on the wires shows as a difference between the
+ *   two readings. A sample is delivered only if
  *   - the first reading has ND (new data) set and EA (error/alarm) clear on all six inertial channels,
  *   - the second one has the same 14 bits everywhere,
  *   - XGYRO_OUT has not lost its sign bit (known anomaly of the part: a step of +2^13 LSB).
- * After a pause, or with samples that come too fast, the settings are read first (something else may have reset the sensor), and
- * every ten seconds without a cause, fifty at most.
- * Everything else is counted, and time passes: the next sample delivered says how many are missing before it, by the clock
- * and the sensor's own sample period, which is tracked.
- *
- * Trouble that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state; the
- * driver resets the sensor and tries again, at first after 0.1 s, then with doubled delays up to 10 s. Nothing blocks for
- * longer than a register access, about 70 us each (350 us in the sensor's slow mode), some ten of them in a row; a hundred when the
- * sensor is started.
+ *   Everything else is counted, and time passes: the next delivered sample tells how many are missing before it, by
+ *   the clock and the sensor's own sample period, which is tracked.
+ * SETTINGS  They are read back every ten seconds, fifty at most. So they are after a pause, and when samples come too
+ *   fast, before a sample is taken: something else may have reset the sensor.
+ * TROUBLE  that does not pass (absent, silent, stuck, failed self-test, supply out of range) ends in a fault state.
+ *   The driver resets the sensor and tries again, at first after 0.1 s, then with doubled delays up to 10 s.
+ * TIME  Nothing blocks for longer than a register access, about 70 us each (350 us in the sensor's slow mode): some
+ *   ten of them in a row, a hundred when the sensor is started.
  *
  * Registers and bits: ADIS16400/ADIS16405 data sheet, table 8 and the register tables after it. */
 #ifndef ADIS16405_H
@@ -26,16 +25,16 @@
 #define ADIS16405_AXES 6U         /* gx gy gz ax ay az */
 #define ADIS16405_BURST_WORDS 12U /* supply, 3 gyro, 3 accel, 3 magn, temperature, aux */
 
-/* The sensor makes 1638.4 / n Hz, n = 1 .. 128: the nearest n of a rate up to 1638.4 Hz, and whether that makes it to 0.1 %. Constant
- * expressions where the rate is one. */
+/* The sensor makes 1638.4 / n Hz, n = 1 .. 128. The nearest n of a rate up to 1638.4 Hz; true if n makes it to 0.1 %.
+ * Constant expressions where the rate is one. */
 #define ADIS16405_DIVIDER(rate_hz) ((uint32_t)(1638.4F / (rate_hz) + 0.5F))
 #define ADIS16405_OFF(rate_hz) (1638.4F / (rate_hz) - (float)ADIS16405_DIVIDER(rate_hz))
 #define ADIS16405_HAS_RATE(rate_hz) \
     (1638.4F / (rate_hz) >= 1.0F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) && \
      ADIS16405_OFF(rate_hz) >= -1.6384F / (rate_hz))
 
-/* Data sheet, timing specifications: with SMPL_PRD of 0x0A and more (n > 10) SCK is 300 kHz at most and frames lie 75 us apart. Below
- * that 2 MHz, 1 MHz in a burst, and 9 us. */
+/* Data sheet, timing specifications: with SMPL_PRD of 0x0A and more (n > 10) SCK is 300 kHz at most and frames lie
+ * 75 us apart. Below that 2 MHz, 1 MHz in a burst, and 9 us. */
 #define ADIS16405_SLOW(rate_hz) (ADIS16405_DIVIDER(rate_hz) > 10U)
 #define ADIS16405_SCK_MAX_HZ(rate_hz) (ADIS16405_SLOW(rate_hz) ? 300000U : 1000000U)
 #define ADIS16405_STALL_US(rate_hz) (ADIS16405_SLOW(rate_hz) ? 80U : 10U)
@@ -56,8 +55,8 @@ typedef struct adis16405_bus {
     /* One frame of 16 bits each way with chip select low around it, SPI mode 3, at most ADIS16405_SCK_MAX_HZ, then
      * ADIS16405_STALL_US of rest. Bounded; false: it did not take place. */
     bool (*word)(void *context, uint16_t out, uint16_t *in);
-    /* Begins a burst (0x3E00, then 12 words, chip select low throughout); its end is told by adis16405_burst(). Breaks off
-     * one under way. */
+    /* Begins a burst (0x3E00, then 12 words, chip select low throughout); its end is told by adis16405_burst().
+     * Breaks off one under way. */
     bool (*burst)(void *context);
     /* The sensor's reset line; not needed where it is not wired, the driver also resets by command. */
     void (*reset_line)(void *context, bool low);
@@ -72,7 +71,7 @@ typedef enum {
 typedef enum {
     ADIS16405_NO_FAULT = 0,
     ADIS16405_ABSENT = 1,    /* PRODUCT_ID is not 16405 */
-    ADIS16405_SET_UP = 2,    /* a register did not read back as written, or has changed since; or a reset did not come about */
+    ADIS16405_SET_UP = 2,    /* a register did not read back, or has changed since; or no reset came about */
     ADIS16405_SELF_TEST = 3, /* an axis failed it, or it did not end */
     ADIS16405_SILENT = 4,    /* no data-ready */
     ADIS16405_NO_DATA = 5,   /* data-ready, but no sample that passes the checks */
@@ -128,7 +127,7 @@ typedef struct {
     bool based;            /* `base` is known */
     int16_t last[ADIS16405_AXES];
     volatile uint16_t side[2]; /* supply and temperature, as read; 0: none yet */
-    uint32_t off_rate;     /* readings in a row whose distance in time from the one before is no whole number of periods */
+    uint32_t off_rate;     /* readings in a row that came no whole number of periods after the one before */
     uint32_t equal, unproven;
     uint32_t good;         /* samples since the start of this run */
     uint64_t progress_us;  /* when a sample was delivered last, or the run began */
@@ -157,15 +156,17 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
 /* From the main loop, every few ms at least: goes on with the start, watches, tries again. */
 void adis16405_poll(adis16405_t *self);
 
-/* From the main loop: takes no samples from here on, while interrupts come late or not at all; and goes on. Samples not taken are
- * missing in time. Waits for a reading under way, 4 ms at most. */
+/* From the main loop, while interrupts come late or not at all: takes no samples from here on, or goes on. The
+ * samples of a pause are missing in time. Waits for a reading under way, 4 ms at most. */
 void adis16405_pause(adis16405_t *self, bool on);
 
-/* Has the sensor add `wanted` (deg/s, m/s^2; 0: what it adds after a reset, but no negative XGYRO_OFF) to its readings by its offset
- * registers, and says in `got` what the nearest steps of those are, 0.0125 deg/s and 3.33 mg. Each is read back. They are written anew whenever the sensor is started, so nothing
- * goes into its flash. Samples that wait, and some that follow, are dropped: missing in time. False: beyond the registers (50 deg/s,
- * 6.8 g), or not written; the sensor adds what it did, after a restart if need be. A negative XGYRO_OFF is refused: with one the part loses the
- * sign bit of negative x rates (the anomaly above), so that a positive x bias stays. */
+/* Has the sensor add `wanted` (deg/s, m/s^2) to its readings by its offset registers. 0 is its own offset after a
+ * reset, but no negative XGYRO_OFF. `got`: the nearest steps, 0.0125 deg/s and 3.33 mg. Each register is read back.
+ * All are written anew whenever the sensor is started, so nothing goes into its flash. Samples that wait, and some
+ * that follow, are dropped: missing in time.
+ * False: beyond the registers (50 deg/s, 6.8 g), or not written. The sensor then adds the same as before, after a
+ * restart if need be. A negative XGYRO_OFF is refused: with one the part loses the sign bit of negative x rates (the
+ * anomaly above). So a positive x bias stays. */
 bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES]);
 
 /* The oldest waiting sample, deg/s and m/s^2, and the samples missing before it; false: none is waiting. */

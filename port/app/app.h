@@ -1,4 +1,5 @@
-/* The firmware application, the same on every target: samples through the stationary gate into the bank, reports out as frames.
+/* The firmware application, the same on every target: samples go through the stationary gate into the bank, reports go
+ * out as frames. app.c is its main loop, app_parts.h the map of its files.
  *
  *     app_init(&app, &port, period);
  *     app_gate(&app);
@@ -17,10 +18,11 @@
 #error "telemetry carries eight hypotheses at most"
 #endif
 #if !SELFCAL_MODEL_UNITS_SENT
-#error "each axis of the model must be one that telemetry has a message for, in the unit that it has there (lib/selfcal.dbc)"
+#error "each axis of the model must be one that telemetry has a message for, in its unit (lib/selfcal.dbc)"
 #endif
 
-/* Milliseconds between corrected samples on the wire (message CORRECTED); 0: none, and none of their memory, a report an axis. */
+/* Milliseconds between corrected samples on the wire (message CORRECTED). 0: none, and none of their memory, which is a
+ * report an axis. */
 #ifndef APP_CORRECTED_MS
 #define APP_CORRECTED_MS 0
 #endif
@@ -28,8 +30,9 @@
 #error "APP_CORRECTED_MS: milliseconds, 0 for none"
 #endif
 
-/* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: commands are taken (command.h).
- * Without it nothing that comes by the wire is looked at but the opening and closing of an SLCAN channel. */
+/* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: the image takes
+ * commands (command.h). Without a key it looks at nothing that comes by the wire but the opening and closing of an
+ * SLCAN channel. */
 #ifdef APP_COMMAND_KEY
 #define APP_COMMANDS 1
 #else
@@ -37,7 +40,8 @@
 #endif
 
 #if APP_COMMANDS
-/* An answer yet to be sent: of what comes of an order when it is obeyed, and of all that is answered as it comes. Private. */
+/* Answers that wait for the wire: one of an order, when it has been obeyed, and one of all that is answered at once.
+ * Private. */
 enum { OF_ORDER, AT_ONCE, ANSWERS };
 typedef struct {
     bool waiting;
@@ -46,7 +50,7 @@ typedef struct {
 } answer_t;
 #endif
 
-/* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all of it `memory`. */
+/* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all in `memory`. */
 typedef struct {
     const port_t *port;
     const port_module_t *module; /* NULL: none */
@@ -123,13 +127,13 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms);
 /* After app_init(), which makes it SELFCAL_NODE: the module's number on its bus. SELFCAL_BAD_ARGUMENT beyond 11. */
 selfcal_status_t app_node(app_t *app, uint8_t node);
 
-/* After app_init(): from here on only samples of rest feed the bank; while the module moves time passes as a gap. Starts with the
- * model's noise, a bound, and goes on with what is measured at rest, once 30 windows have been. False: the model has no gate, and
- * every sample counts as one of rest. */
+/* After app_init(): from here on only samples of rest feed the bank. While the module moves time passes as a gap.
+ * The gate starts with the model's noise, a bound. After 30 windows of rest it goes on with the measured noise.
+ * False: the model has no gate, and every sample counts as one of rest. */
 bool app_gate(app_t *app);
 
-/* After that: restores the newest saved state that is whole and of this model, and from here on saves, tells of the module in
- * the status, and sends a status even when no sample comes. `module` must stay. */
+/* After app_gate(): restores the newest saved state that is whole and of this model. From here on the application
+ * saves, tells of the module in the status, and sends a status even when no sample comes. `module` must stay. */
 void app_module(app_t *app, const port_module_t *module);
 
 #if APP_COMMANDS
@@ -137,12 +141,12 @@ void app_module(app_t *app, const port_module_t *module);
 void app_command(app_t *app, const uint8_t data[8]);
 #endif
 
-/* False once the bank's memory has been found corrupt, or an axis's report has been worked on, or a frame refused by the
- * port, for five minutes: then only a restart helps, and the watchdog must not be fed. */
+/* False: only a restart helps, and the watchdog must not be fed. The bank's memory was found corrupt, or an axis's
+ * report took five minutes, or the port refused a frame for five minutes. */
 bool app_healthy(const app_t *app);
 
-/* One turn of the main loop: the samples that wait, one slice of a report, and the frames the wire has room for. False once
- * the port has said PORT_END, the final report is out and the status says finished. */
+/* One turn of the main loop: the samples that wait, one slice of a report, and as many frames as the wire takes.
+ * False once the port has said PORT_END, the final report is out and the status says finished. */
 bool app_step(app_t *app);
 
 #endif

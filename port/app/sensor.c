@@ -4,11 +4,12 @@
 
 /* Two bursts, 634 us, must fit a sample period. */
 typedef char the_rate_can_be_read[(int)SELFCAL_MODEL_RATE_HZ < 1000 ? 1 : -1];
-/* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no quotient of floats.) */
+/* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no
+ * quotient of floats.) */
 static const int the_sensor_makes_the_rate = 1 / ADIS16405_HAS_RATE(SELFCAL_MODEL_RATE_HZ);
 
 static adis16405_t sensor;
-static volatile bool listening;             /* a sensor that was not reset with the processor is ready before the driver is */
+static volatile bool listening; /* a sensor that was not reset with the processor is ready before the driver is */
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 #if SELFCAL_MODEL_CHANNELS > 0
 static bool is_supply[SELFCAL_MODEL_CHANNELS]; /* else temperature */

@@ -171,94 +171,111 @@ static int fail(int code, const char *subject, const char *what)
     return code;
 }
 
-int main(int argc, char **argv)
-{
-    static host_t host;
-    static app_t app;
-    const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};
-    const char *path = NULL, *bus = NULL;
-    double report_every_s = 10.0, timeout_s = 30.0;
-    long node = SELFCAL_NODE;
-    bool gate = false, stay = false;
+typedef struct {
+    const char *path, *bus; /* the recording; the CAN device, NULL: a pseudo-terminal */
+    double report_every_s, timeout_s;
+    double speed; /* times as fast as the recording's time; 0: as fast as it goes */
+    long node;
+    bool gate, stay;
+} options_t;
 
+/* 0, or the exit code after a complaint. */
+static int parse(options_t *options, int argc, char **argv)
+{
     for (int i = 1; i < argc; i++) {
-        double *option = strcmp(argv[i], "--report-every") == 0 ? &report_every_s
-                         : strcmp(argv[i], "--realtime") == 0   ? &host.speed
-                         : strcmp(argv[i], "--timeout") == 0    ? &timeout_s
+        double *number = strcmp(argv[i], "--report-every") == 0 ? &options->report_every_s
+                         : strcmp(argv[i], "--realtime") == 0   ? &options->speed
+                         : strcmp(argv[i], "--timeout") == 0    ? &options->timeout_s
                                                                 : NULL;
-        if (option != NULL) {
-            if (i + 1 == argc || !positive(argv[i + 1], option)) {
+        if (number != NULL) {
+            if (i + 1 == argc || !positive(argv[i + 1], number)) {
                 return fail(2, argv[i], "wants a positive number");
             }
             i++;
         } else if (strcmp(argv[i], "--gate") == 0) {
-            gate = true;
+            options->gate = true;
         } else if (strcmp(argv[i], "--node") == 0) {
-            if (i + 1 == argc || !node_number(argv[i + 1], &node)) {
+            if (i + 1 == argc || !node_number(argv[i + 1], &options->node)) {
                 return fail(2, argv[i], "wants a number from 0 to 11");
             }
             i++;
         } else if (strcmp(argv[i], "--stay") == 0) {
-            stay = true;
+            options->stay = true;
         } else if (strcmp(argv[i], "--can") == 0 && i + 1 < argc) {
-            bus = argv[++i];
-        } else if (path == NULL && argv[i][0] != '-') {
-            path = argv[i];
+            options->bus = argv[++i];
+        } else if (options->path == NULL && argv[i][0] != '-') {
+            options->path = argv[i];
         } else {
             return fail(2, argv[i], "unknown argument");
         }
     }
-    if (path == NULL) {
-        return fail(2, "RECORDING", "is missing");
-    }
-    const char *error = open_recording(&host, path);
-    if (error != NULL) {
-        return fail(2, path, error);
-    }
-    if (app_init(&app, &port, (uint32_t)ceil(report_every_s * 1000.0)) != SELFCAL_OK ||
-        app_node(&app, (uint8_t)node) != SELFCAL_OK) {
-        return fail(2, "model", "refused by the library");
-    }
-    if (gate && !app_gate(&app)) {
-        return fail(2, "model", "has no gate");
-    }
+    return options->path == NULL ? fail(2, "RECORDING", "is missing") : 0;
+}
 
-    const int timeout_ms = (int)(timeout_s * 1000.0);
+static int run_on_can(host_t *host, app_t *app, const options_t *options)
+{
     bool more = true;
-    if (bus != NULL) {
-        host.on_can = true;
-        error = can_open(&host.can, bus, timeout_ms);
-        if (error != NULL) {
-            return fail(1, bus, error);
-        }
-        (void)printf("SELFCAL_CAN %s\n", bus);
-        (void)fflush(stdout);
-        start_clock(&host);
-        while (more && host.error == NULL && host.can.error == NULL) {
-            more = app_step(&app);
-        }
-        if (host.error != NULL) {
-            return fail(2, path, host.error);
-        }
-        return host.can.error != NULL ? fail(1, bus, host.can.error) : 0;
+    host->on_can = true;
+    const char *error = can_open(&host->can, options->bus, (int)(options->timeout_s * 1000.0));
+    if (error != NULL) {
+        return fail(1, options->bus, error);
     }
-    const char *device = pty_open(&host.pty, timeout_ms, stay);
+    (void)printf("SELFCAL_CAN %s\n", options->bus);
+    (void)fflush(stdout);
+    start_clock(host);
+    while (more && host->error == NULL && host->can.error == NULL) {
+        more = app_step(app);
+    }
+    if (host->error != NULL) {
+        return fail(2, options->path, host->error);
+    }
+    return host->can.error != NULL ? fail(1, options->bus, host->can.error) : 0;
+}
+
+static int run_on_pty(host_t *host, app_t *app, const options_t *options)
+{
+    bool more = true;
+    const char *device = pty_open(&host->pty, (int)(options->timeout_s * 1000.0), options->stay);
     if (device == NULL) {
         return fail(1, "pseudo-terminal", strerror(errno));
     }
     (void)printf("SELFCAL_PTY %s\n", device);
     (void)fflush(stdout);
+    while (more && host->error == NULL && await_channel(host, true)) {
+        more = app_step(app);
+    }
+    if (host->error != NULL) {
+        return fail(2, options->path, host->error);
+    }
+    if (host->pty.error != NULL) {
+        return fail(1, device, host->pty.error);
+    }
+    /* Closing the pseudo-terminal would throw away the bytes that the host has not read yet. */
+    pty_flush(&host->pty);
+    return await_channel(host, false) || host->pty.hung_up ? 0 : fail(1, device, host->pty.error);
+}
 
-    while (more && host.error == NULL && await_channel(&host, true)) {
-        more = app_step(&app);
+int main(int argc, char **argv)
+{
+    static host_t host;
+    static app_t app;
+    const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};
+    options_t options = {.report_every_s = 10.0, .timeout_s = 30.0, .node = SELFCAL_NODE};
+    const int refused = parse(&options, argc, argv);
+    if (refused != 0) {
+        return refused;
     }
-    if (host.error != NULL) {
-        return fail(2, path, host.error);
+    host.speed = options.speed;
+    const char *error = open_recording(&host, options.path);
+    if (error != NULL) {
+        return fail(2, options.path, error);
     }
-    if (host.pty.error != NULL) {
-        return fail(1, device, host.pty.error);
+    if (app_init(&app, &port, (uint32_t)ceil(options.report_every_s * 1000.0)) != SELFCAL_OK ||
+        app_node(&app, (uint8_t)options.node) != SELFCAL_OK) {
+        return fail(2, "model", "refused by the library");
     }
-    /* Closing the pseudo-terminal would throw away what the host has not read yet. */
-    pty_flush(&host.pty);
-    return await_channel(&host, false) || host.pty.hung_up ? 0 : fail(1, device, host.pty.error);
+    if (options.gate && !app_gate(&app)) {
+        return fail(2, "model", "has no gate");
+    }
+    return options.bus != NULL ? run_on_can(&host, &app, &options) : run_on_pty(&host, &app, &options);
 }

@@ -1,8 +1,8 @@
 /* A recording in the sensor's place, for the targets that replay: the host's and the emulators'.
  *
- * Little-endian: "SELFCAL1", uint32 axes, uint32 channels, float64 rate (Hz), uint64 rows. Then each row: uint32 samples
- * missing just before it, float32 reading of each axis and of each channel. Axes, channels and units are the model's.
- * Time is that of the recording: samples passed over the rate. */
+ * Little-endian: "SELFCAL1", uint32 axes, uint32 channels, float64 rate (Hz), uint64 rows. Then each row: uint32
+ * samples missing just before it, float32 reading of each axis and of each channel. Axes, channels and units are the
+ * model's. Time is that of the recording: samples passed over the rate. */
 #ifndef REPLAY_H
 #define REPLAY_H
 

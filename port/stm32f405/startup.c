@@ -31,8 +31,8 @@ void board_reset(void)
     }
 }
 
-/* `frame`: what the processor pushed on entry (PM0214 2.3.7). With the stack itself gone it may lie outside the memory; then
- * only the vector and CFSR are told. */
+/* `frame`: what the processor pushed on entry (PM0214 2.3.7). With the stack itself gone it may lie outside the
+ * memory; then only the vector and CFSR are told. */
 void fault_record(const uint32_t *frame, uint32_t vector);
 void fault_record(const uint32_t *frame, uint32_t vector)
 {
@@ -46,8 +46,8 @@ void fault_record(const uint32_t *frame, uint32_t vector)
     board_reset();
 }
 
-/* Every exception and interrupt without a handler of its own. The stack pointer is put back to its start first, because it
- * may be what is broken. */
+/* Every exception and interrupt without a handler of its own. The stack pointer is put back to its start first,
+ * because it may be what is broken. */
 __attribute__((naked)) static void unexpected(void)
 {
     __asm__ volatile("mov r0, sp\n"

@@ -5,7 +5,7 @@
 For each TARGET reads build/TARGET/selfcal.elf (`make firmware`), what gcc says of each function's stack beside its
 objects (.su) and port/TARGET/budget.json: greatest `flash`, `ram` (without stack) and `stack` in bytes, and under
 `calls` for each source file that calls through pointers the const tables of functions it calls through, or for a
-function of it (`app.c:app_command`) the functions. Exit code 1 above a budget.
+function of it (`app_commands.c:app_command`) the functions. Exit code 1 above a budget.
 
 The worst stack is that of the deepest path through the call graph of the linked image, read from its disassembly, from
 the reset vector, and upon it the deepest of the interrupt handlers with what the processor pushes (they share one

@@ -32,11 +32,12 @@ from image_sizes import FirmwareError, Image
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})
 CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
+APP = ("app.c", "app_frames.c", "app_reports.c", "app_samples.c", "app_state.c")
 #: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
 CALLS = {file: ["selfcal_regressors_code?"] for file in ("averager.c", "check.c", "posterior.c")} | {
     "bank.c": ["selfcal_regressors_code?", "selfcal_kernel_run"],
     "snapshot.c": [],
-    "app.c": ["board_time_ms", "board_sample", "board_send", "board_idle"],
+    **dict.fromkeys(APP, ["board_time_ms", "board_sample", "board_send", "board_idle"]),
     "replay.c": ["board_read"],
 }
 
@@ -181,7 +182,7 @@ def test_images_with_settings_keep_the_budgets(target: str, flags: str) -> None:
         ("app/module.c", "-DBOARD_SAVE_PERIOD_S=0", "BOARD_SAVE_PERIOD_S: 1 to"),
         ("app/module.c", "-DBOARD_SAVE_PERIOD_S=4294968U", "BOARD_SAVE_PERIOD_S: 1 to"),
         ("app/adis16405.c", "-DADIS16405_QUEUE=1000", "ADIS16405_QUEUE must be a power of two"),
-        ("app/app.c", "-DAPP_COMMAND_KEY=0x1ULL", "the_key_has_two_halves"),
+        ("app/app_commands.c", "-DAPP_COMMAND_KEY=0x1ULL", "the_key_has_two_halves"),
         ("stm32f405/main.c", "-DBOARD_REPORT_MS=0", "BOARD_REPORT_MS: 100 to"),
         ("stm32f405/main.c", "-DBOARD_CAN_KBITPS=800", "BOARD_CAN_KBITPS: 125 to 1000"),
         ("stm32f405/main.c", "-DBOARD_USART_BAUD=1200", "BOARD_USART_BAUD: 9600 to"),

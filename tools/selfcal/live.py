@@ -32,7 +32,7 @@ STATUS_LINES = 2
 #: s without a byte after which contact is lost, and how often the longest interval that was seen has to pass.
 SILENT_S, INTERVALS = 3.0, 3.0
 #: s that a module may be silent before its second status has shown how often it speaks: it sends one every 10 s
-#: (STATUS_MS in port/app/app.c), and a save takes up to 2 s.
+#: (STATUS_MS in port/app/app_frames.c), and a save takes up to 2 s.
 FIRST_S = 12.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 
