@@ -11,7 +11,7 @@
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
-#   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed16 | fixed32]
+#   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed]
 #                               random calls of the library under sanitizers, 10^7 executions
 #   make firmware [TARGET=...] [CFLAGS=...] [NODE=n] [ACCEPT=1]
 #                               build/TARGET/selfcal.elf, .bin, .hex of each board; sizes; fails above a budget
@@ -129,13 +129,14 @@ posix: $(MODEL)/selfcal_model.c
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
 WARNINGS_DOUBLE := $(filter-out -Wdouble-promotion,$(WARNINGS))
 INCLUDES := -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL)
+# What the tests look at beyond the default model.
+TEST_SIZES := -DSELFCAL_HYPOTHESES_MAX=4 -DSELFCAL_REGRESSORS_MAX=6
 TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
-TESTS_FIXED := $(foreach test,fixed block bank snapshot check averager,\
-                 $(BUILD)/c/fixed16/test_$(test) $(BUILD)/c/fixed32/test_$(test))
+TESTS_FIXED := $(foreach test,fixed block bank snapshot check intake,$(BUILD)/c/fixed/test_$(test))
 
 test: setup
 	@$(BIN)/python tests/run.py
@@ -188,25 +189,26 @@ FMA := $(if $(filter fma,$(shell grep -m1 '^flags' /proc/cpuinfo 2>/dev/null)),-
 $(BUILD)/c/plain/%: C := -O2 $(FMA) $(WARNINGS)
 SANITIZED := -O1 $(FMA) -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all
 $(BUILD)/c/sanitized/%: C := $(SANITIZED)
-$(BUILD)/c/fixed16/%: C := $(SANITIZED) -DSELFCAL_FIXED=16
-$(BUILD)/c/fixed32/%: C := $(SANITIZED) -DSELFCAL_FIXED=32
+$(BUILD)/c/fixed/%: C := $(SANITIZED) -DSELFCAL_FIXED
 # From a folder four levels below to this one, whose path may have spaces.
 BACK := ../../../..
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
-	cd $$(@D)/objects && $(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES:-I%=-I$(BACK)/%) -c $(TESTED:%=$(BACK)/%)
+	cd $$(@D)/objects && $(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES:-I%=-I$(BACK)/%) \
+	    -c $(TESTED:%=$(BACK)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
 $(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
-	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
+	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
+	    $$(filter-out %.h,$$^) -lm -o $$@
 $(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
-	$(CC) -std=c99 $$(C) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) $$(filter-out %.h,$$^) -lm -o $$@
+	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
+	    $$(filter-out %.h,$$^) -lm -o $$@
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))
-$(eval $(call C_TESTS,fixed16))
-$(eval $(call C_TESTS,fixed32))
+$(eval $(call C_TESTS,fixed))
 
 # --------------------------------------------------------------------------------------------------------------- fuzz
 
@@ -215,8 +217,8 @@ $(eval $(call C_TESTS,fixed32))
 KERNEL ?= float
 FUZZ := $(BUILD)/fuzz/$(KERNEL)
 FUZZ_SIZES := -DSELFCAL_AXES_MAX=3 -DSELFCAL_TERMS_MAX=3 -DSELFCAL_HYPOTHESES_MAX=6 -DSELFCAL_GRID_MAX=6 \
-              -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_CELLS=16 -DSELFCAL_SIGMA_CELLS=8 -DSELFCAL_HISTOGRAM=32 \
-              -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
+    -DSELFCAL_BATCH=8 -DSELFCAL_REPORT_QUALITY=0 -DSELFCAL_ALPHA_MAX=6 -DSELFCAL_HYPOTHESIS_NODES_MAX=36 \
+    -DSELFCAL_NODES_MAX=216 -DSELFCAL_RETIRE_BLOCKS=4 -DSELFCAL_REGRESSORS_MAX=2
 RUNS ?= 10000000
 
 # RUNS executions, or SECONDS seconds, beginning with the inputs found before. A failing input is left in
@@ -228,10 +230,10 @@ fuzz: $(FUZZ)/fuzz_api
 	    $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
 
 # -march=native: fused multiply-adds are no calls.
-$(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch])
+$(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch]) | $(MODEL)/selfcal_model.c
 	@mkdir -p $(@D)
-	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib $(FUZZ_SIZES) \
-	    $(patsubst fixed%,-DSELFCAL_FIXED=%,$(filter fixed%,$*)) \
+	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib -I$(MODEL) $(FUZZ_SIZES) \
+	    $(patsubst fixed,-DSELFCAL_FIXED,$(filter fixed,$*)) \
 	    '-DSELFCAL_ASSERT(condition)=((condition) ? (void)0 : __builtin_trap())' \
 	    -fsanitize=fuzzer,address,undefined,float-cast-overflow -fno-sanitize-recover=all \
 	    -fno-sanitize-coverage=trace-cmp $(filter %.c,$^) -lm -o $@
@@ -271,8 +273,6 @@ ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part has: the measuring and its records take some of it.
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
-MAP_cortex-m4f-portable := $(MAP_cortex-m4f)
-MAP_cortex-m0-32bit := $(MAP_cortex-m0)
 
 bench: setup bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
@@ -285,10 +285,10 @@ BENCH_LINK := arm-none-eabi-gcc -nostartfiles -T tests/bench/image.ld -Wl,--gc-s
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(patsubst %-portable,%,$(1:-32bit=))
+	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1)
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
 	@rm -rf $$(@D)/objects
-	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/objects
+	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) MODEL_DIR=$$(@D) OUT=$$(@D)/objects
 	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),\
 	    $(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
@@ -300,21 +300,19 @@ $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp te
 	    $$(patsubst %,$$(@D)/objects/%.o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model)) -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
-# The same without the assembly, and by 32-bit products instead of 16-bit ones.
-$(eval $(call BENCH_IMAGE,cortex-m4f-portable))
 $(eval $(call BENCH_IMAGE,cortex-m0))
-$(eval $(call BENCH_IMAGE,cortex-m0-32bit))
 
 # more.c without regressors' code, with it, and with the laws that are sums.
-MORE_plain := -DBENCH_PLAIN
-MORE_regressors :=
-MORE_sums := -DSELFCAL_TERMS_MAX=3
+MORE_plain := -DBENCH_PLAIN -DSELFCAL_REGRESSORS_MAX=6
+MORE_regressors := -DSELFCAL_REGRESSORS_MAX=6
+MORE_sums := -DSELFCAL_TERMS_MAX=3 -DBENCH_SUMS
 define BENCH_MORE
 bench-images: $(BENCH)/$(1)/$(2).elf
 $(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk \
                         tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
-	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) OUT=$$(@D)/$(2) PROGRAM_FLAGS='$(MORE_$(2))'
+	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) MODEL_DIR=$$(@D) OUT=$$(@D)/$(2) \
+	    PROGRAM_FLAGS='$(MORE_$(2))'
 	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),\
 	    $(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
 	$(BENCH_LINK) $(ARM_$(1)) -Wl,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
@@ -333,7 +331,7 @@ $(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/ben
 
 # ------------------------------------------------------------------------------------------------------------- checks
 
-CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-ruff check-mypy
+CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-house check-ruff check-mypy
 .PHONY: $(CHECKS)
 check: setup
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
@@ -347,7 +345,7 @@ check-gcc: $(MODEL)/selfcal_model.c
 	$(call each,$(GCC) $(WARNINGS),$(C_ALL))
 	$(call each,$(GCC) $(WARNINGS_DOUBLE) -DSELFCAL_REAL_DOUBLE,$(C_ALL))
 	$(call each,$(GCC) $(WARNINGS) -DSELFCAL_TERMS_MAX=3,$(wildcard lib/*.c))
-	$(call each,$(GCC) $(WARNINGS) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED=16,$(wildcard lib/*.c))
+	$(call each,$(GCC) $(WARNINGS) -DSELFCAL_TERMS_MAX=3 -DSELFCAL_FIXED,$(wildcard lib/*.c))
 
 check-clang: $(MODEL)/selfcal_model.c
 	$(call each,clang -std=c99 -O2 -c -o /dev/null $(INCLUDES) $(WARNINGS),$(C_ALL))
@@ -360,8 +358,6 @@ INCLUDES_OF = $(INCLUDES:-I$(MODEL)=-I$(BUILD)/$(1)/model) $(MACHINE_$(CORE_$(1)
 ARM_C := $(wildcard lib/*.c port/app/*.c port/replay/*.c)
 ARM_GCC := arm-none-eabi-gcc -O2 -c -o /dev/null $(ARM_COMPILE)
 check-arm: $(BOARDS:%=check-arm-%)
-	$(call each,$(ARM_GCC) $(ARM_cortex-m4f-portable) $(INCLUDES),$(wildcard lib/*.c))
-	$(call each,$(ARM_GCC) $(ARM_cortex-m0-32bit) $(INCLUDES),$(wildcard lib/*.c))
 .PHONY: $(BOARDS:%=check-arm-%)
 $(BOARDS:%=check-arm-%): check-arm-%: $(BUILD)/%/model/selfcal_model.c
 	$(call each,$(ARM_GCC) $(ARM_$(CORE_$*)) $(call INCLUDES_OF,$*),$(ARM_C) $(call EMBEDDED,$*) $<)
@@ -380,7 +376,7 @@ TIDY_CPU_cortex-m4f := -mcpu=cortex-m4
 TIDY_CPU_cortex-m0 := -mcpu=cortex-m0
 check-tidy: $(MODEL)/selfcal_model.c $(BOARDS:%=check-tidy-%)
 	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
-	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED=16 -DSELFCAL_TERMS_MAX=3)
+	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED -DSELFCAL_TERMS_MAX=3)
 .PHONY: $(BOARDS:%=check-tidy-%)
 $(BOARDS:%=check-tidy-%): check-tidy-%: $(BUILD)/%/model/selfcal_model.c
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(call EMBEDDED,$*) -- \
@@ -395,13 +391,17 @@ check-tokens:
 	        grep -vE 'typedef double (selfcal_wide_t|selfcal_real_t);'; \
 	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
 
+# Lines, conditionals, circles, lengths of functions, names.
+check-house: $(PACKAGE)
+	@$(BIN)/python tests/count_house.py
+
 check-ruff: $(PACKAGE)
 	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests host_sim
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
-	    tests/bench/bench.py tests/bench/image_sizes.py
+	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py
 	@cd tools && ../$(BIN)/mypy --no-error-summary $(addprefix ../tests/hidden/,generator.py judge.py rivals.py)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 

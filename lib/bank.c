@@ -1,47 +1,43 @@
 /* Bank sums: one scalar filter per node over every axis, and the sums its likelihood needs.
  *
- * Each node runs the zero-bias filter over the measurement and over the regressor "1" (innovations nu and u); the bias and
- * sigma_v are integrated out afterwards from A = sum u^2/s, B = sum u nu/s, C = sum nu^2/s and D = sum ln s (generalised
- * least squares; de Jong, Biometrika 78 (1991) 143-151). Everything is relative to sigma_v.
+ * Each node runs the zero-bias filter over the measurement and over the regressor "1" (innovations nu and u); the bias
+ * and sigma_v are integrated out afterwards from A = sum u^2/s, B = sum u nu/s, C = sum nu^2/s and D = sum ln s
+ * (generalised least squares; de Jong, Biometrika 78 (1991) 143-151). Everything is relative to sigma_v.
  *
  *   nu = y - x        s = r + P        K = P/s        x' = phi (x + K nu)        P' = phi^2 r P/(r + P) + q
  *
  * Two rearrangements keep float exact enough:
- * - With beta = 1 - phi and g = phi K + beta, x' = x + g nu - beta y: beta down to 1e-7 keeps its digits, and a sample costs
+ * - With beta = 1 - phi and g = phi K + beta, x' = x + g nu - beta y: beta down to 1e-7 keeps its digits, and a sample
+ * costs
  *   one subtraction and two fused multiply-adds besides its two sums.
- * - The Riccati recursion runs on d = P - p_inf, d' = phi^2 (r d + (r - 1) P p_inf) / ((1 + p_inf) (r + P)): its rounding is
- *   relative to d, which dies out, whereas P' itself would settle some 1e-7/g off (3e-4 relative at g = 1e-4). So does u,
- *   u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf: e' = (1 - g) e - (g - g_inf) u_inf, where
- *   g - g_inf = phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
+ * - The Riccati recursion runs on d = P - p_inf, d' = phi^2 (r d + (r - 1) P p_inf) / ((1 + p_inf) (r + P)): its
+ * rounding is
+ *   relative to d, which dies out, whereas P' itself would settle some 1e-7/g off (3e-4 relative at g = 1e-4). So does
+ *   u, u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf: e' = (1 - g) e - (g - g_inf) u_inf, where g - g_inf =
+ *   phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
  */
-#include "kernel.h"
+#include "bank.h"
 
 #include <float.h>
 
-/* A node counts as converged when d falls to this part of p_inf: what is left of the gain's error moves a ln-likelihood by
- * less than that many nats. */
+/* A node counts as converged when d falls to this part of p_inf: what is left of the gain's error moves a ln-likelihood
+ * by less than that many nats. */
 #define CONVERGED R(1e-6)
 
 /* u has settled when e falls to this part of u_inf; where u_inf is 0 (random walk) at U_ZERO: denormals are slow. */
 #define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
 
-/* ln of what a prior may reach, 1e-20 to 1e20 of any unit: rounding alone would carry wider limits out of a float's range. */
+/* ln of what a prior may reach, 1e-20 to 1e20 of any unit: rounding alone would carry wider limits out of a float's
+ * range. */
 #define LN_LIMIT 46.0F
 
 /* s; a bank interval of a microsecond or of ten days is no sensor's. */
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
-/* Of a term's deviation and bandwidth. */
-#define FACTOR_MIN 1e-3F
-#define FACTOR_MAX 1e3F
-
 /* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
 #define LN_RATIO_MAX 6.91F
-
-/* Bank intervals that a stated correlation time lasts at most: 1 - phi keeps its digits. */
-#define TIME_MAX 1e6F
 
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
@@ -76,40 +72,12 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     return place;
 }
 
-#if SELFCAL_TERMS_MAX > 1
-static bool valid_term(const selfcal_term_t *term, float dt_s) {
-    const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
-    const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
-    const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
-    const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
-    return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN && term->deviation <= FACTOR_MAX &&
-           (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
-}
 
-/* A sum that there are filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
-static bool valid_sum(const selfcal_law_t *law, float dt_s) {
-    unsigned by_ratio = 0;
-    for (uint8_t a = 0; a < law->terms; a++) {
-        if (!valid_term(&law->term[a], dt_s)) {
-            return false;
-        }
-        by_ratio += law->term[a].by_ratio ? 1U : 0U;
-    }
-    return law->terms > 0U && law->terms + (law->coloured_noise ? 1U : 0U) <= SELFCAL_TERMS_MAX &&
-           !(has_ratio(law) && has_alpha(law)) && (by_ratio == 0U || (by_ratio < law->terms && !law->coloured_noise));
-}
-#endif
-
-static bool valid_law(const selfcal_law_t *law, float dt_s) {
+static bool valid_law(const selfcal_law_t *law, const selfcal_states_code_t *states, float dt_s) {
     if (law == NULL || law->terms > SELFCAL_LAW_TERMS || !is_bool(&law->coloured_noise)) {
         return false;
     }
-#if SELFCAL_TERMS_MAX > 1
-    return is_plain(law) || valid_sum(law, dt_s);
-#else
-    (void)dt_s;
-    return is_plain(law);
-#endif
+    return is_plain(law) || (states != NULL && states->valid(law, dt_s));
 }
 
 bool selfcal_law_is_sum(const selfcal_law_t *law) {
@@ -118,21 +86,23 @@ bool selfcal_law_is_sum(const selfcal_law_t *law) {
 
 static bool valid_model(const selfcal_model_t *model) {
     if ((model->forgetting != NULL &&
-         (model->forgetting->code == NULL || !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
+         (model->forgetting->code == NULL ||
+          !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
         !(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {
         return false;
     }
     for (uint8_t a = 0; a < model->axes; a++) {
-        if (!valid_priors(model->axis[a].prior, 1) || !(model->axis[a].bias_sd > 0.0F) || !isfinite(model->axis[a].bias_sd)) {
+        if (!valid_priors(model->axis[a].prior, 1) || !(model->axis[a].bias_sd > 0.0F) ||
+            !isfinite(model->axis[a].bias_sd)) {
             return false;
         }
     }
     uint32_t nodes = 0;
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
-        if (!valid_law(hypothesis->law, model->dt_s) ||
+        if (!valid_law(hypothesis->law, model->states, model->dt_s) ||
             (hypothesis->prior != NULL && !valid_priors(hypothesis->prior, model->axes))) {
             return false;
         }
@@ -145,14 +115,16 @@ static bool valid_model(const selfcal_model_t *model) {
             }
         }
         if (rho != (hypothesis->rho != NULL) || alpha != (hypothesis->alpha != NULL) ||
-            (rho && !valid_grid(hypothesis->rho, SELFCAL_GRID_MAX)) || (alpha && !valid_grid(hypothesis->alpha, SELFCAL_ALPHA_MAX)) ||
+            (rho && !valid_grid(hypothesis->rho, SELFCAL_GRID_MAX)) ||
+            (alpha && !valid_grid(hypothesis->alpha, SELFCAL_ALPHA_MAX)) ||
             hypothesis_nodes(hypothesis) > SELFCAL_HYPOTHESIS_NODES_MAX) {
             return false;
         }
         nodes += hypothesis_nodes(hypothesis);
     }
     const selfcal_regressors_t *regressors = model->regressors;
-    return nodes == model->nodes && nodes <= SELFCAL_NODES_MAX && (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
+    return nodes == model->nodes && nodes <= SELFCAL_NODES_MAX &&
+        (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
 }
 
 /* A node at the instant of its first sample. */
@@ -160,13 +132,11 @@ static void init_node(selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
     selfcal_node_t *node = &self->node[index];
-#if SELFCAL_TERMS_MAX > 1
     if (is_sum(law)) {
         memset(node, 0, sizeof *node);
-        selfcal_terms_start(self, index, place);
+        self->model->states->start(self, index, place);
         return;
     }
-#endif
     const selfcal_wide_t variance = has_drift(law) ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
     selfcal_wide_t beta = 0.0;
     if (has_decay(law)) {
@@ -198,9 +168,10 @@ static void init_node(selfcal_t *self, uint16_t index) {
 }
 
 /* Between what ln of an axis's sigma_v lies, as its first batch shows it: with D_i the differences of neighbours,
- * E D_i^2 / 2 = sigma_v^2 + sigma_w^2 / 2 and -E D_i D_(i+1) = sigma_v^2. The first is the upper end. The second is not raised by
- * drift but scatters more: where drift is evident (the batch spreads twice as wide as its differences, sigma_w above some 0.8
- * sigma_v) it is the lower end, but not below a hundredth of the first. Both within the prior's limits. */
+ * E D_i^2 / 2 = sigma_v^2 + sigma_w^2 / 2 and -E D_i D_(i+1) = sigma_v^2. The first is the upper end. The second is not
+ * raised by drift but scatters more: where drift is evident (the batch spreads twice as wide as its differences,
+ * sigma_w above some 0.8 sigma_v) it is the lower end, but not below a hundredth of the first. Both within the prior's
+ * limits. */
 typedef struct {
     selfcal_real_t lo, hi;
 } ln_range_t;
@@ -227,7 +198,8 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     }
     const selfcal_prior_t *prior = &self->model->axis[axis].prior[SELFCAL_N];
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)self->model->dt_s);
-    const selfcal_real_t least = (selfcal_real_t)prior->ln_min - half_ln_dt, most = (selfcal_real_t)prior->ln_max - half_ln_dt;
+    const selfcal_real_t least = (selfcal_real_t)prior->ln_min - half_ln_dt,
+        most = (selfcal_real_t)prior->ln_max - half_ln_dt;
     ln_range_t range = {least, least};
     if (square > R(0.0)) {
         square /= (selfcal_real_t)squares;
@@ -241,8 +213,8 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     return range;
 }
 
-/* ln of sqrt(E D_i^2 / 2) over sigma_v for a moving average: E D_i^2 / 2 = sigma_v^2 (1 - theta + theta^2) / (1 + theta)^2, which in
- * the spectral ratio is sigma_v^2 (1 + 3 / ratio^2) / 4. */
+/* ln of sqrt(E D_i^2 / 2) over sigma_v for a moving average: E D_i^2 / 2 = sigma_v^2 (1 - theta + theta^2) / (1 +
+ * theta)^2, which in the spectral ratio is sigma_v^2 (1 + 3 / ratio^2) / 4. */
 static inline selfcal_real_t ln_difference_gain(selfcal_real_t ln_ratio) {
     return R(0.5) * r_log(r_fma(R(0.75), r_exp(R(-2.0) * ln_ratio), R(0.25)));
 }
@@ -254,9 +226,7 @@ static void place_nodes(selfcal_t *self) {
     ln_range_t sigma[SELFCAL_AXES_MAX];
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         sigma[axis] = first_ln_sigma(self, axis);
-#ifdef SELFCAL_FIXED
         selfcal_kernel_start(self, axis, sigma[axis].hi);
-#endif
     }
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_hypothesis_t *hypothesis = &model->hypothesis[h];
@@ -270,8 +240,8 @@ static void place_nodes(selfcal_t *self) {
             const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
             /* sigma_w = K sqrt(dt) */
             const selfcal_real_t shift = markov ? R(0.0) : half_ln_dt;
-            /* Where the drift hides the white noise a deviation beyond the last node may still count. A sum's likelihood, off which the
-             * report takes no expectation, must be level there. */
+            /* Where the drift hides the white noise a deviation beyond the last node may still count. A sum's
+             * likelihood, off which the report takes no expectation, must be level there. */
             const selfcal_real_t above = is_sum(hypothesis->law) ? R(3.0) : markov ? R(1.25) : R(0.5);
             ln_range_t ln_sigma = sigma[axis];
             if (hypothesis->law->coloured_noise) {
@@ -309,14 +279,9 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
         return SELFCAL_BAD_MODEL;
     }
     const size_t used = SELFCAL_SIZE(model->nodes, model->axes);
-    const size_t regressors = model->regressors != NULL ? model->regressors->count : 0U;
-#if SELFCAL_TERMS_MAX > 1
-    const size_t terms = selfcal_terms_nodes(model);
+    const size_t regressors = regressors_of(model), terms = sum_nodes(model);
     const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) +
                           SELFCAL_TERMS_SIZE(terms, model->axes, regressors);
-#else
-    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors);
-#endif
     if (size < needed || ((uintptr_t)memory & 7U) != 0U) {
         return SELFCAL_BAD_MEMORY;
     }
@@ -334,13 +299,30 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     if (regressors > 0U) {
         model->regressors->code->init(self, (unsigned char *)memory + used);
     }
-#if SELFCAL_TERMS_MAX > 1
     if (terms > 0U) {
-        selfcal_terms_init(self, (unsigned char *)memory + used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors));
+        model->states->init(self, (unsigned char *)memory + used +
+                                      SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors));
     }
-#endif
     selfcal_bank_pace(self, model->block);
     return SELFCAL_OK;
+}
+
+void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one,
+                          const innovations_t *other) {
+    selfcal_sum_t value = {R(0.0), R(0.0)};
+    const uint32_t count = gains->span.to - gains->span.from;
+    for (uint32_t i = 0; i < count; i++) {
+        const selfcal_real_t product = one->weighted[i] * other->nu[i];
+        const selfcal_sum_t total = two_sum(value.hi, product);
+        value.hi = total.hi;
+        value.lo += r_fma_exact(one->low[i], other->nu[i], r_fma_exact(one->weighted[i], other->nu[i], -product)) +
+            total.lo;
+    }
+    const selfcal_sum_t scale = gains->scale;
+    const selfcal_real_t product = scale.hi * value.hi;
+    const selfcal_real_t rest =
+        r_fma_exact(scale.hi, value.lo, r_fma_exact(scale.lo, value.hi, r_fma_exact(scale.hi, value.hi, -product)));
+    sum_add(sum, product, rest);
 }
 
 /* a + b - fl(a + b). */
@@ -348,8 +330,8 @@ static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real
     return r_fabs(a) > r_fabs(b) ? b - (sum - a) : a - (sum - b);
 }
 
-/* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes slowly, and would
- * tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
+/* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes
+ * slowly, and would tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
 static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, gains_t *gains) {
     const span_t span = gains->span;
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
@@ -371,7 +353,8 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         a = r_fma(u, gains->u[i], a);
         now->e = r_fma(-g, now->e, now->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, now->d);
         now->d = now->c * inv_s * r_fma(r, now->d, (r - R(1.0)) * p * node->p_inf);
-        if (r < R(0.5)) { /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
+        /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
+        if (r < R(0.5)) {
             const selfcal_wide_t ln_s = log((selfcal_wide_t)r + (selfcal_wide_t)p);
             const selfcal_real_t hi = (selfcal_real_t)ln_s;
             sum_add(&node->ln_s, hi, (selfcal_real_t)(ln_s - (selfcal_wide_t)hi));
@@ -390,8 +373,8 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
     sum_add_scaled(&node->a, gains->scale, a);
 }
 
-/* A converged node while u still moves (selfcal_kernel_level() once it does not). s is constant and kept out of the sums until they
- * are added. */
+/* A converged node while u still moves (selfcal_kernel_level() once it does not). s is constant and kept out of the
+ * sums until they are added. */
 static void gains_steady(selfcal_node_t *node, gains_t *gains) {
     const span_t span = gains->span;
     const selfcal_real_t g = steady_g(node);
@@ -424,7 +407,8 @@ static void leave_level(selfcal_t *self, size_t j) {
 /* With regressors no node counts as level: their columns always move. */
 static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     const selfcal_regressors_t *regressors = self->model->regressors;
-    void (*const run)(selfcal_t *, size_t, const gains_t *) = regressors != NULL ? regressors->code->run : selfcal_kernel_run;
+    void (*const run)(selfcal_t *, size_t, const gains_t *) = regressors != NULL ? regressors->code->run
+        : selfcal_kernel_run;
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
     for (uint32_t i = span.from; i < span.to && batch->part; i++) {
@@ -439,12 +423,10 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         selfcal_moving_t *now = &node->gains.moving;
-#if SELFCAL_TERMS_MAX > 1
-        if (selfcal_is_term_node(node)) {
-            selfcal_terms_run(self, j, &span);
+        if (is_state_node(self, node)) {
+            self->model->states->run(self, j, &span);
             continue;
         }
-#endif
         if (whole && node->level) {
             node->steady += span.to - span.from;
             continue;
@@ -479,12 +461,10 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         const size_t j = kernel_node(self, i);
         selfcal_node_t *node = &self->node[j];
         selfcal_moving_t *now = &node->gains.moving;
-#if SELFCAL_TERMS_MAX > 1
-        if (selfcal_is_term_node(node)) {
-            selfcal_terms_gap(self, j, count);
+        if (is_state_node(self, node)) {
+            self->model->states->gap(self, j, count);
             continue;
         }
-#endif
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
@@ -569,9 +549,7 @@ bool selfcal_bank_hand_over(selfcal_t *self) {
     if (self->n == 0U) {
         place_nodes(self);
     }
-#ifdef SELFCAL_FIXED
     selfcal_kernel_load(self);
-#endif
     return true;
 }
 
@@ -608,6 +586,11 @@ void selfcal_bank_gap(selfcal_t *self, uint64_t count) {
     self->pending_gap += (uint32_t)(count < room ? count : room);
 }
 
+bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
+    SELFCAL_ASSERT(axis < self->model->axes);
+    return (self->retired >> axis & 1U) != 0U;
+}
+
 uint32_t selfcal_count(const selfcal_t *self) {
     return self->n + self->batch[0].count + self->batch[1].count;
 }
@@ -628,23 +611,16 @@ selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
 void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_node_t *node = &self->node[index];
     const size_t k = (size_t)index * self->model->axes + axis;
-#if SELFCAL_TERMS_MAX > 1
-    if (selfcal_is_term_node(node)) {
-        selfcal_terms_view(self, axis, index, view);
+    if (is_state_node(self, node)) {
+        self->model->states->view(self, axis, index, view);
         return;
     }
-#endif
     view->a = sum_value(node->a) + level_a(node);
-#ifdef SELFCAL_FIXED
-    void (*const see)(const selfcal_t *, size_t, selfcal_wide_t *, selfcal_wide_t *, selfcal_wide_t *) =
-        self->columns != NULL ? self->model->regressors->code->view : selfcal_kernel_view;
-    see(self, k, &view->b, &view->c, &view->drift);
-#else
     selfcal_kernel_view(self, k, &view->b, &view->c, &view->drift);
-#endif
 }
 
-/* ln x to 1e-11, in a third of the time that log() takes in software: x = 2^k m, and m q/64 is so near 1 that its ln needs few digits. */
+/* ln x to 1e-11, in a third of the time that log() takes in software: x = 2^k m, and m q/64 is so near 1 that its ln
+ * needs few digits. */
 selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x) {
     static const selfcal_wide_t ln_q[] = { /* ln(q/64) from q = 43 on */
         -0.39768296766610944, -0.3746934494414107, -0.3522205935893521, -0.33024168687057687, -0.3087354816496133,
@@ -674,11 +650,9 @@ selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x) {
 
 void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_node_t *node = &self->node[index];
-#if SELFCAL_TERMS_MAX > 1
-    if (selfcal_is_term_node(node)) {
+    if (is_state_node(self, node)) {
         return;
     }
-#endif
     view->ln_s = sum_value(node->ln_s);
     if (node->steady != 0U) {
         view->ln_s += (selfcal_wide_t)node->steady * selfcal_bank_ln(1.0 + (selfcal_wide_t)node->p_inf);
@@ -691,11 +665,9 @@ void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t
     view->hypothesis = place.hypothesis;
     view->ln_rho = (selfcal_wide_t)place.ln_rho;
     view->ln_alpha = (selfcal_wide_t)place.ln_alpha;
-#if SELFCAL_TERMS_MAX > 1
-    if (selfcal_is_term_node(node)) {
+    if (is_state_node(self, node)) {
         return;
     }
-#endif
     const selfcal_moving_t now = moving_of(node);
     const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
     const selfcal_wide_t phi = 1.0 - beta, per_phi = beta > 0.0 ? 1.0 / phi : 1.0;
@@ -731,8 +703,4 @@ selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, sel
     }
     selfcal_bank_view(self, axis, index, view);
     return SELFCAL_OK;
-}
-
-selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v, selfcal_wide_t *ln_p) {
-    return selfcal_log_likelihood_subset(self, axis, node, 0U, sigma_v, ln_p);
 }

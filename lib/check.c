@@ -1,26 +1,39 @@
 /* Invariants of a bank: what every push, skip and report leaves true, whatever came in. */
-#include "kernel.h"
+#include "bank.h"
 
-/* The prices that selfcal.h states. */
-#ifndef SELFCAL_REAL_DOUBLE
-SELFCAL_STATIC_ASSERT(bytes_a_node, SELFCAL_SIZE(1, 0) == 56);
-#endif
-#if SELFCAL_TERMS_MAX > 1 && !defined(SELFCAL_REAL_DOUBLE) && !defined(SELFCAL_FIXED)
-SELFCAL_STATIC_ASSERT(bytes_a_node_of_a_sum, SELFCAL_TERMS_SIZE(2, 0, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 104 + 24 * 2);
-SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum, SELFCAL_TERMS_SIZE(1, 1, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 24);
-#endif
-#ifndef SELFCAL_REAL_DOUBLE
-SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20);
-SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors,
-                      SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72); /* 4 (p + 1) (p + 4) */
-#ifdef SELFCAL_FIXED
-SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
-                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 40); /* 8 p + 24 */
-#else
-SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
-                      SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 20); /* 8 p + 4 */
-#endif
-#endif
+/* Sizes of selfcal_config.h that the code can do with. */
+SELFCAL_STATIC_ASSERT(axes, SELFCAL_AXES_MAX >= 1 && SELFCAL_AXES_MAX <= 16);
+SELFCAL_STATIC_ASSERT(hypotheses, SELFCAL_HYPOTHESES_MAX >= 1 && SELFCAL_HYPOTHESES_MAX <= 16);
+SELFCAL_STATIC_ASSERT(grid_has_a_spline, SELFCAL_GRID_MAX >= 6 && SELFCAL_GRID_MAX <= 64);
+SELFCAL_STATIC_ASSERT(alpha, SELFCAL_ALPHA_MAX >= 6 && SELFCAL_ALPHA_MAX <= SELFCAL_GRID_MAX);
+SELFCAL_STATIC_ASSERT(nodes_of_one, SELFCAL_HYPOTHESIS_NODES_MAX >= SELFCAL_GRID_MAX &&
+                      SELFCAL_HYPOTHESIS_NODES_MAX <= 65535);
+SELFCAL_STATIC_ASSERT(nodes_of_all, SELFCAL_NODES_MAX >= SELFCAL_HYPOTHESIS_NODES_MAX && SELFCAL_NODES_MAX <= 65535);
+SELFCAL_STATIC_ASSERT(regressors, SELFCAL_REGRESSORS_MAX >= 1 && SELFCAL_REGRESSORS_MAX <= 6);
+SELFCAL_STATIC_ASSERT(terms, SELFCAL_TERMS_MAX == 1 || SELFCAL_TERMS_MAX == 3);
+SELFCAL_STATIC_ASSERT(a_batch_places_the_nodes, SELFCAL_BATCH >= 8 && SELFCAL_BATCH <= SELFCAL_BATCH_ROOM);
+SELFCAL_STATIC_ASSERT(push_nodes, SELFCAL_PUSH_NODES >= 1 && SELFCAL_PUSH_NODES <= 65535);
+SELFCAL_STATIC_ASSERT(push_every, SELFCAL_PUSH_EVERY >= 1 && SELFCAL_PUSH_EVERY <= 256 &&
+                                      (SELFCAL_PUSH_EVERY & (SELFCAL_PUSH_EVERY - 1)) == 0);
+SELFCAL_STATIC_ASSERT(lines, SELFCAL_LINES >= 8 && SELFCAL_LINES <= 64 && SELFCAL_LINES % 2 == 0);
+SELFCAL_STATIC_ASSERT(retire, SELFCAL_RETIRE_BLOCKS >= 0);
+SELFCAL_STATIC_ASSERT(quality, SELFCAL_REPORT_QUALITY >= 0 && SELFCAL_REPORT_QUALITY <= 3);
+
+/* The prices that selfcal_layout.h states, of the float build and the integer one. */
+#define PRICED(condition) (sizeof(selfcal_real_t) != sizeof(float) || (condition))
+SELFCAL_STATIC_ASSERT(bytes_a_node, PRICED(SELFCAL_SIZE(1, 0) == 56));
+SELFCAL_STATIC_ASSERT(bytes_a_node_and_axis, PRICED(SELFCAL_SIZE(1, 1) - SELFCAL_SIZE(1, 0) == 20));
+SELFCAL_STATIC_ASSERT(bytes_a_node_of_two_regressors, /* 4 (p + 1) (p + 4) */
+                      PRICED(SELFCAL_REGRESSORS_SIZE(2, 0, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) == 72));
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors, /* 8 p + 4, in integers 8 p + 24 */
+                      PRICED(SELFCAL_REGRESSORS_SIZE(1, 1, 2) - SELFCAL_REGRESSORS_SIZE(1, 0, 2) ==
+                             (SELFCAL_STATE_SUMS > 0U ? 40 : 20)));
+SELFCAL_STATIC_ASSERT(bytes_a_node_of_a_sum,
+                      SELFCAL_TERMS_MAX != 3 ||
+                      PRICED(SELFCAL_TERMS_SIZE(2, 0, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 104 + 24 * 2));
+SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum,
+                      SELFCAL_TERMS_MAX != 3 || SELFCAL_STATE_SUMS > 0U ||
+                      PRICED(SELFCAL_TERMS_SIZE(1, 1, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 24));
 
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
 #define Q_MAX R(1e12)
@@ -38,12 +51,8 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors,
 #define SLACK R(1e-5)
 
 static bool flags_are_bools(const selfcal_t *self) {
-#ifdef SELFCAL_FIXED
-    if (!is_bool(&self->step_floored)) {
-        return false;
-    }
-#endif
-    return is_bool(&self->batch[0].part) && is_bool(&self->batch[1].part) && is_bool(&self->started) && is_bool(&self->dropped) &&
+    return is_bool(&self->batch[0].part) && is_bool(&self->batch[1].part) && is_bool(&self->started) &&
+        is_bool(&self->dropped) &&
            is_bool(&self->in_gap);
 }
 
@@ -59,7 +68,8 @@ static bool memory_is_laid_out(const selfcal_t *self) {
         return false;
     }
     const size_t cells = (size_t)model->nodes * model->axes;
-    return self->b != NULL && self->c == self->b + cells && (const void *)self->node == (const void *)(self->c + cells) &&
+    return self->b != NULL && self->c == self->b + cells &&
+        (const void *)self->node == (const void *)(self->c + cells) &&
            (const void *)self->x == (const void *)(self->node + model->nodes);
 }
 
@@ -82,9 +92,11 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
 /* What the samples count for: one each, or less where they are forgotten. */
 static bool weight_is_sound(const selfcal_t *self) {
     if (self->model->forgetting != NULL) {
-        return self->weight <= (selfcal_wide_t)self->n && (self->n > 0U || self->keep == 1.0); /* nothing to forget yet */
+        /* nothing to forget yet */
+        return self->weight <= (selfcal_wide_t)self->n && (self->n > 0U || self->keep == 1.0);
     }
-    return self->keep == 1.0 && self->beginning == 1.0 && self->weight < 9e15 && (uint32_t)(uint64_t)self->weight == self->n;
+    return self->keep == 1.0 && self->beginning == 1.0 && self->weight < 9e15 &&
+        (uint32_t)(uint64_t)self->weight == self->n;
 }
 
 /* One batch is gathered and never full: then it is handed over. The other waits for the nodes or is empty. */
@@ -101,33 +113,21 @@ static bool batches_are_sound(const selfcal_t *self) {
         return false;
     }
     /* time before the first sample is no gap */
-    if (self->n == 0U && (waits->count > 0U ? waits->gap[0] : gathered->count > 0U ? gathered->gap[0] : self->pending_gap) > 0U) {
+    if (self->n == 0U && (waits->count > 0U ? waits->gap[0] : gathered->count > 0U ? gathered->gap[0]
+                          : self->pending_gap) > 0U) {
         return false;
     }
     return batch_is_sound(self, gathered) && batch_is_sound(self, waits);
 }
 
-/* A block's sums, see averager.c. */
-#ifdef SELFCAL_FIXED
-static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
-    const selfcal_block_t *sums = &self->sums[axis];
-    const int64_t most = (int64_t)self->used << 30;
-    return sums->sum_sq >= 0 && sums->sum_sq <= most && sums->sum <= most && sums->sum >= -most && sums->first <= 1L << 26 &&
-           sums->first >= -(1L << 26) && sums->shift <= 15U && sums->exponent >= -151 && sums->exponent <= 100;
-}
-#else
-static bool sums_are_sound(const selfcal_t *self, uint8_t axis) {
-    return isfinite(self->first[axis]) && isfinite(self->sum[axis]) && self->sum_sq[axis] >= R(0.0) && isfinite(self->sum_sq[axis]);
-}
-#endif
-
-static bool averager_is_sound(const selfcal_t *self) {
+static bool intake_is_sound(const selfcal_t *self) {
     const selfcal_counters_t *count = &self->counters;
     const selfcal_real_t ratio_max = (selfcal_real_t)SELFCAL_VARIANCE_RATIO_MAX;
     if (self->position >= self->block || self->used > self->position || self->started != (count->samples > 0U) ||
         (!self->started && (self->position > 0U || self->in_gap)) || count->samples < self->used ||
         selfcal_count(self) > count->samples - self->used || count->samples - self->used < self->within_dof ||
-        count->blocks_part > selfcal_count(self) || (self->in_gap && count->gaps == 0U) || (self->dropped && self->used > 0U) ||
+        count->blocks_part > selfcal_count(self) || (self->in_gap && count->gaps == 0U) ||
+        (self->dropped && self->used > 0U) ||
         !within(self->variance_ratio, R(1.0) / ratio_max, ratio_max) ||
         self->retired >= (1UL << self->model->axes) - 1U) { /* the last axis is never retired */
         return false;
@@ -137,75 +137,13 @@ static bool averager_is_sound(const selfcal_t *self) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&
-            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !sums_are_sound(self, axis) ||
+            (!isfinite(self->origin[axis]) || !isfinite(self->offset[axis]) || !selfcal_intake_sound(self, axis) ||
              !(self->within[axis] >= 0.0) || !isfinite(self->within[axis]))) {
             return false;
         }
     }
     return true;
 }
-
-/* What the kernel keeps, see kernel_float.c and kernel_fixed.c. */
-#ifdef SELFCAL_FIXED
-
-#define ROOM ((int64_t)1 << 62)
-#define X_MAX (SELFCAL_FIXED_LIMIT + (1L << 24))
-
-static bool scales_are_sound(const selfcal_t *self) {
-    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        const selfcal_scale_t *scale = &self->scale[axis];
-        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_sum < 0) {
-            return false;
-        }
-        for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
-            if (self->y_fixed[axis][i] > SELFCAL_FIXED_LIMIT || self->y_fixed[axis][i] < -SELFCAL_FIXED_LIMIT) {
-                return false;
-            }
-        }
-    }
-    return selfcal_kernel_steps_sound(self);
-}
-
-/* A level node's numbers follow from its gains. */
-static bool kernel_is_sound(const selfcal_t *self, size_t j) {
-    const selfcal_node_t *node = &self->node[j];
-    if (node->level) {
-        selfcal_node_t settled = *node;
-        selfcal_kernel_mantissas(&settled);
-        if (settled.gains.settled.g != node->gains.settled.g || settled.gains.settled.u != node->gains.settled.u ||
-            settled.gains.settled.w != node->gains.settled.w || settled.g_shift != node->g_shift || settled.u_shift != node->u_shift ||
-            settled.w_shift != node->w_shift) {
-            return false;
-        }
-    }
-    const size_t axes = self->model->axes;
-    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        if (self->b[k] > ROOM || self->b[k] < -ROOM || self->c[k] < 0 || self->c[k] > ROOM ||
-            self->x[k] > X_MAX || self->x[k] < -X_MAX) {
-            return false;
-        }
-    }
-    return true;
-}
-
-#else
-
-static bool scales_are_sound(const selfcal_t *self) {
-    (void)self;
-    return true;
-}
-
-static bool kernel_is_sound(const selfcal_t *self, size_t j) {
-    const size_t axes = self->model->axes;
-    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
-            return false;
-        }
-    }
-    return true;
-}
-
-#endif
 
 /* Both or neither: the model's regressors and their sums. */
 static bool regressors_are_sound(const selfcal_t *self) {
@@ -214,13 +152,9 @@ static bool regressors_are_sound(const selfcal_t *self) {
 }
 
 /* Likewise of the laws that are sums. */
-static bool terms_are_sound(const selfcal_t *self) {
-#if SELFCAL_TERMS_MAX > 1
-    return (self->terms == NULL) == (selfcal_terms_nodes(self->model) == 0U) && (self->terms == NULL || selfcal_terms_sound(self));
-#else
-    (void)self;
-    return true;
-#endif
+static bool states_are_sound(const selfcal_t *self) {
+    const bool none = sum_nodes(self->model) == 0U;
+    return (self->terms == NULL) == none && (none || (self->model->states != NULL && self->model->states->sound(self)));
 }
 
 /* The node that the kernel takes as the i-th; `sum`: of such a law. */
@@ -231,7 +165,7 @@ static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
         return false;
     }
     const selfcal_moving_t now = moving_of(node);
-    if ((self->n > 0U || i < self->ran) && (now.c == R(0.0)) != sum) { /* by that it is known, see selfcal_is_term_node() */
+    if ((self->n > 0U || i < self->ran) && (now.c == R(0.0)) != sum) { /* by that it is known, see is_state_node() */
         return false;
     }
     /* Some may have run over the batch that waits. */
@@ -247,11 +181,12 @@ static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
         return false;
     }
-    return kernel_is_sound(self, j);
+    return selfcal_kernel_node_sound(self, j);
 }
 
 /* Whether nodes a step apart lie between two limits, but for rounding. */
-static bool nodes_within(const selfcal_grid_t *grid, selfcal_real_t first, selfcal_real_t step, selfcal_real_t lo, selfcal_real_t hi) {
+static bool nodes_within(const selfcal_grid_t *grid, selfcal_real_t first, selfcal_real_t step, selfcal_real_t lo,
+                         selfcal_real_t hi) {
     const selfcal_real_t last = first + step * (selfcal_real_t)(grid_nodes(grid) - 1U), slack = R(1e-3);
     return grid == NULL || (step > R(0.0) && within(first, lo - slack, hi) && within(last, lo, hi + slack));
 }
@@ -279,8 +214,9 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
     if (self == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
-    if (!flags_are_bools(self) || !memory_is_laid_out(self) || !batches_are_sound(self) || !averager_is_sound(self) || !scales_are_sound(self) ||
-        !regressors_are_sound(self) || !terms_are_sound(self)) {
+    if (!flags_are_bools(self) || !memory_is_laid_out(self) || !batches_are_sound(self) || !intake_is_sound(self) ||
+        !selfcal_kernel_sound(self) ||
+        !regressors_are_sound(self) || !states_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     const selfcal_batch_t *waits = &self->batch[1U - self->gathering];

@@ -5,7 +5,7 @@
  * Mean over the window: the oldest bin counts by the part of it that lies within the window.
  * Gain over the window: the value W samples ago lies on the line between the two bin ends beside it.
  * Phase of a line: a product of integers modulo 2^64, which does not drift. */
-#include "internal.h"
+#include "bank.h"
 
 #define BINS (SELFCAL_COLUMN_BINS + 2U)
 #define TWO_PI R(6.283185307179586)

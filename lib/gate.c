@@ -1,24 +1,31 @@
 /* Stationary gate: a generalised likelihood-ratio test over windows of samples: does the sensor rest?
  *
- * After Skog, Haendel, Nilsson & Rantakokko, "Zero-velocity detection: an algorithm evaluation", IEEE Trans. Biomed. Eng. 57
- * (2010) 2657-2666, with two differences. Their detector (SHOE) knows gyros without bias and gravity's magnitude; here every
- * axis has an unknown level of its own, for a bias is just what the bank is to find, and an accelerometer's spoils |g|. And
- * what their detector gains from a known level, a second test gains from the level of the rest before.
+ * After Skog, Haendel, Nilsson & Rantakokko, "Zero-velocity detection: an algorithm evaluation", IEEE Trans. Biomed.
+ * Eng. 57 (2010) 2657-2666, with two differences. Their detector (SHOE) knows gyros without bias and gravity's
+ * magnitude; here every axis has an unknown level of its own, for a bias is just what the bank is to find, and an
+ * accelerometer's spoils |g|. And what their detector gains from a known level, a second test gains from the level of
+ * the rest before.
  *
- * A window holds n samples y_i of each of A axes. At rest y_i = m + v_i, v_i ~ N(0, sigma^2) white, the level m unknown.
+ * A window holds n samples y_i of each of A axes. At rest y_i = m + v_i, v_i ~ N(0, sigma^2) white, the level m
+ * unknown.
  *
- * (i) Shaken? H0: one level m per axis for the window. H1: any signal. Twice the ln of the ratio of the maximised likelihoods is
- *         T1 = sum over axes, samples of (y_i - mean)^2 / sigma^2,   chi-square with A (n - 1) degrees of freedom at rest.
- * (ii) Moved? H0: the window has the level of the rest before, whose estimate has the variance gamma sigma^2. H1: any levels.
- *         T2 = sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)),   chi-square with A degrees of freedom at rest.
- * Mean and scatter of normal samples are independent, so T1 and T2 are: each test gets half of the stated false alarm rate p,
- * and a window of rest is taken for motion with probability p - p^2/4.
+ * (i) Shaken? H0: one level m per axis for the window. H1: any signal. Twice the ln of the ratio of the maximised
+ * likelihoods is
+ *         T1 = sum over axes, samples of (y_i - mean)^2 / sigma^2, chi-square with A (n - 1) degrees of freedom at
+ *         rest.
+ * (ii) Moved? H0: the window has the level of the rest before, whose estimate has the variance gamma sigma^2. H1: any
+ * levels.
+ *         T2 = sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)), chi-square with A degrees of freedom at
+ *         rest.
+ * Mean and scatter of normal samples are independent, so T1 and T2 are: each test gets half of the stated false alarm
+ * rate p, and a window of rest is taken for motion with probability p - p^2/4.
  *
- * A sensor's filter colours its noise; vibration adds to it. With factors measured at rest on each axis, the scatter of a window
- * has the mean `within` sigma^2 (n - 1) and `spread` times the variance that goes with it, and the window's mean has the variance
- * `level` sigma^2/n. Then T1, its terms over `within`, is taken as c chi-square with nu degrees of freedom of the same mean and
- * variance (Satterthwaite, Biometrics Bull. 2 (1946) 110-114): nu = A^2 (n - 1)/sum of spread, c = A (n - 1)/nu. White: nu = A (n - 1), c = 1. */
-#include "internal.h"
+ * A sensor's filter colours its noise; vibration adds to it. With factors measured at rest on each axis, the scatter of
+ * a window has the mean `within` sigma^2 (n - 1) and `spread` times the variance that goes with it, and the window's
+ * mean has the variance `level` sigma^2/n. Then T1, its terms over `within`, is taken as c chi-square with nu degrees
+ * of freedom of the same mean and variance (Satterthwaite, Biometrics Bull. 2 (1946) 110-114): nu = A^2 (n - 1)/sum of
+ * spread, c = A (n - 1)/nu. White: nu = A (n - 1), c = 1. */
+#include "bank.h"
 
 /* ln Gamma(a), a > 0, to 1e-10: Stirling's series above 8. lgamma() has a global, signgam. */
 static selfcal_wide_t ln_gamma(selfcal_wide_t a) {
@@ -32,11 +39,12 @@ static selfcal_wide_t ln_gamma(selfcal_wide_t a) {
            (1.0 / 12.0 - sq * (1.0 / 360.0 - sq * (1.0 / 1260.0 - sq / 1680.0))) / a;
 }
 
-/* What a chi-square variable of `nu` degrees of freedom exceeds with the probability p <= 0.1, in steps: Newton's iteration on the
- * ln of the upper tail of the gamma distribution
+/* What a chi-square variable of `nu` degrees of freedom exceeds with the probability p <= 0.1, in steps: Newton's
+ * iteration on the ln of the upper tail of the gamma distribution
  *     Q(a, x) = e^-x x^a / Gamma(a) h,   a = nu/2,   x half the threshold, above a,   slope of ln Q: -1/(x h),
- * from Wilson & Hilferty's cube root of a normal variable; h by Legendre's continued fraction (Abramowitz & Stegun 6.5.31, even
- * part) from its first term on (modified Lentz). To 1e-9 of the threshold: its tolerances are what float keeps, with a margin. */
+ * from Wilson & Hilferty's cube root of a normal variable; h by Legendre's continued fraction (Abramowitz & Stegun
+ * 6.5.31, even part) from its first term on (modified Lentz). To 1e-9 of the threshold: its tolerances are what float
+ * keeps, with a margin. */
 enum { AT_START, AT_GAMMA, AT_FRACTION, AT_NEWTON, AT_END };
 enum { TERMS_A_STEP = 4, TERMS_MOST = 1000, NEWTON_MOST = 20 };
 
@@ -62,7 +70,8 @@ static bool step_quantile(selfcal_quantile_t *q) {
     case AT_START: {
         /* Normal quantile to 4.5e-4 (Abramowitz & Stegun 26.2.23). */
         const selfcal_wide_t t = sqrt(-2.0 * q->ln_p), width = 1.0 / (9.0 * q->a);
-        const selfcal_wide_t z = t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)));
+        const selfcal_wide_t z =
+            t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)));
         const selfcal_wide_t root = 1.0 - width + z * sqrt(width);
         q->x = fmax(q->a * root * root * root, q->a + 0.5);
         q->at = AT_GAMMA;
@@ -101,8 +110,8 @@ static bool step_quantile(selfcal_quantile_t *q) {
     return q->at != AT_END;
 }
 
-/* By how much the distances T2 of many windows from a level may be greater in all than noise has them, beside 4 sd: the level's noise is
- * measured to 10 % on six axes and 30 windows. */
+/* By how much the distances T2 of many windows from a level may be greater in all than noise has them, beside 4 sd: the
+ * level's noise is measured to 10 % on six axes and 30 windows. */
 #define OFF_MOST 1.25F
 
 /* An axis of infinite sigma is left out. */
@@ -110,8 +119,8 @@ static bool present(const selfcal_gate_t *gate, uint8_t axis) {
     return isfinite(gate->axis[axis].sigma);
 }
 
-/* Thresholds are worked out a step with each sample, from the start and from a change of noise on, those of T1 for whole windows;
- * they depend on the noise by `spread` alone, those of T2 on the axes present. */
+/* Thresholds are worked out a step with each sample, from the start and from a change of noise on, those of T1 for
+ * whole windows; they depend on the noise by `spread` alone, those of T2 on the axes present. */
 enum { THRESHOLDS_KNOWN, WORK_BEGIN, WORK_SHAKEN, WORK_MOVED, WORK_RATE_MOVED };
 
 /* T1 of a window of `n` samples: degrees of freedom, and by what to multiply the chi-square threshold. */
@@ -145,7 +154,8 @@ static void begin_thresholds(selfcal_gate_t *gate) {
         return;
     }
     selfcal_wide_t scale;
-    begin_quantile(&gate->quantile, freedom(gate, gate->config.window, &scale), 0.5 * (selfcal_wide_t)gate->config.false_alarm);
+    begin_quantile(&gate->quantile, freedom(gate, gate->config.window, &scale),
+                   0.5 * (selfcal_wide_t)gate->config.false_alarm);
     gate->work = WORK_SHAKEN;
 }
 
@@ -184,8 +194,8 @@ static void step_thresholds(selfcal_gate_t *gate) {
     }
 }
 
-/* Those for a window of `n` samples. What is not known yet is worked out at once: T1's for a window with missing samples, and all where
- * windows are shorter than the steps are many. */
+/* Those for a window of `n` samples. What is not known yet is worked out at once: T1's for a window with missing
+ * samples, and all where windows are shorter than the steps are many. */
 static void set_thresholds(selfcal_gate_t *gate, uint32_t n) {
     gate->at_once += gate->work != THRESHOLDS_KNOWN || n != gate->config.window;
     while (gate->work != THRESHOLDS_KNOWN) {
@@ -209,8 +219,10 @@ static void start_window(selfcal_gate_t *gate) {
 }
 
 selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_config_t *config) {
-    if (gate == NULL || config == NULL || config->axes == 0U || config->axes > SELFCAL_AXES_MAX || config->window < 2U ||
-        !(config->false_alarm >= 0.0F) || !(config->false_alarm <= 0.1F) || config->hold == 0U || config->memory == 0U) {
+    if (gate == NULL || config == NULL || config->axes == 0U || config->axes > SELFCAL_AXES_MAX ||
+        config->window < 2U ||
+        !(config->false_alarm >= 0.0F) || !(config->false_alarm <= 0.1F) || config->hold == 0U ||
+        config->memory == 0U) {
         return SELFCAL_BAD_ARGUMENT;
     }
     for (uint8_t axis = 0; axis < config->axes; axis++) {
@@ -231,7 +243,8 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
 }
 
 selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise) {
-    if (gate == NULL || noise == NULL || axis >= gate->config.axes || !(noise->sigma > 0.0F) || !(noise->within > 0.0F) ||
+    if (gate == NULL || noise == NULL || axis >= gate->config.axes || !(noise->sigma > 0.0F) ||
+        !(noise->within > 0.0F) ||
         !(noise->spread > 0.0F) || !(noise->level > 0.0F) || !isfinite(noise->within) || !isfinite(noise->spread) ||
         !isfinite(noise->level)) {
         return SELFCAL_BAD_ARGUMENT;
@@ -274,9 +287,10 @@ selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis,
     return SELFCAL_OK;
 }
 
-/* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only; `times`: by how much an axis's variance is
- * greater than was measured, NULL: by nothing. */
-static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n, const selfcal_level_t *level, bool rates,
+/* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only; `times`: by how much an
+ * axis's variance is greater than was measured, NULL: by nothing. */
+static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n,
+                      const selfcal_level_t *level, bool rates,
                       const float times[]) {
     float sum = 0.0F;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
@@ -294,7 +308,8 @@ static void merge(const selfcal_gate_t *gate, selfcal_level_t *level, const floa
     const selfcal_real_t w = r_fmax(level->gamma / (level->gamma + inv_n), least);
     level->gamma = (R(1.0) - w) * (R(1.0) - w) * level->gamma + w * w * inv_n;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
-        level->mean[axis] = (float)r_fma(w, (selfcal_real_t)mean[axis] - (selfcal_real_t)level->mean[axis], (selfcal_real_t)level->mean[axis]);
+        level->mean[axis] = (float)r_fma(w, (selfcal_real_t)mean[axis] - (selfcal_real_t)level->mean[axis],
+                                         (selfcal_real_t)level->mean[axis]);
     }
 }
 
@@ -321,36 +336,40 @@ static void look_away(selfcal_gate_t *gate) {
     gate->state = SELFCAL_MOVING;
 }
 
-/* A window has nothing to go by: too few samples, or one that is no number. It neither is one of those in a row nor ends them. */
+/* A window has nothing to go by: too few samples, or one that is no number. It neither is one of those in a row nor
+ * ends them. */
 static void blind_window(selfcal_gate_t *gate) {
     gate->counters.blind++;
     look_away(gate);
 }
 
-/* What a chi-square variable of `nu` degrees of freedom exceeds once in 30 000 times: 4 sd of its cube root (Wilson & Hilferty). */
+/* What a chi-square variable of `nu` degrees of freedom exceeds once in 30 000 times: 4 sd of its cube root (Wilson &
+ * Hilferty). */
 static float seldom(float nu) {
     const float variance = 2.0F / (9.0F * nu), root = 1.0F - variance + 4.0F * sqrtf(variance);
     return nu * root * root * root;
 }
 
-/* Whether windows are too far off a level in all, though none of them is: a rotation or a swing that is too slow for one window. `sum`: of
- * their T2, chi-square with `nu` degrees of freedom but for `scale`. Never, without a rate of false alarms. */
+/* Whether windows are too far off a level in all, though none of them is: a rotation or a swing that is too slow for
+ * one window. `sum`: of their T2, chi-square with `nu` degrees of freedom but for `scale`. Never, without a rate of
+ * false alarms. */
 static bool off_in_all(const selfcal_gate_t *gate, float sum, float nu, float scale) {
     return gate->judged_axes > 0U && !(sum <= OFF_MOST * scale * seldom(nu));
 }
 
-/* The same of the windows at rest: a sum that forgets, T2 weighing (1 - 1/m)^k after k windows with m = `memory`, has the mean m and the
- * variance 2 m^2/(2 m - 1) per axis: that of m/(2 m - 1) chi-square with 2 m - 1 degrees of freedom. */
+/* The same of the windows at rest: a sum that forgets, T2 weighing (1 - 1/m)^k after k windows with m = `memory`, has
+ * the mean m and the variance 2 m^2/(2 m - 1) per axis: that of m/(2 m - 1) chi-square with 2 m - 1 degrees of
+ * freedom. */
 static bool drifts_off(selfcal_gate_t *gate) {
     const float memory = (float)gate->config.memory, twice = 2.0F * memory - 1.0F;
     gate->off_sum += gate->t2 - gate->off_sum / memory;
     return off_in_all(gate, gate->off_sum, twice * (float)gate->judged_axes, memory / twice);
 }
 
-/* The windows since motion that are on one level: calm are those that scatter no more than the noise that the gate started from, the most
- * that there is at rest; quiet are the last of them that do not by the noise that was measured since. How far means may be off a level
- * goes by the noise measured, and where windows scatter more, by as much more: a slow swing is no level because the
- * model's noise would cover it. */
+/* The windows since motion that are on one level: calm are those that scatter no more than the noise that the gate
+ * started from, the most that there is at rest; quiet are the last of them that do not by the noise that was measured
+ * since. How far means may be off a level goes by the noise measured, and where windows scatter more, by as much more:
+ * a slow swing is no level because the model's noise would cover it. */
 static void follow(selfcal_gate_t *gate, const float mean[], const float scatter[], selfcal_real_t inv_n, bool shaken) {
     const float memory = (float)gate->config.memory, weight = (float)gate->calm + 1.0F;
     float bound = 0.0F, axes = 0.0F, times[SELFCAL_AXES_MAX] = {0.0F};
@@ -430,13 +449,15 @@ static void judge(selfcal_gate_t *gate) {
         }
         gate->counters.alarms++;
         gate->state = SELFCAL_MOVING;
-        gate->calm = gate->quiet = 0; /* Not even the first of the calm ones: picked for its odd mean, it would make a bad level. */
+        /* Not even the first of the calm ones: picked for its odd mean, it would make a bad level. */
+        gate->calm = gate->quiet = 0;
         return;
     }
     follow(gate, mean, scatter, inv_n, shaken);
     const uint32_t hold = gate->config.hold, settle = gate->config.settle;
     const bool back =
-        !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true, NULL) <= gate->rate_moved_above;
+        !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true,
+                                  NULL) <= gate->rate_moved_above;
     const bool settled = settle >= hold && gate->calm > settle;
     if (settled && gate->quiet < gate->calm) {
         start_noise(gate);

@@ -1,361 +1,60 @@
 /* Snapshot: all that a bank knows, as bytes.
  *
- * Format 1, little-endian, without padding. Reals are IEEE 754 bit patterns, a bool is one byte, 0 or 1.
+ * Format 2. Numbers of the header and the checksum are little-endian.
  *        0  4  "SFCL"
  *        4  4  bytes of the whole, checksum included
  *        8  2  format version
- *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 16 or 32 integers (SELFCAL_FIXED)
+ *       10  1  arithmetic: 4 float, 8 double (selfcal_real_t), 32 integers (SELFCAL_FIXED)
  *       11  1  axes of the model
  *       12  2  nodes of the model
  *       14  2  0
  *       16  4  id of the model
- *       20  4  layout: CRC-32 over kind (1 byte) and count (2 bytes) of every field below, so that a build with other fields or
- *              other maxima of the configuration is told apart without anyone counting up the version
- *       24     selfcal_t, its batches, its counters, every node, b, c, x, number formats, what the
- *              regressors and the sums have: the fields below, in their order
+ *       20  4  layout: CRC-32 of sizes and places in the structs, of the configuration and of the byte order
+ *       24     image: the bank's state as it lies in memory. It has no pointers: selfcal_t from `n` on; the nodes with
+ *              their sums; the regressors' sums; the states of laws that are sums.
  *     last  4  CRC-32 of all before (IEEE 802.3: reflected polynomial 0xEDB88320, start and final inversion 0xFFFFFFFF)
  * The first 8 bytes and the checksum are where they are in every version.
  *
- * A field is added to selfcal_t or selfcal_node_t and to its list here; the assertions below fail to compile until it is. The
- * version counts up when what a field means changes, or the header. */
-#include <float.h>
+ * The version counts up when the meaning of a member changes, or the header. */
+#include "bank.h"
 
-#include "internal.h"
-
-#define VERSION 1U
-#ifdef SELFCAL_FIXED
-#define ARITHMETIC SELFCAL_FIXED
-#else
-#define ARITHMETIC sizeof(selfcal_real_t)
-#endif
+#define VERSION 2U
 enum { HEADER = 24, TRAILER = 4 };
 static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 
-/* ------------------------------------------------------------------------------------------------------------ fields */
-
-typedef enum { KIND_BOOL, KIND_U8, KIND_U16, KIND_U32, KIND_U64, KIND_FLOAT, KIND_REAL, KIND_WIDE, KINDS } kind_t;
-
-#define TYPE_BOOL bool
-#define TYPE_U8 uint8_t
-#define TYPE_U16 uint16_t
-#define TYPE_U32 uint32_t
-#define TYPE_U64 uint64_t
-#define TYPE_FLOAT float
-#define TYPE_REAL selfcal_real_t
-#define TYPE_WIDE selfcal_wide_t
-
-static const uint8_t kind_size[KINDS] = {
-    sizeof(TYPE_BOOL), sizeof(TYPE_U8),    sizeof(TYPE_U16),  sizeof(TYPE_U32),
-    sizeof(TYPE_U64),  sizeof(TYPE_FLOAT), sizeof(TYPE_REAL), sizeof(TYPE_WIDE),
-};
-
-/* In the order of the structs. F: every member but the pointers, which selfcal_init() sets; PART: structs with a list of
- * their own. A selfcal_sum_t is two reals; signed numbers are the bits of unsigned ones. */
-#ifdef SELFCAL_FIXED
-#define FIXED_BANK_FIELDS(F, PART)          \
-    PART(selfcal_t, scale, selfcal_scale_t) \
-    F(selfcal_t, y_fixed, U32)              \
-    F(selfcal_t, step, U32)                 \
-    F(selfcal_t, step_from, U32)            \
-    F(selfcal_t, step_to, U32)              \
-    F(selfcal_t, step_beta, FLOAT)          \
-    F(selfcal_t, step_floored, BOOL)
-
-#define FIXED_NODE_SHIFTS(F)       \
-    F(selfcal_node_t, g_shift, U8) \
-    F(selfcal_node_t, u_shift, U8) \
-    F(selfcal_node_t, w_shift, U8)
-
-#define BLOCK_FIELDS(F, PART) PART(selfcal_t, sums, selfcal_block_t)
-
-#define BLOCK_SUM_FIELDS(F)           \
-    F(selfcal_block_t, sum, U64)      \
-    F(selfcal_block_t, sum_sq, U64)   \
-    F(selfcal_block_t, first, U32)    \
-    F(selfcal_block_t, exponent, U16) \
-    F(selfcal_block_t, shift, U8)
-
-#define SCALE_FIELDS(F)               \
-    F(selfcal_scale_t, exponent, U16) \
-    F(selfcal_scale_t, coarser, U16)  \
-    F(selfcal_scale_t, finer, U16)    \
-    F(selfcal_scale_t, most_y, U32)   \
-    F(selfcal_scale_t, most_sum, U32)
-#else
-#define FIXED_BANK_FIELDS(F, PART)
-#define FIXED_NODE_SHIFTS(F)
-#define SCALE_FIELDS(F)
-#define BLOCK_FIELDS(F, PART)   \
-    F(selfcal_t, first, FLOAT)  \
-    F(selfcal_t, sum, REAL)     \
-    F(selfcal_t, sum_sq, REAL)
-#endif
-
-#define BANK_FIELDS(F, PART)                      \
-    F(selfcal_t, n, U32)                          \
-    F(selfcal_t, weight, WIDE)                    \
-    F(selfcal_t, keep, WIDE)                      \
-    F(selfcal_t, beginning, WIDE)                 \
-    F(selfcal_t, rho_lo, REAL)                    \
-    F(selfcal_t, rho_step, REAL)                  \
-    F(selfcal_t, alpha_lo, REAL)                  \
-    F(selfcal_t, alpha_step, REAL)                \
-    PART(selfcal_t, batch, selfcal_batch_t)       \
-    F(selfcal_t, gathering, U8)                   \
-    F(selfcal_t, ran, U16)                        \
-    F(selfcal_t, push_nodes, U16)                 \
-    F(selfcal_t, pending_gap, U32)                \
-    F(selfcal_t, batches, U32)                    \
-    FIXED_BANK_FIELDS(F, PART)                    \
-    F(selfcal_t, started, BOOL)                   \
-    F(selfcal_t, origin, FLOAT)                   \
-    F(selfcal_t, offset, REAL)                    \
-    F(selfcal_t, block, U32)                      \
-    F(selfcal_t, variance_ratio, REAL)            \
-    BLOCK_FIELDS(F, PART)                         \
-    F(selfcal_t, position, U32)                   \
-    F(selfcal_t, used, U32)                       \
-    F(selfcal_t, dropped, BOOL)                   \
-    F(selfcal_t, within, WIDE)                    \
-    F(selfcal_t, within_dof, U64)                 \
-    F(selfcal_t, last, FLOAT)                     \
-    F(selfcal_t, equal, U32)                      \
-    F(selfcal_t, in_gap, BOOL)                    \
-    F(selfcal_t, shifted, FLOAT)                  \
-    F(selfcal_t, retired, U32)                    \
-    F(selfcal_t, watched, U32)                    \
-    F(selfcal_t, bad, U32)                        \
-    F(selfcal_t, bad_blocks, U32)                 \
-    PART(selfcal_t, counters, selfcal_counters_t)
-
-#define BATCH_FIELDS(F)                \
-    F(selfcal_batch_t, y, REAL)        \
-    F(selfcal_batch_t, r, REAL)        \
-    F(selfcal_batch_t, gap, U32)       \
-    F(selfcal_batch_t, gap_after, U32) \
-    F(selfcal_batch_t, count, U32)     \
-    F(selfcal_batch_t, part, BOOL)
-
-#define COUNTER_FIELDS(F)                     \
-    F(selfcal_counters_t, samples, U64)       \
-    F(selfcal_counters_t, missing, U64)       \
-    F(selfcal_counters_t, gaps, U32)          \
-    F(selfcal_counters_t, blocks_lost, U32)   \
-    F(selfcal_counters_t, blocks_part, U32)   \
-    F(selfcal_counters_t, blocks_moving, U32) \
-    F(selfcal_counters_t, not_finite, U32)    \
-    F(selfcal_counters_t, saturated, U32)     \
-    F(selfcal_counters_t, stuck, U32)         \
-    F(selfcal_counters_t, regressor_not_finite, U32)
-
-#define NODE_FIELDS(F)                 \
-    F(selfcal_node_t, beta, REAL)      \
-    F(selfcal_node_t, q, REAL)         \
-    F(selfcal_node_t, p_inf, REAL)     \
-    F(selfcal_node_t, u_inf, REAL)     \
-    F(selfcal_node_t, gains, REAL)     \
-    F(selfcal_node_t, level, BOOL)     \
-    FIXED_NODE_SHIFTS(F)               \
-    F(selfcal_node_t, steady, U32)     \
-    F(selfcal_node_t, level_from, U32) \
-    F(selfcal_node_t, a, REAL)         \
-    F(selfcal_node_t, ln_s, REAL)
-
-#define COLUMN_FIELDS(F)               \
-    F(selfcal_column_t, z, REAL)       \
-    F(selfcal_column_t, last, REAL)    \
-    F(selfcal_column_t, origin, FLOAT) \
-    F(selfcal_column_t, first, FLOAT)  \
-    F(selfcal_column_t, offset, REAL)  \
-    F(selfcal_column_t, sum, REAL)
-
-#if SELFCAL_TERMS_MAX > 1
-#define TERM_FIELDS(F)                  \
-    F(selfcal_term_node_t, p, WIDE)     \
-    F(selfcal_term_node_t, beta, REAL)  \
-    F(selfcal_term_node_t, q, REAL)     \
-    F(selfcal_term_node_t, theta, REAL) \
-    F(selfcal_term_node_t, steady, BOOL)
-#endif
-
-/* What a part of the bank is made of. */
+/* Bytes of the bank that are in the image. */
 typedef struct {
-    uint16_t offset, count;
-    uint8_t kind;
-} field_t;
-
-/* NOLINTBEGIN(bugprone-sizeof-expression): a count of one is a quotient of equal sizes. */
-#define COUNT(struct_t, member, kind) (sizeof(((struct_t *)0)->member) / sizeof(TYPE_##kind))
-#define ROW(struct_t, member, kind) {offsetof(struct_t, member), COUNT(struct_t, member, kind), KIND_##kind},
-#define NO_ROW(struct_t, member, type)
-#define LENGTH(array) (sizeof(array) / sizeof((array)[0]))
-
-static const field_t bank_fields[] = {BANK_FIELDS(ROW, NO_ROW)};
-static const field_t batch_fields[] = {BATCH_FIELDS(ROW)};
-static const field_t counter_fields[] = {COUNTER_FIELDS(ROW)};
-static const field_t node_fields[] = {NODE_FIELDS(ROW)};
-static const field_t column_fields[] = {COLUMN_FIELDS(ROW)};
-#if SELFCAL_TERMS_MAX > 1
-static const field_t term_fields[] = {TERM_FIELDS(ROW)};
-#endif
-static const field_t sum_fields[] = {{0, 2, KIND_REAL}};
-#ifdef SELFCAL_FIXED
-static const field_t scale_fields[] = {SCALE_FIELDS(ROW)};
-static const field_t block_fields[] = {BLOCK_SUM_FIELDS(ROW)};
-static const field_t total_fields[] = {{0, 1, KIND_U64}}, drift_fields[] = {{0, 1, KIND_U32}};
-#else
-static const field_t total_fields[] = {{0, 2, KIND_REAL}}, drift_fields[] = {{0, 1, KIND_REAL}};
-static const field_t real_fields[] = {{0, 1, KIND_REAL}};
-#endif
-
-/* The structs once more, from the lists alone: as large as the real ones, every member in its place. (What these cannot see is a
- * bool that slips into padding; a test compares the bytes.) */
-#define MIRROR(struct_t, member, kind) TYPE_##kind member[COUNT(struct_t, member, kind)];
-#define MIRROR_PART(struct_t, member, type) type member[sizeof(((struct_t *)0)->member) / sizeof(type)];
-typedef struct {
-#if SELFCAL_TERMS_MAX > 1
-    const void *pointer[7]; /* as below, and terms */
-#else
-    const void *pointer[6]; /* model, columns, node, b, c, x */
-#endif
-    BANK_FIELDS(MIRROR, MIRROR_PART)
-} selfcal_t_mirror;
-typedef struct {
-    BATCH_FIELDS(MIRROR)
-} selfcal_batch_t_mirror;
-typedef struct {
-    COUNTER_FIELDS(MIRROR)
-} selfcal_counters_t_mirror;
-typedef struct {
-    NODE_FIELDS(MIRROR)
-} selfcal_node_t_mirror;
-typedef struct {
-    COLUMN_FIELDS(MIRROR)
-} selfcal_column_t_mirror;
-#if SELFCAL_TERMS_MAX > 1
-typedef struct {
-    TERM_FIELDS(MIRROR)
-} selfcal_term_node_t_mirror;
-#endif
-#ifdef SELFCAL_FIXED
-typedef struct {
-    SCALE_FIELDS(MIRROR)
-} selfcal_scale_t_mirror;
-typedef struct {
-    BLOCK_SUM_FIELDS(MIRROR)
-} selfcal_block_t_mirror;
-#endif
-/* NOLINTEND(bugprone-sizeof-expression) */
-
-#define IN_PLACE(struct_t, member, kind) \
-    SELFCAL_STATIC_ASSERT(struct_t##_##member, offsetof(struct_t, member) == offsetof(struct_t##_mirror, member));
-BANK_FIELDS(IN_PLACE, IN_PLACE)
-BATCH_FIELDS(IN_PLACE)
-COUNTER_FIELDS(IN_PLACE)
-NODE_FIELDS(IN_PLACE)
-COLUMN_FIELDS(IN_PLACE)
-SELFCAL_STATIC_ASSERT(all_of_the_bank, sizeof(selfcal_t) == sizeof(selfcal_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_a_batch, sizeof(selfcal_batch_t) == sizeof(selfcal_batch_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_the_counters, sizeof(selfcal_counters_t) == sizeof(selfcal_counters_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_a_node, sizeof(selfcal_node_t) == sizeof(selfcal_node_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_a_column, sizeof(selfcal_column_t) == sizeof(selfcal_column_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_the_columns, sizeof(selfcal_columns_t) == 5 * sizeof(void *));
-#if SELFCAL_TERMS_MAX > 1
-TERM_FIELDS(IN_PLACE)
-SELFCAL_STATIC_ASSERT(all_of_a_term_node, sizeof(selfcal_term_node_t) == sizeof(selfcal_term_node_t_mirror));
-#ifdef SELFCAL_FIXED
-SELFCAL_STATIC_ASSERT(all_of_the_terms, sizeof(selfcal_terms_t) == 3 * sizeof(void *));
-#else
-SELFCAL_STATIC_ASSERT(all_of_the_terms, sizeof(selfcal_terms_t) == 2 * sizeof(void *));
-#endif
-#endif
-SELFCAL_STATIC_ASSERT(all_of_a_sum, sizeof(selfcal_sum_t) == 2 * sizeof(selfcal_real_t));
-#ifdef SELFCAL_FIXED
-SCALE_FIELDS(IN_PLACE)
-BLOCK_SUM_FIELDS(IN_PLACE)
-SELFCAL_STATIC_ASSERT(all_of_a_scale, sizeof(selfcal_scale_t) == sizeof(selfcal_scale_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_a_block, sizeof(selfcal_block_t) == sizeof(selfcal_block_t_mirror));
-SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 8);
-SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == 4);
-#else
-SELFCAL_STATIC_ASSERT(all_of_a_total, sizeof(selfcal_total_t) == 2 * sizeof(selfcal_real_t));
-SELFCAL_STATIC_ASSERT(all_of_a_drift, sizeof(selfcal_drift_t) == sizeof(selfcal_real_t));
-#endif
-SELFCAL_STATIC_ASSERT(float_is_ieee_single, sizeof(float) == 4 && FLT_MANT_DIG == 24 && FLT_MAX_EXP == 128);
-SELFCAL_STATIC_ASSERT(wide_is_ieee_double, sizeof(selfcal_wide_t) == 8 && DBL_MANT_DIG == 53 && DBL_MAX_EXP == 1024);
-SELFCAL_STATIC_ASSERT(bool_is_a_byte, sizeof(bool) == 1);
-
-/* Records of one kind in a row. */
-typedef struct {
-    const field_t *field;
-    size_t fields;
-    const void *record;
-    size_t records, stride;
+    void *from;
+    size_t bytes;
 } part_t;
 
-#ifdef SELFCAL_FIXED
-enum { PARTS = 14 + (SELFCAL_TERMS_MAX > 1 ? 3 : 0) };
-#else
-enum { PARTS = 12 + (SELFCAL_TERMS_MAX > 1 ? 2 : 0) };
-#endif
+enum { PARTS = 4 };
 
-/* The parts of a bank of `model`; without `self`, their sizes alone. */
-static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t part[PARTS]) {
-    const size_t nodes = model->nodes, cells = nodes * model->axes;
-    const bool there = self != NULL;
-    const size_t p = model->regressors != NULL ? model->regressors->count : 0U, used = p > 0U ? 1U : 0U;
-    const selfcal_columns_t *columns = there ? self->columns : NULL;
-    const bool more = columns != NULL;
-#if SELFCAL_TERMS_MAX > 1
-    const size_t sums = selfcal_terms_nodes(model);
-    const selfcal_terms_t *terms = there ? self->terms : NULL;
-    const bool sum = terms != NULL;
-#endif
-    const part_t parts[PARTS] = {
-        {bank_fields, LENGTH(bank_fields), self, 1, sizeof *self},
-        {batch_fields, LENGTH(batch_fields), there ? self->batch : NULL, LENGTH(self->batch), sizeof self->batch[0]},
-        {counter_fields, LENGTH(counter_fields), there ? &self->counters : NULL, 1, sizeof self->counters},
-        {node_fields, LENGTH(node_fields), there ? self->node : NULL, nodes, sizeof *self->node},
-        {total_fields, LENGTH(total_fields), there ? self->b : NULL, cells, sizeof *self->b},
-        {total_fields, LENGTH(total_fields), there ? self->c : NULL, cells, sizeof *self->c},
-        {drift_fields, LENGTH(drift_fields), there ? self->x : NULL, cells, sizeof *self->x},
-#ifdef SELFCAL_FIXED
-        {scale_fields, LENGTH(scale_fields), there ? self->scale : NULL, LENGTH(self->scale), sizeof self->scale[0]},
-        {block_fields, LENGTH(block_fields), there ? self->sums : NULL, LENGTH(self->sums), sizeof self->sums[0]},
-#endif
-        {column_fields, LENGTH(column_fields), more ? columns->column : NULL, p, sizeof *columns->column},
-        {sum_fields, 1, more ? columns->a : NULL, used * nodes * SELFCAL_REGRESSORS_ROWS(p + 1U), sizeof *columns->a},
-        {sum_fields, 1, more ? columns->b : NULL, cells * p, sizeof *columns->b},
-        {sum_fields, 1, more ? columns->x : NULL, used * nodes * (p + 1U), sizeof *columns->x},
-#ifdef SELFCAL_FIXED
-        {sum_fields, 1, more ? columns->reading : NULL, 3U * used * cells, sizeof *columns->reading},
-#else
-        {real_fields, 1, more ? columns->low : NULL, used * cells, sizeof *columns->low},
-#endif
-#if SELFCAL_TERMS_MAX > 1
-        {term_fields, LENGTH(term_fields), sum ? terms->node : NULL, sums, sizeof *terms->node},
-        {sum_fields, 1, sum ? terms->x : NULL, sums * (1U + p + model->axes) * SELFCAL_TERMS_MAX, sizeof *terms->x},
-#ifdef SELFCAL_FIXED
-        {sum_fields, 1, sum ? terms->bc : NULL, sums * model->axes * 2U, sizeof *terms->bc},
-#endif
-#endif
-    };
-    memcpy(part, parts, sizeof parts);
+/* Without `self`, their sizes alone. */
+static void parts_of(const selfcal_model_t *model, selfcal_t *self, part_t part[PARTS]) {
+    const size_t nodes = model->nodes, axes = model->axes, p = regressors_of(model), sums = sum_nodes(model);
+    const size_t columns = SELFCAL_REGRESSORS_SIZE(nodes, axes, p), states = SELFCAL_TERMS_SIZE(sums, axes, p);
+    memset(part, 0, PARTS * sizeof part[0]);
+    part[0].bytes = sizeof(selfcal_t) - offsetof(selfcal_t, n);
+    part[1].bytes = SELFCAL_SIZE(nodes, axes);
+    part[2].bytes = p > 0U ? columns - 7U - sizeof(selfcal_columns_t) : 0U;
+    part[3].bytes = sums > 0U ? states - 7U - sizeof(selfcal_terms_t) : 0U;
+    if (self != NULL) {
+        part[0].from = (uint8_t *)self + offsetof(selfcal_t, n);
+        part[1].from = self->b;
+        part[2].from = p > 0U ? self->columns->column : NULL;
+        part[3].from = sums > 0U ? self->terms->node : NULL;
+    }
 }
 
 static size_t size_of(const selfcal_model_t *model) {
     part_t part[PARTS];
     parts_of(model, NULL, part);
-    size_t total = HEADER + TRAILER;
-    for (size_t p = 0; p < PARTS; p++) {
-        for (size_t f = 0; f < part[p].fields; f++) {
-            total += part[p].records * part[p].field[f].count * kind_size[part[p].field[f].kind];
-        }
-    }
-    return total;
+    return HEADER + part[0].bytes + part[1].bytes + part[2].bytes + part[3].bytes + TRAILER;
 }
 
-/* ------------------------------------------------------------------------------------------------------------- bytes */
+/* -------------------------------------------------------------------------------------------------------------
+ * bytes */
 
 /* Four bits a step: a table of 64 bytes. */
 static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
@@ -372,14 +71,6 @@ static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
     return ~crc;
 }
 
-/* Where byte i, counted from the least significant one, of a number of `size` bytes lies in this machine's memory. */
-static size_t place(size_t i, size_t size) {
-    const uint16_t one = 1;
-    uint8_t first;
-    memcpy(&first, &one, 1);
-    return first == 1U ? i : size - 1U - i;
-}
-
 static uint32_t number_at(const uint8_t *bytes, size_t size) {
     uint32_t number = 0;
     for (size_t i = size; i > 0U; i--) {
@@ -388,19 +79,35 @@ static uint32_t number_at(const uint8_t *bytes, size_t size) {
     return number;
 }
 
-static uint32_t layout_of(const part_t part[PARTS]) {
-    uint32_t crc = 0;
-    for (size_t p = 0; p < PARTS; p++) {
-        for (size_t f = 0; f < part[p].fields; f++) {
-            const field_t *field = &part[p].field[f];
-            const uint8_t bytes[3] = {field->kind, (uint8_t)field->count, (uint8_t)(field->count >> 8)};
-            crc = crc32(crc, bytes, sizeof bytes);
-        }
-    }
-    return crc;
+/* What makes an image another build's. */
+static uint32_t layout(void) {
+    const uint32_t facts[] = {
+        sizeof(void *),
+        sizeof(selfcal_t),
+        offsetof(selfcal_t, n),
+        offsetof(selfcal_t, batch),
+        offsetof(selfcal_t, integers),
+        offsetof(selfcal_t, started),
+        offsetof(selfcal_t, sums),
+        offsetof(selfcal_t, counters),
+        sizeof(selfcal_batch_t),
+        sizeof(selfcal_integers_t),
+        sizeof(selfcal_node_t),
+        sizeof(selfcal_total_t),
+        sizeof(selfcal_drift_t),
+        sizeof(selfcal_column_t),
+        sizeof(selfcal_reading_t),
+        sizeof(selfcal_term_node_t),
+        SELFCAL_AXES_MAX,
+        SELFCAL_HYPOTHESES_MAX,
+        SELFCAL_BATCH,
+        SELFCAL_TERMS_MAX,
+    };
+    return crc32(0, (const uint8_t *)facts, sizeof facts); /* of these bytes as they lie: the order of bytes is in it */
 }
 
-/* -------------------------------------------------------------------------------------------------------------- save */
+/* --------------------------------------------------------------------------------------------------------------
+ * save */
 
 typedef struct {
     selfcal_write_t write;
@@ -417,29 +124,19 @@ static void flush(sink_t *sink) {
     sink->held = 0;
 }
 
-static void put(sink_t *sink, uint8_t byte) {
-    sink->chunk[sink->held++] = byte;
-    if (sink->held == sizeof sink->chunk) {
-        flush(sink);
+static void put(sink_t *sink, const uint8_t *bytes, size_t count) {
+    for (size_t i = 0; i < count && sink->good; i++) {
+        sink->chunk[sink->held++] = bytes[i];
+        if (sink->held == sizeof sink->chunk) {
+            flush(sink);
+        }
     }
 }
 
 static void put_number(sink_t *sink, size_t size, uint32_t number) {
-    for (size_t i = 0; i < size; i++) {
-        put(sink, (uint8_t)(number >> (8U * i)));
-    }
-}
-
-static void put_record(sink_t *sink, const part_t *part, const uint8_t *record) {
-    for (size_t f = 0; f < part->fields; f++) {
-        const size_t size = kind_size[part->field[f].kind];
-        const uint8_t *at = record + part->field[f].offset;
-        for (size_t left = part->field[f].count; left > 0U; left--, at += size) {
-            for (size_t i = 0; i < size; i++) {
-                put(sink, at[place(i, size)]);
-            }
-        }
-    }
+    const uint8_t bytes[4] =
+        {(uint8_t)number, (uint8_t)(number >> 8), (uint8_t)(number >> 16), (uint8_t)(number >> 24)};
+    put(sink, bytes, size);
 }
 
 size_t selfcal_snapshot_size(const selfcal_t *self) {
@@ -455,23 +152,19 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     }
     const selfcal_model_t *model = self->model;
     part_t part[PARTS];
-    parts_of(model, self, part);
+    parts_of(model, (selfcal_t *)(uintptr_t)self, part); /* read alone */
     sink_t sink = {.write = write, .context = context, .good = true};
-    for (size_t i = 0; i < sizeof magic; i++) {
-        put(&sink, magic[i]);
-    }
+    put(&sink, magic, sizeof magic);
     put_number(&sink, 4, (uint32_t)size_of(model));
     put_number(&sink, 2, VERSION);
-    put_number(&sink, 1, ARITHMETIC);
+    put_number(&sink, 1, SELFCAL_ARITHMETIC);
     put_number(&sink, 1, model->axes);
     put_number(&sink, 2, model->nodes);
     put_number(&sink, 2, 0);
     put_number(&sink, 4, model->id);
-    put_number(&sink, 4, layout_of(part));
+    put_number(&sink, 4, layout());
     for (size_t p = 0; p < PARTS; p++) {
-        for (size_t k = 0; k < part[p].records && sink.good; k++) {
-            put_record(&sink, &part[p], (const uint8_t *)part[p].record + k * part[p].stride);
-        }
+        put(&sink, part[p].from, part[p].bytes);
     }
     put_number(&sink, TRAILER, crc32(sink.crc, sink.chunk, sink.held));
     if (sink.held > 0U) {
@@ -480,12 +173,11 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     return sink.good ? SELFCAL_OK : SELFCAL_WRITE_FAILED;
 }
 
-/* ----------------------------------------------------------------------------------------------------------- restore */
+/* -----------------------------------------------------------------------------------------------------------
+ * restore */
 
 /* What the header and the checksum say. */
 static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *bytes, size_t length) {
-    part_t part[PARTS];
-    parts_of(model, NULL, part);
     if (length < HEADER + TRAILER) {
         return SELFCAL_SNAPSHOT_TRUNCATED;
     }
@@ -502,33 +194,17 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     if (number_at(bytes + 8, 2) != VERSION) {
         return SELFCAL_SNAPSHOT_VERSION;
     }
-    if (bytes[10] != ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
-        number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id || number_at(bytes + 20, 4) != layout_of(part) ||
+    if (bytes[10] != SELFCAL_ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
+        number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id ||
+        number_at(bytes + 20, 4) != layout() ||
         length != size_of(model)) {
         return SELFCAL_SNAPSHOT_FOREIGN;
     }
     return SELFCAL_OK;
 }
 
-/* Fills a record; false if a bool is neither 0 nor 1. */
-static bool get_record(const part_t *part, uint8_t *record, const uint8_t **bytes) {
-    for (size_t f = 0; f < part->fields; f++) {
-        const size_t size = kind_size[part->field[f].kind];
-        uint8_t *at = record + part->field[f].offset;
-        for (size_t left = part->field[f].count; left > 0U; left--, at += size) {
-            if (part->field[f].kind == KIND_BOOL && **bytes > 1U) {
-                return false;
-            }
-            for (size_t i = 0; i < size; i++) {
-                at[place(i, size)] = *(*bytes)++;
-            }
-        }
-    }
-    return true;
-}
-
-selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size, const void *snapshot,
-                                 size_t length) {
+selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
+                                 const void *snapshot, size_t length) {
     if (self == NULL || model == NULL || memory == NULL || snapshot == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -543,14 +219,13 @@ selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, 
     bytes += HEADER;
     part_t part[PARTS];
     parts_of(model, self, part);
-    bool good = true;
     for (size_t p = 0; p < PARTS; p++) {
-        uint8_t *record = (uint8_t *)part[p].record;
-        for (size_t k = 0; k < part[p].records && good; k++, record += part[p].stride) {
-            good = get_record(&part[p], record, &bytes);
+        if (part[p].bytes > 0U) {
+            memcpy(part[p].from, bytes, part[p].bytes);
         }
+        bytes += part[p].bytes;
     }
-    if (!good || selfcal_check(self) != SELFCAL_OK) {
+    if (selfcal_check(self) != SELFCAL_OK) { /* a bool that is neither 0 nor 1 is found there too */
         (void)selfcal_init(self, model, memory, size);
         return SELFCAL_CORRUPT;
     }

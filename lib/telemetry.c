@@ -1,5 +1,5 @@
 /* Reports and status as frames. Items, bits and scales: selfcal_frames.h, made from selfcal.dbc. */
-#include "internal.h"
+#include "bank.h"
 #include "selfcal_frames.h"
 
 #include <math.h>
@@ -13,8 +13,8 @@ static const char *const axis_names[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_NAM
 /* Items of the places lie evenly, so that loops reach them. */
 SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
-                          SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
-                          SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
+                      SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
+                      SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
 enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
 uint16_t selfcal_crc12(const uint8_t *data, size_t length)
@@ -190,7 +190,8 @@ selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfc
     return SELFCAL_OK;
 }
 
-selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const selfcal_corrected_t *corrected, uint32_t time_ms)
+selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const selfcal_corrected_t *corrected,
+                                             uint32_t time_ms)
 {
     if (self == NULL || corrected == NULL) {
         return SELFCAL_BAD_ARGUMENT;
@@ -416,7 +417,8 @@ static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint3
         return true;
     }
     const bool of_sd = item >= SELFCAL_CORRECTED_SD_GX;
-    const unsigned message = item - (of_sd ? (unsigned)SELFCAL_CORRECTED_SD_GX : (unsigned)SELFCAL_CORRECTED_CORRECTED_GX);
+    const unsigned message =
+        item - (of_sd ? (unsigned)SELFCAL_CORRECTED_SD_GX : (unsigned)SELFCAL_CORRECTED_CORRECTED_GX);
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         if (self->message[axis] == message) {
             *value = float_bits(of_sd ? corrected->sd[axis] : corrected->value[axis]);

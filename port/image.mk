@@ -1,6 +1,6 @@
 # An image for a board of boards.txt. A board's own file sets TARGET and IMAGE_CFLAGS and includes this one:
 #   make -f port/TARGET/TARGET.mk TARGET MODEL_DIR=DIR OUT=DIR [CFLAGS=...]
-# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen --target CORE`). Makes OUT/selfcal.elf, .bin, .hex and .map,
+# MODEL_DIR holds what `selfcal codegen --target CORE` writes. Makes OUT/selfcal.elf, .bin, .hex and .map,
 # and beside the objects gcc's statements of their stacks (.su).
 include port/boards.mk port/arm.mk
 CORE := $(CORE_$(TARGET))
@@ -17,9 +17,9 @@ $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
 
 $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h \
                     port/$(TARGET)/link.ld port/$(TARGET)/$(TARGET).mk port/image.mk port/library.mk port/arm.mk \
-                    $(OUT)/flags
+                    $(MODEL_DIR)/selfcal_config.h $(OUT)/flags
 	@rm -rf $(OUT)/objects
-	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) OUT=$(OUT)/objects \
+	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) MODEL_DIR=$(MODEL_DIR) OUT=$(OUT)/objects \
 	    'PROGRAM_FLAGS=$(QUOTED_FLAGS)'
 	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app \
 	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)

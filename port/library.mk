@@ -1,6 +1,6 @@
-# The library for a core, compiled once for all programs that share its flags. It knows neither the model nor the
-# settings of the application.
-#   make -f port/library.mk objects CORE=CORE OUT=DIR [PROGRAM_FLAGS=...]
+# The library for a core, compiled once for all programs that share its flags. It knows the sizes in
+# MODEL_DIR/selfcal_config.h, not the model, and no settings of the application.
+#   make -f port/library.mk objects CORE=CORE MODEL_DIR=DIR OUT=DIR [PROGRAM_FLAGS=...]
 # puts its objects, and gcc's statements of their stacks (.su), into DIR.
 include port/arm.mk
 
@@ -8,7 +8,7 @@ NOT_THE_LIBRARYS := -DAPP_% -DSELFCAL_NODE=% -DBOARD_% -DADIS16405_% -DQEMU_% -D
 LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out $(NOT_THE_LIBRARYS),$(PROGRAM_FLAGS)))
 LIBRARY_SOURCES := $(wildcard lib/*.c lib/*.h) port/arm.mk
 # Named by the content of all that it is made of: no time stamp takes old objects for new ones.
-LIBRARY_HASH := $(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES); } | sha256sum)
+LIBRARY_HASH := $(shell { printf '%s' '$(subst ','\'',$(LIBRARY_FLAGS))'; cat $(LIBRARY_SOURCES) $(MODEL_DIR)/selfcal_config.h; } | sha256sum)
 LIBRARY := build/library/$(CORE)-$(shell echo $(LIBRARY_HASH) | cut -c1-16)
 
 # The lock: programs may be made at the same time.
@@ -20,5 +20,5 @@ objects:
 
 $(LIBRARY)/stamp:
 	@rm -rf $(@D) && mkdir -p $(@D)
-	$(call arm_objects,$(LIBRARY_FLAGS) -Ilib,$(wildcard lib/*.c),$(@D))
+	$(call arm_objects,$(LIBRARY_FLAGS) -Ilib -I$(MODEL_DIR),$(wildcard lib/*.c),$(@D))
 	@touch $@

@@ -24,7 +24,7 @@ BUILD = ROOT / "build"
 #: s; a suite that takes longer hangs.
 TIMEOUT = {"check": 1800, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
 #: s, by kernel
-FUZZ_SECONDS = {"float": 12, "fixed16": 6, "fixed32": 6}
+FUZZ_SECONDS = {"float": 12, "fixed": 8}
 #: What the suites after the checks run.
 BUILT = ("c-tests", "bench-images", "firmware-images", *(f"build/fuzz/{kernel}/fuzz_api" for kernel in FUZZ_SECONDS))
 #: At once; the machine that this is to be quick on has two cores.
@@ -32,7 +32,7 @@ WORKERS = 2
 #: Left out of `make quick`: the slowest of the checks.
 SLOW_CHECKS = ("check-tidy",)
 #: Variants of the C tests; the first one is plain, and alone in `make quick`.
-VARIANTS = ("plain", "sanitized", "fixed16", "fixed32")
+VARIANTS = ("plain", "sanitized", "fixed")
 #: The thin way of `make quick`: numbers against the textbook, the command, the wire, a recording through the firmware,
 #: both images on their boards. A test that is gone is an error.
 QUICK = (

@@ -1,6 +1,5 @@
-# The firmware for the host: make -f port/posix/posix.mk posix MODEL_DIR=DIR OUT=DIR [AS=cortex-m4f|cortex-m0]
-# MODEL_DIR holds selfcal_model.h and .c (`selfcal codegen`). Makes OUT/selfcal-posix, configured as for the core AS.
-# MODEL_FLAGS: sizes that the model needs beyond the configured ones.
+# The firmware for the host: make -f port/posix/posix.mk posix MODEL_DIR=DIR OUT=DIR
+# MODEL_DIR holds what `selfcal codegen` writes. Makes OUT/selfcal-posix, with the sizes of its --target.
 include port/arm.mk
 
 POSIX_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion
@@ -10,9 +9,10 @@ POSIX_HEADERS := $(wildcard lib/*.h port/*.h port/app/*.h port/replay/*.h port/p
 .PHONY: posix
 posix: $(OUT)/selfcal-posix
 
-$(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_model.c $(MODEL_DIR)/selfcal_model.h
+$(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_model.c \
+                      $(MODEL_DIR)/selfcal_model.h $(MODEL_DIR)/selfcal_config.h
 	@mkdir -p $(OUT)
 	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) \
-	    $(CONFIG_$(AS)) $(MODEL_FLAGS) $(NODE_FLAGS) $(POSIX_CFLAGS) \
+	    $(NODE_FLAGS) $(POSIX_CFLAGS) \
 	    -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
 	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm

@@ -1,5 +1,6 @@
-/* How far reports move when each function of <math.h> errs by ULPS units in the last place: all up, all down, every second function
- * up, and each call by a random part of it. Prints the worst of all records: dP, d mean/sd, d sd/sd, d ln evidence. */
+/* How far reports move when each function of <math.h> errs by ULPS units in the last place: all up, all down, every
+ * second function up, and each call by a random part of it. Prints the worst of all records: dP, d mean/sd, d sd/sd, d
+ * ln evidence. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -70,7 +71,8 @@ static void compare(const selfcal_report_t *true_one, const selfcal_report_t *ot
         const selfcal_posterior_t *a = &true_one->hypothesis[h], *b = &other->hypothesis[h];
         worse(0, fabs((double)a->probability - (double)b->probability));
         if (!(a->probability > 1e-6F)) {
-            continue; /* One that is ruled out may lean on a limit of N, so closely that what ln N is rounded by shows. */
+            /* One that is ruled out may lean on a limit of N, so closely that what ln N is rounded by shows. */
+            continue;
         }
         worse(3, fabs(a->ln_evidence - b->ln_evidence));
         for (int p = 0; p < SELFCAL_PARAMETERS; p++) {
@@ -85,9 +87,11 @@ static void compare(const selfcal_report_t *true_one, const selfcal_report_t *ot
     worse(2, fabs((double)other->bias_sd / (double)true_one->bias_sd - 1.0));
 }
 
-/* White noise 0.04; axis by axis no drift, random walks, Gauss-Markov drifts, the last about a bias of 10 000 times the noise. */
+/* White noise 0.04; axis by axis no drift, random walks, Gauss-Markov drifts, the last about a bias of 10 000 times the
+ * noise. */
 static void push_record(unsigned n) {
-    static const float steps[AXES] = {0.0F, 1e-3F, 0.02F, 5e-4F, 4e-3F, 0.0F}, holds[AXES] = {1.0F, 1.0F, 1.0F, 0.999F, 0.98F, 1.0F};
+    static const float steps[AXES] = {0.0F, 1e-3F, 0.02F, 5e-4F, 4e-3F, 0.0F},
+        holds[AXES] = {1.0F, 1.0F, 1.0F, 0.999F, 0.98F, 1.0F};
     float drift[AXES] = {0};
     state = 12345U;
     for (unsigned i = 0; i < n; i++) {
@@ -96,7 +100,8 @@ static void push_record(unsigned n) {
             drift[axis] = holds[axis] * drift[axis] + steps[axis] * noise();
             sample[axis] = (axis == 5U ? 400.0F : 0.3F) + drift[axis] + 0.04F * noise();
         }
-        if (selfcal_push(&bank, sample) != SELFCAL_OK || (i % 997U == 700U && selfcal_skip(&bank, i % 13U) != SELFCAL_OK)) {
+        if (selfcal_push(&bank, sample) != SELFCAL_OK ||
+            (i % 997U == 700U && selfcal_skip(&bank, i % 13U) != SELFCAL_OK)) {
             exit(2);
         }
     }

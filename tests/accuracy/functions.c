@@ -1,6 +1,6 @@
-/* Writes what each function of <math.h> that lib/ relies on makes of many arguments: for every function its arguments and values in
- * binary, one file. Runs on a host and, with the start-up of tests/bench/image.c, on an emulated Cortex-M. The judge is
- * tests/py/test_math.py, which knows the order below.
+/* Writes what each function of <math.h> that lib/ relies on makes of many arguments: for every function its arguments
+ * and values in binary, one file. Runs on a host and, with the start-up of tests/bench/image.c, on an emulated
+ * Cortex-M. The judge is tests/py/test_math.py, which knows the order below.
  *
  * Arguments are COUNT bit patterns at even steps between two of one sign, hence evenly spread over the exponents. */
 #include <math.h>
@@ -63,18 +63,22 @@ typedef struct {
     double from, to;
 } double_t_;
 
-/* Wider than any argument in lib/: ln of 1e-38 to 1e38 for the logarithms, exponentials that neither overflow nor become denormal. */
+/* Wider than any argument in lib/: ln of 1e-38 to 1e38 for the logarithms, exponentials that neither overflow nor
+ * become denormal. */
 static const single_t singles[] = {
-    {expf, -87.0F, -1e-9F},     {expf, 1e-9F, 88.0F},      {expm1f, -87.0F, -1e-9F}, {expm1f, 1e-9F, 88.0F}, {logf, 1.2e-38F, 3e38F},
+    {expf, -87.0F, -1e-9F},     {expf, 1e-9F, 88.0F},      {expm1f, -87.0F, -1e-9F}, {expm1f, 1e-9F, 88.0F},
+        {logf, 1.2e-38F, 3e38F},
     {log1pf, -0.9999F, -1e-9F}, {log1pf, 1e-9F, 3e38F},    {sqrtf, 1.2e-38F, 3e38F},
 };
 static const double_t_ doubles[] = {
-    {exp, -700.0, -1e-17},      {exp, 1e-17, 700.0},       {expm1, -700.0, -1e-17},  {expm1, 1e-17, 700.0},  {log, 1e-300, 1e300},
+    {exp, -700.0, -1e-17},      {exp, 1e-17, 700.0},       {expm1, -700.0, -1e-17},  {expm1, 1e-17, 700.0},
+        {log, 1e-300, 1e300},
     {log1p, -0.9999999, -1e-17}, {log1p, 1e-17, 1e300},    {sqrt, 1e-300, 1e300},
 };
 
 /* COUNT bit patterns of `size` bytes from `from` on, each with what a function makes of it. */
-static void put_all(const void *from, const void *to, size_t size, void (*evaluate)(uint32_t kind, void *pair), uint32_t kind) {
+static void put_all(const void *from, const void *to, size_t size, void (*evaluate)(uint32_t kind, void *pair),
+                    uint32_t kind) {
     static unsigned char pairs[4096];
     int64_t first = 0, last = 0; /* little-endian: a float's pattern is in the lower half */
     memcpy(&first, from, size);

@@ -1,7 +1,7 @@
-/* Counts the instructions of the library on a Cortex-M, prints them as count.h says, and ends with exit code 0. Every run is the
- * same. */
+/* Counts the instructions of the library on a Cortex-M, prints them as count.h says, and ends with exit code 0. Every
+ * run is the same. */
 #include "count.h"
-#include "internal.h"
+#include "bank.h"
 #include "paper_float.h"
 #include "record.h"
 
@@ -20,7 +20,8 @@ static selfcal_work_t work;
 static selfcal_report_t report;
 static selfcal_telemetry_t telemetry;
 
-/* ------------------------------------------------------------------------------------------------------------ measures */
+/* ------------------------------------------------------------------------------------------------------------
+ * measures */
 
 static record_t record;
 static selfcal_model_t model; /* record_model() */
@@ -113,7 +114,8 @@ static void print_worst_push(const char *name, unsigned samples) {
     count_print(name, worst, 1U);
 }
 
-/* At 819.2 Hz averaged to 1 Hz, where the nodes have time: from the first sample over the batch that places the nodes. */
+/* At 819.2 Hz averaged to 1 Hz, where the nodes have time: from the first sample over the batch that places the
+ * nodes. */
 static void measure_first_push(void) {
     init(&selfcal_model);
     taken_t worst = {0, 0, 0};
@@ -174,7 +176,7 @@ static void measure_hour(void) {
 }
 
 static void measure_report(void) {
-    /* in the order of the stages in posterior.c */
+    /* in the order of the stages in report.c */
     static const char *const stage_name[][3] = {
         {"report.gather", "report.gather.worst_step", "report.gather.steps"},
         {"report.truth", "report.truth.worst_step", "report.truth.steps"},
@@ -201,7 +203,7 @@ static void measure_report(void) {
     selfcal_status_t status = SELFCAL_BUSY;
     while (status == SELFCAL_BUSY) {
         const unsigned stage = work.stage;
-        count_require(stage < STAGES, "the stages of posterior.c");
+        count_require(stage < STAGES, "the stages of report.c");
         start = image_now();
         status = selfcal_report_step(&work, &report);
         const taken_t taken = count_since(start);
@@ -222,7 +224,8 @@ static void measure_report(void) {
 }
 
 static void measure_telemetry(void) {
-    count_require(selfcal_telemetry_init(&telemetry, &selfcal_model, selfcal_model_axis_name) == SELFCAL_OK, "telemetry");
+    count_require(selfcal_telemetry_init(&telemetry, &selfcal_model, selfcal_model_axis_name) == SELFCAL_OK,
+                  "telemetry");
     const image_time_t start = image_now();
     (void)selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank), HOUR * 1000U);
     unsigned frames = 0;
@@ -281,7 +284,8 @@ static void measure_paper(void) {
         for (unsigned k = 0; k < PAPER_SIGMAS; k++) {
             const unsigned j = i * PAPER_SIGMAS + k;
             paper_init(&paper[j], &node, paper_sigma(k));
-            count_require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k), &ln_likelihood[j]) == SELFCAL_OK,
+            count_require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k),
+                                                 &ln_likelihood[j]) == SELFCAL_OK,
                           "likelihood");
         }
     }

@@ -76,18 +76,14 @@ def _board(core: str, *, image: bool = True) -> tuple[int, str, int]:
 
 MACHINES = {
     "cortex-m4f": Machine("netduinoplus2", (), *_board("cortex-m4f")),
-    # ... without the assembly kernel.
-    "cortex-m4f-portable": Machine("netduinoplus2", (), *_board("cortex-m4f", image=False)),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
     "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x9000"), *_board("cortex-m0")),
-    # ... and by 32-bit products instead of 16-bit ones.
-    "cortex-m0-32bit": Machine(
-        "microbit", ("-global", "nrf51-soc.sram-size=0x9000"), *_board("cortex-m0", image=False)
-    ),
 }
 
-#: What a bank that reports and sends cannot be without; the rest is linked by those who call it.
-ALWAYS = ("averager", "bank", "kernel_fixed", "kernel_float", "posterior", "telemetry")
+#: Files by the beginnings of their names: what a bank that reports and sends cannot be without.
+ALWAYS = ("intake", "bank", "report", "telemetry")
+#: ... but for what a model has to name.
+NAMED = ("bank_columns", "bank_forget", "bank_states")
 SMALL_GRID = 12 * 12 + 12 + 1
 
 
@@ -160,7 +156,8 @@ def text_sizes(target: str) -> dict[str, int]:
     for size, path in section.findall(linked):
         if Path(path).stem in library:
             kept["library"] += int(size, 16)
-            kept["always"] += int(size, 16) if Path(path).stem in ALWAYS else 0
+            always = Path(path).stem.startswith(ALWAYS) and Path(path).stem not in NAMED
+            kept["always"] += int(size, 16) if always else 0
         elif Path(path).stem == "selfcal_model":
             kept["tables"] += int(size, 16)
         elif ".a(" in path:
@@ -269,7 +266,7 @@ def table(bench: Bench) -> str:
     number("filters (nodes) of the default model", "facts", "nodes")
     per("`selfcal_push()`, six axes, averaging only", "push", ".1f")
     per("bank, every filter settled, per (node, sample, axis)", "bank.steady", ".2f")
-    per("… without the averager", "bank.steady.alone", ".2f")
+    per("… without the intake", "bank.steady.alone", ".2f")
     per("bank, every filter but one varying, per (node, sample, axis)", "bank.varying", ".2f")
     per("bank, first 3600 samples, per (node, sample, axis)", "bank.hour", ".2f")
     number("filters settled after them", "facts", "bank.hour.settled")
@@ -355,7 +352,7 @@ def table(bench: Bench) -> str:
         number(f"flash, {path.name}", "sizes", f"text.{path.stem}")
     number("flash, library", "sizes", "text.library")
     number("… linked with `--gc-sections`", "sizes", "linked.library")
-    number("… of that averager, bank, kernel, posterior, telemetry", "sizes", "linked.always")
+    number("… of that intake, bank, kernel, report, telemetry", "sizes", "linked.always")
     number("… and what it draws from libm, libc, libgcc", "sizes", "linked.runtime")
     number("flash, tables of the model", "sizes", "linked.tables")
     number("RAM, `SELFCAL_SIZE`, six axes", "sizes", "ram.SELFCAL_SIZE")

@@ -1,5 +1,5 @@
-// Nanoseconds per (node, sample, axis) on the host: the library's bank with every filter settled, and the textbook bank.
-// Prints `library NS` and `textbook NS`, the best of some rounds each. One thread.
+// Nanoseconds per (node, sample, axis) on the host: the library's bank with every filter settled, and the textbook
+// bank. Prints `library NS` and `textbook NS`, the best of some rounds each. One thread.
 #include "record.h"
 #include "textbook_bank.hpp"
 

@@ -16,7 +16,8 @@ extern void image_stack(void); /* its address is the stack's */
 
 volatile uint32_t image_rounds;
 
-/* ---------------------------------------------------------------------------------------------------------- semihosting */
+/* ----------------------------------------------------------------------------------------------------------
+ * semihosting */
 
 enum { SYS_WRITE0 = 0x04, SYS_EXIT_EXTENDED = 0x20 };
 
@@ -48,11 +49,13 @@ void image_exit(uint32_t code) {
     }
 }
 
-/* ---------------------------------------------------------------------------------------------------------------- clock */
+/* ----------------------------------------------------------------------------------------------------------------
+ * clock */
 
 /* In assembly, so that what it adds to a count is known: five instructions. */
 __attribute__((naked)) static void count_round(void) {
-    __asm__ volatile(".syntax unified\n ldr r0, =image_rounds\n ldr r1, [r0]\n adds r1, #1\n str r1, [r0]\n bx lr\n .ltorg");
+    __asm__ volatile(".syntax unified\n ldr r0, =image_rounds\n ldr r1, [r0]\n adds r1, #1\n str r1, [r0]\n bx lr\n"
+                     ".ltorg");
 }
 
 void image_start_clock(void) {
@@ -76,7 +79,8 @@ __attribute__((naked, noinline)) void image_known_loop(uint32_t count) {
     __asm__ volatile(".syntax unified\n1: nop\n subs r0, #1\n bne 1b\n bx lr");
 }
 
-/* ------------------------------------------------------------------------------------------------------------- start-up */
+/* -------------------------------------------------------------------------------------------------------------
+ * start-up */
 
 static void fault(void) {
     image_print("fault\n");
@@ -101,5 +105,6 @@ void reset(void) {
 
 typedef void (*vector_t)(void);
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16] = {
-    image_stack, reset, fault, fault, fault, fault, fault, NULL, NULL, NULL, NULL, fault, fault, NULL, fault, count_round,
+    image_stack, reset, fault, fault, fault, fault, fault, NULL, NULL, NULL, NULL, fault, fault, NULL, fault,
+        count_round,
 };

@@ -1,12 +1,12 @@
-/* What a bare-metal bench image runs on: a Cortex-M under QEMU with `-icount shift=6,sleep=off`, where every instruction takes
- * 64 ns of virtual time, and semihosting. */
+/* What a bare-metal bench image runs on: a Cortex-M under QEMU with `-icount shift=6,sleep=off`, where every
+ * instruction takes 64 ns of virtual time, and semihosting. */
 #ifndef IMAGE_H
 #define IMAGE_H
 
 #include <stdint.h>
 
-/* SysTick ticks since image_start_clock(), and how often the counter ran round: its handler adds IMAGE_HANDLER_INSTRUCTIONS each
- * time. */
+/* SysTick ticks since image_start_clock(), and how often the counter ran round: its handler adds
+ * IMAGE_HANDLER_INSTRUCTIONS each time. */
 typedef struct {
     uint64_t ticks;
     uint32_t rounds;

@@ -1,6 +1,7 @@
-/* Counts the instructions of the firmware application on a Cortex-M, the stationary gate before the bank: what a sample costs at
- * the sensor's full rate, between reports and while one is worked out, and how long samples wait then; the gate by itself. Time is the instructions' own, at MHZ of them a second.
- * Prints as bench.c does. Reading the sensor and writing the wire are not in it. */
+/* Counts the instructions of the firmware application on a Cortex-M, the stationary gate before the bank: what a sample
+ * costs at the sensor's full rate, between reports and while one is worked out, and how long samples wait then; the
+ * gate by itself. Time is the instructions' own, at MHZ of them a second. Prints as bench.c does. Reading the sensor
+ * and writing the wire are not in it. */
 #include "app.h"
 #include "count.h"
 #include "record.h"
@@ -8,8 +9,9 @@
 #define AXES SELFCAL_MODEL_AXES
 /* Samples that lie ready; a power of two. */
 #define RING 32U
-/* Reports are due when 33 bank samples are in: 2 batches, so that pushes carry the nodes' work, and one for the gate to see rest.
- * Meanwhile the gate takes the noise that it has measured twice, after 30 and 60 windows of a third of a second. */
+/* Reports are due when 33 bank samples are in: 2 batches, so that pushes carry the nodes' work, and one for the gate to
+ * see rest. Meanwhile the gate takes the noise that it has measured twice, after 30 and 60 windows of a third of a
+ * second. */
 #define REPORT_MS 34000U
 /* One sample is missing before this one, so that the gate judges a window by thresholds of its own. */
 #define GAP_AT 20000U
@@ -92,7 +94,8 @@ static void keep_worst(taken_t *worst, taken_t taken) {
     }
 }
 
-/* A sample's share while thresholds are worked out, while none is, at a whole window's end, and at that of one with a sample missing. */
+/* A sample's share while thresholds are worked out, while none is, at a whole window's end, and at that of one with a
+ * sample missing. */
 static void print_gate(void) {
     taken_t step = {0, 0, 0}, sum = {0, 0, 0}, judged = {0, 0, 0}, part = {0, 0, 0};
     uint32_t steps = 0;

@@ -1,10 +1,10 @@
-/* Counts per (node, sample, axis) what regressors cost, or with SELFCAL_TERMS_MAX of 3 the laws that are sums; and the default
+/* Counts per (node, sample, axis) what regressors cost, or with BENCH_SUMS the laws that are sums; and the default
  * model, which has neither, in such an image and in one without their code (-DBENCH_PLAIN). Prints as count.h says. */
 #include "count.h"
-#include "internal.h"
+#include "bank.h"
 #include "record.h"
 
-#if SELFCAL_TERMS_MAX > 1
+#if defined(BENCH_SUMS)
 #include "../c/laws.h"
 #endif
 
@@ -13,7 +13,7 @@
 #define WINDOW (SELFCAL_TERMS_MAX > 1 ? 32U : 64U)
 /* Bank samples within which the filters of fast drifts settle. */
 #define SETTLED_BY 5000U
-#if SELFCAL_TERMS_MAX > 1
+#if defined(BENCH_SUMS)
 #define SUM_GRID 6U /* nodes a dimension; none costs more or less than another */
 #define BYTES (SELFCAL_SIZE(SUM_GRID * SUM_GRID, AXES) + SELFCAL_TERMS_SIZE(SUM_GRID * SUM_GRID, AXES, 0U))
 #elif defined(BENCH_PLAIN)
@@ -57,7 +57,8 @@ static uint64_t steady_samples(void) {
     return sum;
 }
 
-/* One window of a new bank over `model`: with fast drifts once all filters have settled, with slow ones near its beginning. */
+/* One window of a new bank over `model`: with fast drifts once all filters have settled, with slow ones near its
+ * beginning. */
 static void measure(const char *name, const selfcal_model_t *model, bool fast, bool levels) {
     record_init(&record);
     count_require(selfcal_init(&bank, model, memory, sizeof memory) == SELFCAL_OK, "init");
@@ -77,7 +78,7 @@ static void measure(const char *name, const selfcal_model_t *model, bool fast, b
     }
 }
 
-#if SELFCAL_TERMS_MAX > 1
+#if defined(BENCH_SUMS)
 
 static void measure_sum(const char *name, unsigned law, bool fast) {
     static const selfcal_real_t fit[SUM_GRID * SUM_GRID] = {0}; /* for reports, which there are none of */
@@ -90,6 +91,7 @@ static void measure_sum(const char *name, unsigned law, bool fast) {
             prior[a][p] = law != FLICKER && p == SELFCAL_RATIO ? ratio : axis[a].prior[p];
         }
     }
+    model.states = &selfcal_states_code;
     const selfcal_hypothesis_t hypothesis = {&named_law[law], 0.0F, &grid, &grid, &prior[0][0]};
     model.hypothesis = &hypothesis;
     model.hypotheses = 1;

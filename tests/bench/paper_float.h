@@ -1,6 +1,7 @@
-/* The recursion as printed in Stepanov & Motorin, IFAC-PapersOnLine 50-1 (2017) 2830-2835, in plain float C: what the library's
- * instruction counts are measured against. One textbook filter with the state (drift, bias) per (node, sigma_v), its covariance at
- * every step, and weights (11) normalised at every sample (in logarithms: as numbers they would underflow). */
+/* The recursion as printed in Stepanov & Motorin, IFAC-PapersOnLine 50-1 (2017) 2830-2835, in plain float C: what the
+ * library's instruction counts are measured against. One textbook filter with the state (drift, bias) per (node,
+ * sigma_v), its covariance at every step, and weights (11) normalised at every sample (in logarithms: as numbers they
+ * would underflow). */
 #ifndef PAPER_FLOAT_H
 #define PAPER_FLOAT_H
 

@@ -24,8 +24,8 @@ void record_next(record_t *record, float sample[SELFCAL_MODEL_AXES]);
 /* The default model with every sample a bank sample, one a second. */
 selfcal_model_t record_model(void);
 
-/* The same with priors narrowed to the fastest drifts, where every filter settles within hundreds of samples, or to the slowest,
- * where none does but the constant one. `axis` [axes] must stay. */
+/* The same with priors narrowed to the fastest drifts, where every filter settles within hundreds of samples, or to the
+ * slowest, where none does but the constant one. `axis` [axes] must stay. */
 selfcal_model_t record_narrow_model(bool fast, selfcal_axis_t axis[SELFCAL_MODEL_AXES]);
 
 /* Filters whose gains have settled for good: those that the fast kernel runs. */

@@ -1,12 +1,13 @@
-/* The functions of <math.h> that lib/ calls and that C libraries round differently, from +, -, * and / alone. Linked into a
- * host build and into an emulated one, it takes the C libraries out of the comparison: what then differs is the firmware's.
- * Right to some 1e-14, which is all it needs; SAME_FMAF adds fmaf(), which newlib does not round once where the core has no
- * instruction for it. */
+/* The functions of <math.h> that lib/ calls and that C libraries round differently, from +, -, * and / alone. Linked
+ * into a host build and into an emulated one, it takes the C libraries out of the comparison: what then differs is the
+ * firmware's. Right to some 1e-14, which is all it needs; SAME_FMAF adds fmaf(), which newlib does not round once where
+ * the core has no instruction for it. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
-static const double LN2_HIGH = 0.693147180369123816490, LN2_LOW = 1.90821492927058770002e-10; /* fdlibm's split of ln 2 */
+/* fdlibm's split of ln 2 */
+static const double LN2_HIGH = 0.693147180369123816490, LN2_LOW = 1.90821492927058770002e-10;
 
 static double scaled(double value, int exponent)
 {

@@ -2,11 +2,12 @@
  *
  *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS COLUMNS NODE
  *
- * As a slow module would that takes SLOW_MS for each axis: an axis's report is begun when that of the last is out, with the
- * status every STATUS_MS between. 0: all at once. The hypotheses are a random walk, Gauss-Markov, a constant bias, and
- * these again.
+ * As a slow module would that takes SLOW_MS for each axis: an axis's report is begun when that of the last is out, with
+ * the status every STATUS_MS between. 0: all at once. The hypotheses are a random walk, Gauss-Markov, a constant bias,
+ * and these again.
  *
- * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F `. */
+ * Each report: lines `V MESSAGE SIGNAL NUMBER` with what its frames must say, then its frames as SLCAN lines after `F
+ * `. */
 #include "selfcal.h"
 
 #include "laws.h"
@@ -144,7 +145,8 @@ int main(int argc, char **argv)
     require(selfcal_telemetry_init(&telemetry, &model, axis_name));
     require(selfcal_telemetry_node(&telemetry, node));
     for (unsigned long number = 1; number <= reports; number++) {
-        const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U + (number - 1U) * AXES * slow_ms); /* wraps within the stream */
+        /* wraps within the stream */
+        const uint32_t time_ms = (uint32_t)(4294940000U + number * 1500U + (number - 1U) * AXES * slow_ms);
         selfcal_counters_t counters;
         memset(&counters, 0, sizeof counters);
         counters.samples = told_count("STATUS", "samples", random32());
@@ -231,8 +233,10 @@ int main(int argc, char **argv)
             (void)told_count(message[a], "hypotheses", hypotheses);
             (void)told_count(message[a], "columns", columns);
             selfcal_telemetry_coefficients(&telemetry, coefficient);
-            for (uint32_t after = (a * slow_ms / STATUS_MS + 1U) * STATUS_MS; after <= (a + 1U) * slow_ms; after += STATUS_MS) {
-                require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number, time_ms + after));
+            for (uint32_t after = (a * slow_ms / STATUS_MS + 1U) * STATUS_MS; after <= (a + 1U) * slow_ms;
+                 after += STATUS_MS) {
+                require(selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, (uint32_t)number,
+                                                 time_ms + after));
                 send_all(&telemetry);
             }
             require(selfcal_telemetry_report(&telemetry, &report, &counters, begun_ms));

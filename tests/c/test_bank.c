@@ -37,7 +37,8 @@ static void bad_arguments_change_nothing(void) {
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_init(NULL, &model, memory, sizeof memory));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_init(&other, NULL, memory, sizeof memory));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_init(&other, &model, NULL, sizeof memory));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_init(&other, &model, memory, SELFCAL_SIZE(model.nodes, model.axes) - 1U));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY,
+                      selfcal_init(&other, &model, memory, SELFCAL_SIZE(model.nodes, model.axes) - 1U));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_init(&other, &model, (char *)memory + 4, sizeof memory));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push(&bank, NULL));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push(NULL, (const float[AXES]){0}));
@@ -60,7 +61,8 @@ static void bad_arguments_change_nothing(void) {
     TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
 }
 
-/* Noise of 30 deg/s, beyond what the priors allow, within the range: no number may stand for a bias that nothing is known of. */
+/* Noise of 30 deg/s, beyond what the priors allow, within the range: no number may stand for a bias that nothing is
+ * known of. */
 static void a_record_outside_the_priors_has_no_bias(void) {
     for (unsigned i = 0; i < 2000U; i++) {
         push(0.0F, 30.0F);
@@ -77,7 +79,8 @@ static void a_record_outside_the_priors_has_no_bias(void) {
     TEST_ASSERT_TRUE(isnan(sd));
 }
 
-/* Short records up to 200 times louder than the priors allow: the last pass of a search may find no row as high as one before it. */
+/* Short records up to 200 times louder than the priors allow: the last pass of a search may find no row as high as one
+ * before it. */
 static void a_loud_record_has_a_finite_bias_or_none(void) {
     static const unsigned samples[] = {5, 30, 60};
     static const float loud[] = {5.0F, 10.0F, 15.0F, 50.0F, 100.0F};
@@ -114,7 +117,8 @@ static void models_that_contradict_themselves_are_refused(void) {
         bad.dt_s = intervals[i];
         TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
     }
-    static const selfcal_prior_t priors[] = {{-47.0F, 0.0F, false}, {0.0F, 47.0F, false}, {1.0F, 1.0F, false}, {NAN, 1.0F, false},
+    static const selfcal_prior_t priors[] =
+        {{-47.0F, 0.0F, false}, {0.0F, 47.0F, false}, {1.0F, 1.0F, false}, {NAN, 1.0F, false},
                                              {0.0F, NAN, false},    {-INFINITY, 0.0F, true}, {0.0F, INFINITY, true}};
     for (unsigned i = 0; i < sizeof priors / sizeof priors[0]; i++) {
         selfcal_axis_t axis[AXES];
@@ -126,8 +130,8 @@ static void models_that_contradict_themselves_are_refused(void) {
     }
 }
 
-/* Found by fuzzing: drift over white noise is anything here, up to 1e40. Through the longest gaps there are, with blocks of every
- * weight, nothing overflows. */
+/* Found by fuzzing: drift over white noise is anything here, up to 1e40. Through the longest gaps there are, with
+ * blocks of every weight, nothing overflows. */
 static void the_widest_priors_keep_every_sum_finite(void) {
     selfcal_axis_t axis[AXES];
     memcpy(axis, model.axis, sizeof axis);
@@ -153,7 +157,8 @@ static void the_widest_priors_keep_every_sum_finite(void) {
     selfcal_node_view_t view;
     for (uint16_t node = 0; node < model.nodes; node++) {
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, node, &view));
-        TEST_ASSERT_TRUE(isfinite(view.a) && isfinite(view.b) && isfinite(view.c) && isfinite(view.ln_s) && view.a > 0.0);
+        TEST_ASSERT_TRUE(isfinite(view.a) && isfinite(view.b) && isfinite(view.c) && isfinite(view.ln_s) &&
+                         view.a > 0.0);
     }
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_check(&bank));
 }
@@ -171,7 +176,8 @@ static void the_constant_law_sums_the_data(void) {
             first = sample[0];
         }
         sum += (selfcal_wide_t)sample[0] - (selfcal_wide_t)first;
-        square += ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first) * ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first);
+        square += ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first) *
+            ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first);
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
     }
     selfcal_node_view_t view;
@@ -185,8 +191,8 @@ static void the_constant_law_sums_the_data(void) {
     TEST_ASSERT_TRUE(selfcal_offset(&bank, 0) == (selfcal_wide_t)first);
 }
 
-/* ln p of the constant law is a normal density with covariance sigma^2 I + P0 1 1'; its determinant and quadratic form are
- * closed (Sherman-Morrison). */
+/* ln p of the constant law is a normal density with covariance sigma^2 I + P0 1 1'; its determinant and quadratic form
+ * are closed (Sherman-Morrison). */
 static void the_likelihood_of_the_constant_law_is_the_normal_density(void) {
     enum { N = 50 };
     selfcal_wide_t sum = 0.0, square = 0.0;
@@ -200,17 +206,19 @@ static void the_likelihood_of_the_constant_law_is_the_normal_density(void) {
         square += (selfcal_wide_t)y * (selfcal_wide_t)y;
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
     }
-    const selfcal_wide_t sigma = 0.05, p0 = (selfcal_wide_t)model.axis[0].bias_sd * (selfcal_wide_t)model.axis[0].bias_sd;
+    const selfcal_wide_t sigma = 0.05,
+        p0 = (selfcal_wide_t)model.axis[0].bias_sd * (selfcal_wide_t)model.axis[0].bias_sd;
     const selfcal_wide_t var = sigma * sigma;
-    const selfcal_wide_t expected = -0.5 * (N * log(2.0 * 3.14159265358979324 * var) + log(1.0 + N * p0 / var) + square / var -
+    const selfcal_wide_t expected =
+        -0.5 * (N * log(2.0 * 3.14159265358979324 * var) + log(1.0 + N * p0 / var) + square / var -
                                             p0 * sum * sum / (var * (var + N * p0)));
     selfcal_wide_t ln_p = 0.0;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_log_likelihood(&bank, 0, 0, sigma, &ln_p));
     TEST_ASSERT_TRUE(fabs(ln_p - expected) < 1e-4); /* float sums: 64 roundings of 6e-8 on some 50 nats */
 }
 
-/* A gap of k samples told at once or one by one is the same prediction. Both ways the node's sums see the same samples; only
- * the rounding of the one-step predictions differs. */
+/* A gap of k samples told at once or one by one is the same prediction. Both ways the node's sums see the same samples;
+ * only the rounding of the one-step predictions differs. */
 static void a_gap_may_be_told_in_pieces(void) {
     static selfcal_wide_t memory2[sizeof memory / sizeof memory[0]];
     selfcal_t other;
@@ -240,7 +248,8 @@ static void a_gap_may_be_told_in_pieces(void) {
     TEST_ASSERT_EQUAL(37, selfcal_counters(&other)->missing);
 }
 
-/* A gap of two hours lets every drift forget: the likelihood of what follows is that of fresh filters, so nothing may blow up. */
+/* A gap of two hours lets every drift forget: the likelihood of what follows is that of fresh filters, so nothing may
+ * blow up. */
 static void a_long_gap_leaves_finite_sums(void) {
     for (int i = 0; i < 100; i++) {
         push(0.1F, 0.02F);
@@ -252,14 +261,15 @@ static void a_long_gap_leaves_finite_sums(void) {
     for (uint16_t node = 0; node < model.nodes; node++) {
         selfcal_node_view_t view;
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_node(&bank, 0, node, &view));
-        TEST_ASSERT_TRUE(isfinite(view.a) && isfinite(view.b) && isfinite(view.c) && isfinite(view.ln_s) && view.a > 0.0);
+        TEST_ASSERT_TRUE(isfinite(view.a) && isfinite(view.b) && isfinite(view.c) && isfinite(view.ln_s) &&
+                         view.a > 0.0);
     }
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&work, &bank, 0, &report));
     TEST_ASSERT_TRUE(isfinite(report.bias_mean) && report.bias_sd > 0.0F);
 }
 
-/* Once the nodes have their place (after SELFCAL_BATCH bank samples), reports on the way change nothing but where float sums are
- * folded: some hundred roundings of 6e-8. */
+/* Once the nodes have their place (after SELFCAL_BATCH bank samples), reports on the way change nothing but where float
+ * sums are folded: some hundred roundings of 6e-8. */
 static void reports_on_the_way_do_not_change_the_sums(void) {
     selfcal_node_view_t with[SELFCAL_MODEL_NODES];
     for (int round = 0; round < 2; round++) {

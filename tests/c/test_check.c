@@ -92,7 +92,8 @@ static void a_silent_sensor_is_sound(void) {
     }
 }
 
-/* As much white noise and as little walk as a model may have: variances of drift over white noise are denormals, or 0. */
+/* As much white noise and as little walk as a model may have: variances of drift over white noise are denormals, or
+ * 0. */
 static void a_model_at_its_limits_is_sound(void) {
     selfcal_axis_t axes[AXES];
     memcpy(axes, selfcal_model.axis, sizeof axes);
@@ -187,9 +188,9 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.sums[0].exponent = 101);
     BROKEN(bank.sums[0].shift = 16);
 #else
-    BROKEN(bank.first[0] = NAN);
-    BROKEN(bank.sum[0] = NAN);
-    BROKEN(bank.sum_sq[0] = -1.0F);
+    BROKEN(bank.sums[0].first = NAN);
+    BROKEN(bank.sums[0].sum = NAN);
+    BROKEN(bank.sums[0].sum_sq = -1.0F);
 #endif
     BROKEN(bank.within[AXES - 1U] = -1.0);
     BROKEN(bank.within[0] = INFINITY);
@@ -200,9 +201,6 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(memset(&gathered->part, 2, 1));
     BROKEN(memset(&waits->part, 254, 1));
     BROKEN(memset(&node[level].level, 3, 1));
-#ifdef SELFCAL_FIXED
-    BROKEN(memset(&bank.step_floored, 2, 1));
-#endif
     /* counts that do not fit */
     BROKEN(bank.counters.samples = 0);
     BROKEN(bank.counters.samples = bank.within_dof);
@@ -244,14 +242,14 @@ static void each_broken_invariant_is_seen(void) {
     BROKEN(bank.x[last] = INT32_MAX);
     BROKEN(bank.x[0] = INT32_MIN);
     BROKEN(bank.x[0] = 2 * SELFCAL_FIXED_LIMIT); /* among the readings, but for rounding */
-    BROKEN(bank.scale[AXES - 1U].exponent = 201);
-    BROKEN(bank.scale[0].most_y = -1);
-    BROKEN(bank.y_fixed[0][SELFCAL_BATCH - 1U] = INT32_MAX);
-    BROKEN(bank.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
-    BROKEN(bank.step[0][1]++); /* not that of its readings */
-    BROKEN(bank.step_from = bank.step_to + 1U);
-    BROKEN(bank.step_to = SELFCAL_BATCH + 1U);
-    BROKEN(bank.step_beta = NAN);
+    BROKEN(bank.integers.scale[AXES - 1U].exponent = 201);
+    BROKEN(bank.integers.scale[0].most_y = -1);
+    BROKEN(bank.integers.y[0][SELFCAL_BATCH - 1U] = INT32_MAX);
+    BROKEN(bank.integers.step[AXES - 1U][SELFCAL_BATCH] = INT32_MIN);
+    BROKEN(bank.integers.step[0][1]++); /* not that of its readings */
+    BROKEN(bank.integers.step_from = bank.integers.step_to + 1U);
+    BROKEN(bank.integers.step_to = SELFCAL_BATCH + 1U);
+    BROKEN(bank.integers.step_beta = NAN);
     BROKEN(node[level].g_shift++);
     BROKEN(node[level].u_shift = 64);
     BROKEN(node[level].gains.settled.w++);

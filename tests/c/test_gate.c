@@ -1,4 +1,5 @@
-/* The stationary gate through the public header: arguments and extremes. Its statistics are tested in tests/py/test_gate.py. */
+/* The stationary gate through the public header: arguments and extremes. Its statistics are tested in
+ * tests/py/test_gate.py. */
 #include <float.h>
 #include <math.h>
 
@@ -79,12 +80,14 @@ static void extremes_are_motion(void) {
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_noise(&gate, axis, &tiny));
     }
     for (unsigned i = 0; i < 1000U; i++) {
-        TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
+        TEST_ASSERT_EQUAL(SELFCAL_MOVING,
+                          selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
         TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){FLT_MAX, NAN}));
     }
     TEST_ASSERT_EQUAL(200, gate.counters.blind);
     for (unsigned i = 0; i < 1000U; i++) {
-        TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
+        TEST_ASSERT_EQUAL(SELFCAL_MOVING,
+                          selfcal_gate_push(&gate, (const float[2]){i % 2U == 0U ? most : -most, -most}));
     }
     TEST_ASSERT_EQUAL(100, gate.counters.shaken);
     TEST_ASSERT_EQUAL(SELFCAL_MOVING, selfcal_gate_skip(&gate, UINT64_MAX));
@@ -101,8 +104,8 @@ static unsigned settle(void) {
     return steps;
 }
 
-/* Thresholds come in steps, as many as the header says at most, over false alarm rates and windows; those worked out at once, for a
- * window of as many samples with one missing, are the same to the last bit: it is one computation, cut. */
+/* Thresholds come in steps, as many as the header says at most, over false alarm rates and windows; those worked out at
+ * once, for a window of as many samples with one missing, are the same to the last bit: it is one computation, cut. */
 static void thresholds_in_steps_are_those_at_once(void) {
     static const float rates[] = {0.1F, 1e-2F, 1e-4F, 1e-8F};
     static const uint32_t windows[] = {100, 273, 2000, 100000};
@@ -131,7 +134,8 @@ static void thresholds_in_steps_are_those_at_once(void) {
     }
 }
 
-/* A change of noise just before a window's end is in force at that end, and a gyro left out is out of the gyros' threshold. */
+/* A change of noise just before a window's end is in force at that end, and a gyro left out is out of the gyros'
+ * threshold. */
 static void a_late_change_of_noise_counts(void) {
     const selfcal_gate_noise_t none = {INFINITY, 1.0F, 1.0F, 1.0F};
     (void)window(5.0F, 9.8F);

@@ -91,7 +91,8 @@ static const char *expected(const char *line, size_t length, bool *open)
     if (strlen(line) == length) { /* no zero byte inside */
         for (size_t i = 0; i < sizeof accepted / sizeof accepted[0]; i++) {
             if (strcmp(line, accepted[i]) == 0) {
-                *open = strcmp(line, "C") == 0 ? false : strcmp(line, "O") == 0 || strcmp(line, "L") == 0 ? true : *open;
+                *open = strcmp(line, "C") == 0 ? false : strcmp(line, "O") == 0 ||
+                    strcmp(line, "L") == 0 ? true : *open;
                 return "\r";
             }
         }

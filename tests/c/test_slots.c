@@ -1,5 +1,6 @@
-/* Saved state in two slots (port/app/slots.h) on a memory in RAM that behaves as flash: what stands after a power cut at every one of
- * its operations, after operations that it refuses, after damage, and when a state is longer than a slot. The truth is what was put. */
+/* Saved state in two slots (port/app/slots.h) on a memory in RAM that behaves as flash: what stands after a power cut
+ * at every one of its operations, after operations that it refuses, after damage, and when a state is longer than a
+ * slot. The truth is what was put. */
 #include "slots.h"
 
 #include <string.h>
@@ -14,7 +15,8 @@ static union {
 static long operations, cut_at, refuse_at;
 static bool off; /* the power is cut */
 
-/* The operation that the cut falls into is half done: a word has the low half of its bits, a slot is erased to its middle. */
+/* The operation that the cut falls into is half done: a word has the low half of its bits, a slot is erased to its
+ * middle. */
 static bool erase(uint32_t slot)
 {
     const long now = operations++;
@@ -160,8 +162,8 @@ static void the_next_save_overwrites_the_damaged_one(void)
     TEST_ASSERT_EQUAL(1, stored(true));
 }
 
-/* As the application asks when start-up has refused the newest, whole as it is: a cut anywhere leaves the state in use, also in the
- * save after that, which finds no other. */
+/* As the application asks when start-up has refused the newest, whole as it is: a cut anywhere leaves the state in use,
+ * also in the save after that, which finds no other. */
 static void the_older_one_is_kept_where_it_is_asked_for(void)
 {
     long total = 1;

@@ -9,7 +9,7 @@
 #ifdef SELFCAL_FIXED
 #define SOME_X 77
 #define NO_X 0x7FFFFFFFU
-#define REAL_BYTES SELFCAL_FIXED
+#define REAL_BYTES 32
 #else
 #define SOME_X 7.7e-5F
 #define NO_X 0x7FC00000U /* a quiet NaN */
@@ -19,7 +19,8 @@
 enum { AXES = 2, BLOCK = 3, SAMPLES = 420 };
 #define MEMORY_BYTES SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
 #define BYTES_MAX SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
-enum { OFFSET_LENGTH = 4, OFFSET_VERSION = 8, OFFSET_REAL = 10, OFFSET_AXES = 11, OFFSET_NODES = 12, OFFSET_ID = 16, OFFSET_N = 24 };
+enum { OFFSET_LENGTH = 4, OFFSET_VERSION = 8, OFFSET_REAL = 10, OFFSET_AXES = 11, OFFSET_NODES = 12, OFFSET_ID = 16,
+    OFFSET_N = 24 };
 
 typedef struct {
     selfcal_t self;
@@ -54,7 +55,8 @@ static float noise(uint32_t index) {
     return sum - 6.0F;
 }
 
-/* Step `i` of a record with everything in it that counts: gaps in blocks and over them, bad samples of each kind, reports. */
+/* Step `i` of a record with everything in it that counts: gaps in blocks and over them, bad samples of each kind,
+ * reports. */
 static void step(selfcal_t *self, uint32_t i) {
     float sample[AXES];
     for (uint32_t axis = 0; axis < AXES; axis++) {
@@ -187,11 +189,13 @@ static void restored_anywhere_and_continued_equals_uninterrupted(void) {
         in_gap += bank.self.pending_gap > 0U ? 1U : 0U;
         step(&bank.self, i);
     }
-    TEST_ASSERT_TRUE(in_batch > 300U && running > 50U && in_block > 200U && in_gap > 5U); /* else the cuts are not where they should be */
+    /* else the cuts are not where they should be */
+    TEST_ASSERT_TRUE(in_batch > 300U && running > 50U && in_block > 200U && in_gap > 5U);
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     for (uint32_t i = 0; i < SAMPLES; i++) {
         memset(&other, 0xA5, sizeof other); /* what was there before must not matter */
-        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_restore(&other.self, &model, other.memory, sizeof other.memory, cut[i], length));
+        TEST_ASSERT_EQUAL(SELFCAL_OK,
+                          selfcal_restore(&other.self, &model, other.memory, sizeof other.memory, cut[i], length));
         run(&other, i, SAMPLES);
         TEST_ASSERT_EQUAL(SELFCAL_OK, save(&other, &again));
         TEST_ASSERT_EQUAL_MEMORY(saved.bytes, again.bytes, length);
@@ -204,8 +208,8 @@ static void restored_anywhere_and_continued_equals_uninterrupted(void) {
     TEST_ASSERT_EQUAL_MEMORY(&one, &two, sizeof one);
 }
 
-/* Everything but the pointers, padding and all (selfcal_init() clears it): a member that a snapshot leaves out differs, unless it
- * is 0. So none may be: the counters are looked at, the rest is what the record makes of it. */
+/* Everything but the pointers, padding and all (selfcal_init() clears it): a member that a snapshot leaves out differs,
+ * unless it is 0. So none may be: the counters are looked at, the rest is what the record makes of it. */
 static void every_byte_of_the_bank_comes_back(void) {
     begin(&bank);
     run(&bank, 0, 250);
@@ -214,13 +218,15 @@ static void every_byte_of_the_bank_comes_back(void) {
     }
     const selfcal_counters_t *count = selfcal_counters(&bank.self);
     TEST_ASSERT_TRUE(count->samples > 0U && count->missing > 0U && count->gaps > 0U && count->blocks_lost > 0U &&
-                     count->blocks_part > 0U && count->blocks_moving > 0U && count->not_finite[0] > 0U && count->saturated[1] > 0U && count->stuck[1] > 0U);
+                     count->blocks_part > 0U && count->blocks_moving > 0U && count->not_finite[0] > 0U &&
+                         count->saturated[1] > 0U && count->stuck[1] > 0U);
     TEST_ASSERT_TRUE(bank.self.watched > 0U && bank.self.bad[0] > 0U && bank.self.bad_blocks[0] > 0U);
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     memset(&other, 0xA5, sizeof other);
     TEST_ASSERT_EQUAL(SELFCAL_OK, restore(&other, &saved));
     const size_t from = offsetof(selfcal_t, n);
-    TEST_ASSERT_EQUAL_MEMORY((const uint8_t *)&bank.self + from, (const uint8_t *)&other.self + from, sizeof(selfcal_t) - from);
+    TEST_ASSERT_EQUAL_MEMORY((const uint8_t *)&bank.self + from, (const uint8_t *)&other.self + from,
+                             sizeof(selfcal_t) - from);
     TEST_ASSERT_EQUAL_MEMORY(bank.memory, other.memory, SELFCAL_SIZE(model.nodes, model.axes));
     TEST_ASSERT_EQUAL_PTR(&model, other.self.model);
     TEST_ASSERT_EQUAL_PTR(other.memory, other.self.b);
@@ -244,15 +250,17 @@ static void the_format_is_the_one_described(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     TEST_ASSERT_EQUAL_MEMORY("SFCL", saved.bytes, 4);
     TEST_ASSERT_EQUAL(saved.length, number_at(&saved, OFFSET_LENGTH, 4));
-    TEST_ASSERT_EQUAL(1, number_at(&saved, OFFSET_VERSION, 2));
+    TEST_ASSERT_EQUAL(2, number_at(&saved, OFFSET_VERSION, 2));
     TEST_ASSERT_EQUAL(REAL_BYTES, number_at(&saved, OFFSET_REAL, 1));
     TEST_ASSERT_EQUAL(AXES, number_at(&saved, OFFSET_AXES, 1));
     TEST_ASSERT_EQUAL(model.nodes, number_at(&saved, OFFSET_NODES, 2));
     TEST_ASSERT_EQUAL(0, number_at(&saved, 14, 2));
     TEST_ASSERT_EQUAL_HEX32(0x89ABCDEFU, number_at(&saved, OFFSET_ID, 4));
     TEST_ASSERT_EQUAL(selfcal_count(&bank.self), number_at(&saved, OFFSET_N, 4));
-    TEST_ASSERT_EQUAL_HEX32(crc32_by_definition(saved.bytes, saved.length - 4U), number_at(&saved, saved.length - 4U, 4));
-    TEST_ASSERT_EQUAL_HEX32(0xCBF43926U, crc32_by_definition((const uint8_t *)"123456789", 9)); /* the usual check value */
+    TEST_ASSERT_EQUAL_HEX32(crc32_by_definition(saved.bytes, saved.length - 4U),
+                            number_at(&saved, saved.length - 4U, 4));
+    /* the usual check value */
+    TEST_ASSERT_EQUAL_HEX32(0xCBF43926U, crc32_by_definition((const uint8_t *)"123456789", 9));
     TEST_ASSERT_TRUE(saved.length <= SELFCAL_SNAPSHOT_MAX(model.nodes, model.axes));
 #ifndef SELFCAL_FIXED
     /* the last real before the checksum is x of the last node and axis: four bytes of an IEEE single, lowest first */
@@ -270,13 +278,15 @@ static void any_alignment_will_do(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     for (size_t shift = 0; shift < 8U; shift++) {
         memmove(again.bytes + shift, saved.bytes, saved.length);
-        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_restore(&other.self, &model, other.memory, sizeof other.memory, again.bytes + shift,
+        TEST_ASSERT_EQUAL(SELFCAL_OK,
+                          selfcal_restore(&other.self, &model, other.memory, sizeof other.memory, again.bytes + shift,
                                                       saved.length));
         TEST_ASSERT_EQUAL_MEMORY(bank.memory, other.memory, SELFCAL_SIZE(model.nodes, model.axes));
     }
 }
 
-/* ---------------------------------------------------------------------------------------------------------- refusals */
+/* ----------------------------------------------------------------------------------------------------------
+ * refusals */
 
 /* `other` holds a bank at work, which a refusal leaves alone. */
 static void refused(selfcal_status_t expected, const store_t *store) {
@@ -371,14 +381,20 @@ static void bad_arguments_change_nothing(void) {
     begin_small_pair();
     before = other;
     const size_t size = sizeof other.memory;
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_restore(NULL, &model, other.memory, size, saved.bytes, saved.length));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_restore(&other.self, NULL, other.memory, size, saved.bytes, saved.length));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_restore(&other.self, &model, NULL, size, saved.bytes, saved.length));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_restore(&other.self, &model, other.memory, size, NULL, saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT,
+                      selfcal_restore(NULL, &model, other.memory, size, saved.bytes, saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT,
+                      selfcal_restore(&other.self, NULL, other.memory, size, saved.bytes, saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT,
+                      selfcal_restore(&other.self, &model, NULL, size, saved.bytes, saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT,
+                      selfcal_restore(&other.self, &model, other.memory, size, NULL, saved.length));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_restore(&other.self, &model, other.memory,
-                                                          SELFCAL_SIZE(model.nodes, model.axes) - 1U, saved.bytes, saved.length));
+                                                          SELFCAL_SIZE(model.nodes, model.axes) - 1U, saved.bytes,
+                                                              saved.length));
     model.block = 0;
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_restore(&other.self, &model, other.memory, size, saved.bytes, saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL,
+                      selfcal_restore(&other.self, &model, other.memory, size, saved.bytes, saved.length));
     model.block = BLOCK;
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_save(NULL, append, &again));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_save(&other.self, NULL, &again));
@@ -409,7 +425,8 @@ static size_t where_differ(const store_t *one, const store_t *two) {
     return at;
 }
 
-/* The checksum fits, the contents cannot be: whoever made it, it must not get in. What is left is an empty bank that works. */
+/* The checksum fits, the contents cannot be: whoever made it, it must not get in. What is left is an empty bank that
+ * works. */
 static void corrupt(size_t at, size_t size, uint32_t value) {
     again = saved;
     for (size_t i = 0; i < size; i++) {
@@ -424,7 +441,8 @@ static void corrupt(size_t at, size_t size, uint32_t value) {
     run(&before, 0, 60);
     run(&other, 0, 60);
     const size_t from = offsetof(selfcal_t, n);
-    TEST_ASSERT_EQUAL_MEMORY((const uint8_t *)&before.self + from, (const uint8_t *)&other.self + from, sizeof(selfcal_t) - from);
+    TEST_ASSERT_EQUAL_MEMORY((const uint8_t *)&before.self + from, (const uint8_t *)&other.self + from,
+                             sizeof(selfcal_t) - from);
     TEST_ASSERT_EQUAL_MEMORY(before.memory, other.memory, SELFCAL_SIZE(model.nodes, model.axes));
 }
 
@@ -463,9 +481,11 @@ static void contents_that_no_bank_can_have_are_refused(void) {
     corrupt(in_gap, 1, 0xFF);
 }
 
-/* Anybody can make a checksum. What gets in may be wrong, but nothing that is undefined follows: the sanitizers watch. */
+/* Anybody can make a checksum. What gets in may be wrong, but nothing that is undefined follows: the sanitizers
+ * watch. */
 static void hostile_contents_are_refused_or_harmless(void) {
-    static const uint32_t extreme[] = {0x3F800000U, 0x7F7FFFFFU}; /* 1.0 and the greatest float, which is a great integer too */
+    /* 1.0 and the greatest float, which is a great integer too */
+    static const uint32_t extreme[] = {0x3F800000U, 0x7F7FFFFFU};
     begin_small_pair();
     const size_t end = saved.length - 4U;
     uint32_t refusals = 0U;

@@ -14,7 +14,7 @@ static const selfcal_hypothesis_t all_laws[] = {
     {&named_law[GAUSS_MARKOV], 0.0F, &grid, &grid, NULL},
     {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
     {&named_law[RANDOM_WALK], 0.0F, &grid, NULL, NULL}};
-static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL};
+static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL, NULL};
 static const char *const names[] = {"ay", "gx"};
 enum { GX = 0x201, AY = 0x205, GX_H0 = 0x220, AY_H0 = 0x240, GX_COEFFICIENTS = 0x20A }; /* of node 0 */
 
@@ -85,7 +85,8 @@ static uint32_t bits_of(float number)
     return all;
 }
 
-/* Published check value of CRC-12/CDMA2000 (catalogue of parametrised CRC algorithms, G. Cook): "123456789" gives 0xD4D. */
+/* Published check value of CRC-12/CDMA2000 (catalogue of parametrised CRC algorithms, G. Cook): "123456789" gives
+ * 0xD4D. */
 static void test_crc_check_value(void)
 {
     TEST_ASSERT_EQUAL_HEX16(0xD4D, selfcal_crc12((const uint8_t *)"123456789", 9));
@@ -146,7 +147,8 @@ static void test_full_report_is_opening_hypotheses_and_end(void)
     TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
 }
 
-/* Place 1 is K if the law has a walk, else the deviation. Place 2 has the grid alpha. Every statistic and flag is its own. */
+/* Place 1 is K if the law has a walk, else the deviation. Place 2 has the grid alpha. Every statistic and flag is its
+ * own. */
 static void test_each_place_carries_its_parameter(void)
 {
     static const selfcal_parameter_t parameter[3][3] = {
@@ -351,7 +353,8 @@ static void test_busy_until_all_frames_are_fetched(void)
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_status(&telemetry, &counters, SELFCAL_RUNNING, 1, 1));
 }
 
-/* gx is axis 1 of the model and item 1 (its sd 7), ay axis 0 and item 5 (11); an axis without sd, and axes the model has not, are left out. */
+/* gx is axis 1 of the model and item 1 (its sd 7), ay axis 0 and item 5 (11); an axis without sd, and axes the model
+ * has not, are left out. */
 static void test_a_corrected_sample_goes_out_by_axis(void)
 {
     selfcal_corrected_t corrected = {{0.25F, -1.5F}, {0.5F, 0.125F}, 2U};

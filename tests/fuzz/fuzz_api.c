@@ -1,10 +1,11 @@
 /* libFuzzer on the public interface: the input is a model and a list of calls with their arguments.
  *
- * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, counters not running backwards, reports that are
- * probability laws. After every LOOK_EVERY-th, and wherever the state is about to be replaced: selfcal_check() content (what is
- * broken stays broken). A twin, once restored from a snapshot, gets the same calls and must stay equal bit for bit.
- * An execution is fast: small grids and batches (see the Makefile), seldom two sums in a model, records that are short where the
- * nodes are many, and by a hash of the input only some executions make whole reports, save snapshots, or push long records. */
+ * After every call: no report of the sanitizers, no failed SELFCAL_ASSERT, counters not running backwards, reports that
+ * are probability laws. After every LOOK_EVERY-th, and wherever the state is about to be replaced: selfcal_check()
+ * content (what is broken stays broken). A twin, once restored from a snapshot, gets the same calls and must stay equal
+ * bit for bit. An execution is fast: small grids and batches (see the Makefile), seldom two sums in a model, records
+ * that are short where the nodes are many, and by a hash of the input only some executions make whole reports, save
+ * snapshots, or push long records. */
 #include <math.h>
 #include <sanitizer/asan_interface.h>
 #include <stdio.h>
@@ -17,7 +18,8 @@
 
 enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID };
 enum { STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 32 };
-enum { EFFORT = 1500, SAMPLES_MIN = 10 }; /* for bank samples, some 0.1 ms; but a batch and a part of the next are had by all */
+/* for bank samples, some 0.1 ms; but a batch and a part of the next are had by all */
+enum { EFFORT = 1500, SAMPLES_MIN = 10 };
 #define MORE (SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
               SELFCAL_TERMS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX))
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(NODES_MAX, SELFCAL_AXES_MAX) + MORE)
@@ -67,7 +69,8 @@ static bool reporting;    /* a report is under way */
 static size_t in_use;     /* bytes of their memory */
 static unsigned pushes, effort, steps, snapshots; /* left: long inputs, whole reports and snapshots are slow */
 static unsigned sample_effort;    /* of effort, for a bank sample */
-static unsigned flushes, reports; /* left: looks that take all nodes through a part of a batch, reports that come to an end */
+/* left: looks that take all nodes through a part of a batch, reports that come to an end */
+static unsigned flushes, reports;
 static bool moved;                /* there may be such a part */
 static selfcal_counters_t before;
 static uint32_t count_before;
@@ -79,7 +82,8 @@ static selfcal_telemetry_t telemetry;
 static bool has_telemetry;
 static uint32_t crc_table[256];
 
-/* -------------------------------------------------------------------------------------------------------------- input */
+/* --------------------------------------------------------------------------------------------------------------
+ * input */
 
 static uint8_t byte(input_t *in) {
     return in->at < in->end ? *in->at++ : 0U;
@@ -106,7 +110,8 @@ static float moderate(input_t *in) {
     return ldexpf((float)((b & 15) - 8), (b >> 4) - 8);
 }
 
-/* ------------------------------------------------------------------------------------------------------------- model */
+/* -------------------------------------------------------------------------------------------------------------
+ * model */
 
 /* Node values to coefficients of the quintic without inner knots: the inverse of the Bernstein polynomials at k/5. */
 static void make_fit(void) {
@@ -149,6 +154,7 @@ static void make_model(input_t *in, bool any_sums) {
     model.axes = (uint8_t)(1U + shape % SELFCAL_AXES_MAX);
     model.axis = axis_table;
     model.hypothesis = hypothesis_table;
+    model.states = &selfcal_states_code;
     for (unsigned axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
         memcpy(of_ratio[axis], some_priors, sizeof some_priors);
         selfcal_axis_t *a = &axis_table[axis];
@@ -183,7 +189,8 @@ static void make_model(input_t *in, bool any_sums) {
             h->rho = law != CONSTANT ? &grid : NULL;
             h->alpha = law >= GAUSS_MARKOV ? &grid : NULL;
             h->prior = law >= MOVING_AVERAGE ? &of_ratio[0][0] : NULL;
-            model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
+            model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) *
+                                     (h->alpha != NULL ? NODES_A_GRID : 1));
         }
     }
     if ((kind >> 7 & 1U) != 0U) {
@@ -249,14 +256,13 @@ static void make_model(input_t *in, bool any_sums) {
     case 22: of_ratio[0][byte(in) % SELFCAL_PARAMETERS].ln_max = any_float(in); break;
     default:
         hypothesis_table[0].ln_probability = any_float(in);
-#if SELFCAL_TERMS_MAX > 1
         law_table[WALK_AND_MARKOV].term[1].bandwidth = any_float(in);
-#endif
         break;
     }
 }
 
-/* --------------------------------------------------------------------------------------------------------- what holds */
+/* --------------------------------------------------------------------------------------------------------- what
+ * holds */
 
 static bool append(void *context, const void *bytes, size_t count) {
     store_t *store = context;
@@ -286,14 +292,17 @@ static size_t plain_nodes(void) {
     size_t nodes = 0;
     for (uint8_t h = 0; h < model.hypotheses; h++) {
         const selfcal_hypothesis_t *of = &hypothesis_table[h];
-        nodes += selfcal_law_is_sum(of->law) ? 0U : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
+        nodes += selfcal_law_is_sum(of->law) ? 0U
+            : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
     }
     return nodes;
 }
 
-/* What a bank sample costs, in some 0.1 us: each node's gains and the series it filters, those of sums to twice the digits. */
+/* What a bank sample costs, in some 0.1 us: each node's gains and the series it filters, those of sums to twice the
+ * digits. */
 static unsigned effort_of_sample(void) {
-    const unsigned columns = 1U + model.axes + (model.regressors != NULL ? regressors.count : 0U), plain = (unsigned)plain_nodes();
+    const unsigned columns = 1U + model.axes + (model.regressors != NULL ? regressors.count : 0U),
+        plain = (unsigned)plain_nodes();
     return (model.nodes - plain) * (3U + columns) + plain * (2U + columns) / (model.regressors != NULL ? 2U : 4U) + 1U;
 }
 
@@ -314,20 +323,20 @@ static void fence(bank_t *of) {
 /* All but the pointers; padding is clear in both. */
 static void equal_banks(const bank_t *one, const bank_t *two) {
     const size_t from = offsetof(selfcal_t, n);
-    HOLDS(memcmp((const uint8_t *)&one->self + from, (const uint8_t *)&two->self + from, sizeof(selfcal_t) - from) == 0);
+    HOLDS(memcmp((const uint8_t *)&one->self + from, (const uint8_t *)&two->self + from,
+                 sizeof(selfcal_t) - from) == 0);
     HOLDS(memcmp(one->memory, two->memory, SELFCAL_SIZE(model.nodes, model.axes)) == 0);
     if (model.regressors != NULL) {
         const uint8_t *a = (const void *)one->self.columns->column, *b = (const void *)two->self.columns->column;
-        const size_t all = SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U - sizeof(selfcal_columns_t);
+        const size_t all = SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U -
+            sizeof(selfcal_columns_t);
         HOLDS(memcmp(a, b, all) == 0);
     }
-#if SELFCAL_TERMS_MAX > 1
     if (one->self.terms != NULL) {
         const uint8_t *a = (const void *)one->self.terms->node, *b = (const void *)two->self.terms->node;
         const size_t nodes = SELFCAL_TERMS_SIZE(1, model.axes, 0) - 7U - sizeof(selfcal_terms_t); /* of one node */
         HOLDS(memcmp(a, b, nodes * (one->self.model->nodes - plain_nodes())) == 0);
     }
-#endif
 }
 
 static bool grown(uint32_t before_, uint32_t now) {
@@ -347,7 +356,8 @@ static void check_counters(void) {
           grown(before.blocks_lost, now.blocks_lost) && grown(before.blocks_part, now.blocks_part) &&
           grown(before.blocks_moving, now.blocks_moving));
     for (unsigned axis = 0; axis < model.axes; axis++) {
-        HOLDS(grown(before.not_finite[axis], now.not_finite[axis]) && grown(before.saturated[axis], now.saturated[axis]) &&
+        HOLDS(grown(before.not_finite[axis], now.not_finite[axis]) &&
+              grown(before.saturated[axis], now.saturated[axis]) &&
               grown(before.stuck[axis], now.stuck[axis]));
         HOLDS(isfinite(selfcal_offset(&bank.self, (uint8_t)axis)));
         HOLDS(!(selfcal_within_sd(&bank.self, (uint8_t)axis) < 0.0F));
@@ -390,7 +400,8 @@ static void check_motion(selfcal_motion_t motion) {
     HOLDS(gate.state == motion && gate.counters.alarms <= gate.counters.windows);
 }
 
-/* -------------------------------------------------------------------------------------------------------------- calls */
+/* --------------------------------------------------------------------------------------------------------------
+ * calls */
 
 static void push(const float sample[]) {
     if (pushes == 0U || effort == 0U) {
@@ -522,7 +533,8 @@ static void look_at_node(input_t *in) {
     flushes -= moved ? 1U : 0U;
     moved = false;
     const selfcal_status_t status = selfcal_node(&bank.self, axis, index, &view);
-    HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED || status == SELFCAL_BAD_ARGUMENT);
+    HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED ||
+          status == SELFCAL_BAD_ARGUMENT);
     HOLDS((status == SELFCAL_BAD_ARGUMENT) == (axis >= model.axes || index >= model.nodes));
     if (twinned) {
         HOLDS(selfcal_node(&twin.self, axis, index, &view) == status);
@@ -541,7 +553,8 @@ static void report_begin(input_t *in) {
     const uint8_t axis = byte(in) % (SELFCAL_AXES_MAX + 1U);
     const uint8_t mask = model.regressors != NULL ? byte(in) & 3U : 0U;
     const selfcal_status_t status = selfcal_report_begin_subset(&work, &bank.self, axis, mask, NULL, &report);
-    HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED || status == SELFCAL_BAD_ARGUMENT);
+    HOLDS(status == SELFCAL_OK || status == SELFCAL_TOO_SHORT || status == SELFCAL_AXIS_RETIRED ||
+          status == SELFCAL_BAD_ARGUMENT);
     HOLDS((status == SELFCAL_BAD_ARGUMENT) == (axis >= model.axes) || mask != 0U);
     if (twinned) {
         HOLDS(selfcal_report_begin_subset(&twin_work, &twin.self, axis, mask, NULL, &twin_report) == status);
@@ -553,7 +566,8 @@ static void report_steps(unsigned wanted) {
     selfcal_status_t status = SELFCAL_BUSY;
     for (; reporting && wanted > 0U && steps > 0U && status == SELFCAL_BUSY; wanted--, steps--) {
         status = selfcal_report_step(&work, &report);
-        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN || status == SELFCAL_AXIS_RETIRED ||
+        HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN ||
+              status == SELFCAL_AXIS_RETIRED ||
               (status == SELFCAL_TOO_SHORT && model.forgetting != NULL));
         HOLDS(!twinned || selfcal_report_step(&twin_work, &twin_report) == status);
     }
@@ -567,7 +581,8 @@ static void report_steps(unsigned wanted) {
         if (!tampered) {
             check_report();
         }
-        if (has_telemetry && selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank.self), 1000U) == SELFCAL_OK) {
+        if (has_telemetry && selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank.self),
+                                                      1000U) == SELFCAL_OK) {
             check_frames();
         }
     }
@@ -725,7 +740,8 @@ static void bad_arguments(input_t *in) {
     const float sample[SELFCAL_AXES_MAX] = {0};
     HOLDS(selfcal_push(NULL, sample) == SELFCAL_BAD_ARGUMENT && selfcal_push(&bank.self, NULL) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_skip(NULL, byte(in)) == SELFCAL_BAD_ARGUMENT && selfcal_check(NULL) == SELFCAL_BAD_ARGUMENT);
-    HOLDS(selfcal_save(NULL, append, NULL) == SELFCAL_BAD_ARGUMENT && selfcal_save(&bank.self, NULL, NULL) == SELFCAL_BAD_ARGUMENT);
+    HOLDS(selfcal_save(NULL, append, NULL) == SELFCAL_BAD_ARGUMENT &&
+          selfcal_save(&bank.self, NULL, NULL) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_report_begin(NULL, &bank.self, 0, &report) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_restore(&twin.self, &model, twin.memory, in_use, NULL, 100) == SELFCAL_BAD_ARGUMENT);
     HOLDS(selfcal_init(&twin.self, &model, twin.memory, in_use - 1U) == SELFCAL_BAD_MEMORY);

@@ -65,10 +65,9 @@ class Agreement:
 LIMITS = {
     "double": Agreement(1e-3, 1e-6, math.inf),
     "float": Agreement(math.inf, 1e-3, 0.02),
-    "fixed16": Agreement(math.inf, 5e-3, 0.05),
-    "fixed32": Agreement(math.inf, 5e-3, 0.05),
+    "fixed": Agreement(math.inf, 5e-3, 0.05),
 }
-LENGTHS = {"double": 10**6, "float": 10**6, "fixed16": 10**5, "fixed32": 10**6}
+LENGTHS = {"double": 10**6, "float": 10**6, "fixed": 10**6}
 #: Of a report against one on dense nodes: |d ln evidence|, |d mean| / sd, |sd ratio - 1|.
 REPORT_LIMIT = np.array([0.05, 0.05, 0.03])
 
@@ -114,11 +113,7 @@ def dense(tables: Tables) -> Tables:
 
 def a_bank(tables: Tables, build: str) -> Bank:
     """A bank of one of LIMITS's builds."""
-    if build == "fixed16":
-        return Bank(tables, fixed=16)
-    if build == "fixed32":
-        return Bank(tables, fixed=32)
-    return Bank(tables, double=build == "double")
+    return Bank(tables, double=build == "double", fixed=build == "fixed")
 
 
 def push(bank: Bank, y: Floats, z: Floats | None = None) -> None:

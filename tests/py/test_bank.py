@@ -29,7 +29,7 @@ def test_parity_with_the_textbook_bank(law: str, n: int, gaps: bool) -> None:
 
 @pytest.mark.parametrize("law", PLAIN)
 def test_parity_at_a_hundred_thousand(law: str) -> None:
-    """The stated record length of the 16-bit products, with gaps."""
+    """Records longer than a model is fitted to as a rule, with gaps."""
     y, _ = a_record(law, 100_000, 0, gaps=True)
     hold(f"{law} n=1e5", [compare(y, tables_of(MODEL, TARGET), sigmas=5, every=2)])
 

@@ -34,8 +34,12 @@ STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STAT
 CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
 APP = ("app.c", "app_frames.c", "app_reports.c", "app_samples.c", "app_state.c")
 #: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
-CALLS = {file: ["selfcal_regressors_code?"] for file in ("averager.c", "check.c", "posterior.c")} | {
-    "bank.c": ["selfcal_regressors_code?", "selfcal_kernel_run"],
+CALLS = {"intake.c": ["selfcal_regressors_code?"]} | {
+    **{file: ["selfcal_regressors_code?", "selfcal_states_code?"] for file in ("check.c", "report_bias.c")},
+    "report.c": ["selfcal_regressors_code?"],
+    "report.c:selfcal_report_step": ["stages"],
+    "report_node.c": ["selfcal_regressors_code?"],
+    "bank.c": ["selfcal_regressors_code?", "selfcal_states_code?", "selfcal_kernel_run"],
     "snapshot.c": [],
     **dict.fromkeys(APP, ["board_time_ms", "board_sample", "board_send", "board_idle"]),
     "replay.c": ["board_read"],

@@ -72,7 +72,6 @@ def program(
         f"MODEL_DIR={made.parent}",
         f"OUT={folder / target}",
         f"CORE={target}",
-        f"AS={core}",
         f"{make.upper()}_CFLAGS={flags}",
     ]
     subprocess.run(["make", "-s", "-f", f"port/{make}/{make}.mk", make, *settings], cwd=ROOT, check=True)

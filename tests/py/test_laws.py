@@ -81,7 +81,7 @@ def test_parity_with_the_textbook_bank(n: int, gaps: bool) -> None:
         for y in records:
             y[n // 3 : n // 3 + max(1, n // 10)] = np.nan
     every = 1 if n < 1000 else 3  # nodes: the textbook is slow
-    found = [compare(y, made, None, builds=("double", "float", "fixed32"), sigmas=5, every=every) for y in records]
+    found = [compare(y, made, None, builds=("double", "float", "fixed"), sigmas=5, every=every) for y in records]
     hold(f"n={n} gaps={gaps}", found)
 
 

@@ -260,7 +260,7 @@ while [ $# -gt 1 ]; do [ "$1" = -o ] && : >"$2" && : >"${2%.o}.su"; shift; done
         (bin_ / f"arm-none-eabi-{name}").write_text(tool)
         (bin_ / f"arm-none-eabi-{name}").chmod(0o755)
     (checkout / "model").mkdir()
-    for name in ("selfcal_model.c", "selfcal_model.h"):
+    for name in ("selfcal_model.c", "selfcal_model.h", "selfcal_config.h"):
         (checkout / "model" / name).touch()
     command = ["-f", "port/stm32f405/stm32f405.mk", "stm32f405", "MODEL_DIR=model", "OUT=out"]
     path = f"{bin_}:{os.environ['PATH']}"

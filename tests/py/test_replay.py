@@ -284,15 +284,14 @@ def test_model_in_other_units_than_the_wire(tmp_path: Path) -> None:
     assert_one_line(command(SHIPPED, "--model", tmp_path / "model.yaml"), "telemetry carries it in deg/s")
 
 
-def test_a_model_that_the_firmware_has_no_room_for(tmp_path: Path) -> None:
-    """What the compiler says of it, not where it was when it did."""
+def test_a_model_of_more_nodes_than_the_default_one(tmp_path: Path) -> None:
+    """The firmware's sizes follow from it."""
     text = Model.load().path.read_text()
     old = "cortex-m4f: {random_walk: 16,"
     assert text.count(old) == 1
     (tmp_path / "model.yaml").write_text(text.replace(old, "cortex-m4f: {random_walk: 24,"))
-    said = '#error "set SELFCAL_GRID_MAX to 24: this model has a grid of so many nodes"'
     done = command(SHIPPED, "--target", "cortex-m4f", "--model", tmp_path / "model.yaml")
-    assert_one_line(done, f"error: cannot build the firmware: {said}")
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_rate_that_no_board_has(tmp_path: Path) -> None:

@@ -448,7 +448,7 @@ def test_the_flag_of_a_cortex_m0_tells_what_its_nodes_bear() -> None:
     recording = load(ROOT / "tests" / "data" / "simulated_adis16405.npz")
     y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
     block = round(recording.rate_hz)
-    bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=16)
+    bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=True)
     bank.push(y[: len(y) // block * block].reshape(-1, block, len(MODEL.axes)).mean(axis=1))
     for index, axis in enumerate(MODEL.axes):
         judge = Bank(dense(tables_of(MODEL, axis=axis)), dense=True)
@@ -475,7 +475,7 @@ def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
         y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
         block = round(recording.rate_hz)
         y = y[: len(y) // block * block].reshape(-1, block, len(MODEL.axes)).mean(axis=1)
-        bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=16)
+        bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=True)
         bank.push(y)
         for index, axis in enumerate(MODEL.axes):
             judge = Bank(dense(tables_of(MODEL, axis=axis)), dense=True)
@@ -487,7 +487,7 @@ def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
 
 
 def test_the_small_model_takes_12_kb() -> None:
-    """Six axes by 16-bit products, as on a Cortex-M0; what the nodes cost is in `tolerances.py --only targets`."""
-    bank = Bank(make_tables(MODEL, 1.0, None, SMALL), fixed=16)
+    """Six axes in integers, as on a Cortex-M0; what the nodes cost is in `tolerances.py --only targets`."""
+    bank = Bank(make_tables(MODEL, 1.0, None, SMALL), fixed=True)
     assert len(MODEL.axes) == 6
     assert bank.raw.size <= 12 * 1024

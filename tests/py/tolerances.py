@@ -20,7 +20,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from rich import box
@@ -243,7 +242,7 @@ def likeliest(report: AxisResult) -> str:
 
 def targets(n: int, seeds: int) -> list[Row]:
     """Added error of the nodes alone: the report's cells are the host's. Median, nine in ten and worst of the axes."""
-    fixed: dict[str, Literal[16] | None] = {target: 16 if "m0" in target else None for target in MODEL.nodes}
+    fixed = {target: "m0" in target for target in MODEL.nodes}
     tables = {target: make_tables(MODEL, 1.0, None, target) for target in MODEL.nodes}
     found: dict[tuple[str, str], list[list[float]]] = {}
     bytes_of = {}
@@ -265,8 +264,8 @@ def targets(n: int, seeds: int) -> list[Row]:
     rows = []
     for (source, target), each in found.items():
         values = np.array(each)
-        bad = values[:, 1] > LIMITS["fixed16"].probability
-        build = f"fixed{fixed[target]}" if fixed[target] else "float"
+        bad = values[:, 1] > LIMITS["fixed"].probability
+        build = "fixed" if fixed[target] else "float"
         head = f"{target}, {tables[target].nodes} nodes, {bytes_of[target]} B"
         for name, quantile in (("median", 0.5), ("9 in 10", 0.9), ("worst", 1.0)):
             *numbers, constant = np.quantile(values[:, :5], quantile, axis=0).tolist()

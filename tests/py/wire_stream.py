@@ -33,7 +33,7 @@ class Sent:
 def _program() -> Path:
     program = Path(_folder.name) / "telemetry_stream"
     sources = ["tests/c/telemetry_stream.c", "lib/telemetry.c", "port/app/slcan.c"]
-    options = ["-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-DSELFCAL_HYPOTHESES_MAX=8"]
+    options = ["-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-Itools/bindings"]
     command = [os.environ.get("CC", "cc"), *options, "-o", str(program), *sources, "-lm"]
     subprocess.run(command, cwd=ROOT, check=True)
     return program

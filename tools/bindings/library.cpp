@@ -1,6 +1,6 @@
-// The C library as Python sees it: one class over selfcal_t that owns its memory and tables. Compiled from the same sources
-// as _library32 (the float of the firmware), _library64 (-DSELFCAL_REAL_DOUBLE, to tell rounding from method), _fixed16 and
-// _fixed32 (-DSELFCAL_FIXED, the firmware of parts without an FPU).
+// The C library as Python sees it: one class over selfcal_t that owns its memory and tables. Compiled from the same
+// sources as _library32 (the float of the firmware), _library64 (-DSELFCAL_REAL_DOUBLE, to tell rounding from
+// method), and _fixed (-DSELFCAL_FIXED, the firmware of parts without an FPU).
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -24,7 +24,7 @@ using PriorTuple = std::tuple<double, double, bool>; // ln_min, ln_max, uniform
 using TermTuple = std::tuple<bool, double, double, bool, bool>; // walk, deviation, bandwidth, stated, by_ratio
 using LawTuple = std::tuple<std::vector<TermTuple>, bool>;      // terms, coloured_noise
 using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
-                                   std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none: the axes'
+                                   std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none
 
 using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -33,7 +33,8 @@ using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu
 namespace MODULE_NAME {
 
 struct Grid {
-    explicit Grid(const GridTuple &t) : fit(std::get<1>(t).begin(), std::get<1>(t).end()), grid{std::get<0>(t), fit.data()} {
+    explicit Grid(const GridTuple &t) : fit(std::get<1>(t).begin(), std::get<1>(t).end()),
+        grid{std::get<0>(t), fit.data()} {
         if (fit.size() != size_t{grid.nodes} * grid.nodes)
             throw std::invalid_argument("the spline matrix does not fit its nodes");
     }
@@ -43,11 +44,13 @@ struct Grid {
 
 class Bank {
 public:
-    Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes, const std::vector<HypothesisTuple> &hypotheses,
+    Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes,
+         const std::vector<HypothesisTuple> &hypotheses,
          uint32_t id, const std::optional<RegressorsTuple> &regressors, double half_life_s) {
         for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
-            if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || uniform.size() != SELFCAL_PARAMETERS)
+            if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS ||
+                uniform.size() != SELFCAL_PARAMETERS)
                 throw std::invalid_argument("an axis needs one prior a parameter");
             for (size_t p = 0; p < SELFCAL_PARAMETERS; p++)
                 axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]), uniform[p]};
@@ -58,7 +61,8 @@ public:
         }
         size_t nodes = 0;
         for (const auto &[law, ln_probability, rho, alpha, priors] : hypotheses) {
-            const selfcal_hypothesis_t h{add(law), static_cast<float>(ln_probability), add(rho), add(alpha), add(priors)};
+            const selfcal_hypothesis_t h{add(law), static_cast<float>(ln_probability), add(rho), add(alpha),
+                add(priors)};
             const size_t count = size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
             nodes += count;
             term_nodes_ += selfcal_law_is_sum(h.law) ? count : 0;
@@ -73,15 +77,17 @@ public:
                   axes_.data(),
                   hypotheses_.data(),
                   nullptr,
-                  nullptr};
+                  nullptr,
+                  &selfcal_states_code};
         if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
             throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
         if (regressors) {
             std::tie(reference_, coefficient_sd_) = *regressors;
-            if (reference_.size() > SELFCAL_REGRESSORS_MAX || coefficient_sd_.size() != axes_.size() * reference_.size())
+            if (reference_.size() > SELFCAL_REGRESSORS_MAX ||
+                coefficient_sd_.size() != axes_.size() * reference_.size())
                 throw std::invalid_argument("regressors need a reference each and a prior for every axis");
-            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(), coefficient_sd_.data(),
-                           nullptr, nullptr};
+            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(),
+                           coefficient_sd_.data(), nullptr, nullptr};
             model_.regressors = &regressors_;
         }
         forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
@@ -238,7 +244,8 @@ public:
     double weight() const { return bank_.weight; }
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const {
-        return SELFCAL_SIZE(model_.nodes, model_.axes) + SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size()) +
+        return SELFCAL_SIZE(model_.nodes, model_.axes) +
+            SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size()) +
                SELFCAL_TERMS_SIZE(term_nodes_, model_.axes, reference_.size());
     }
 
@@ -256,7 +263,8 @@ public:
     }
 
     void restore(const nb::bytes &snapshot) {
-        check(selfcal_restore(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double), snapshot.data(), snapshot.size()));
+        check(selfcal_restore(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double), snapshot.data(),
+                              snapshot.size()));
     }
 
     float within_sd(uint8_t axis) const {
@@ -273,7 +281,8 @@ private:
         selfcal_law_t &law = *laws_.emplace_back(std::make_unique<selfcal_law_t>());
         law.coloured_noise = coloured_noise;
         for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : terms)
-            law.term[law.terms++] = {walk ? SELFCAL_WALK : SELFCAL_MARKOV, static_cast<float>(deviation), static_cast<float>(bandwidth),
+            law.term[law.terms++] =
+                {walk ? SELFCAL_WALK : SELFCAL_MARKOV, static_cast<float>(deviation), static_cast<float>(bandwidth),
                                      stated, by_ratio};
         return &law;
     }
@@ -309,7 +318,8 @@ private:
         case SELFCAL_BAD_ARGUMENT:
             throw std::invalid_argument("argument out of range");
         case SELFCAL_BAD_MODEL:
-            throw std::invalid_argument("the model's tables contradict themselves or exceed what the library is built for");
+            throw std::invalid_argument("the model's tables contradict themselves or exceed "
+                                        "what the library is built for");
         case SELFCAL_SNAPSHOT_TRUNCATED:
             throw std::invalid_argument("the snapshot is truncated");
         case SELFCAL_SNAPSHOT_TOO_LONG:
@@ -342,11 +352,13 @@ private:
 
 class Gate {
 public:
-    Gate(uint32_t window, float false_alarm, uint32_t hold, uint32_t settle, uint32_t memory, const std::vector<float> &sigma,
+    Gate(uint32_t window, float false_alarm, uint32_t hold, uint32_t settle, uint32_t memory,
+         const std::vector<float> &sigma,
          const std::vector<bool> &is_rate) {
         if (sigma.size() > SELFCAL_AXES_MAX || is_rate.size() != sigma.size())
             throw std::invalid_argument("one sigma and one kind an axis, up to SELFCAL_AXES_MAX");
-        selfcal_gate_config_t config{static_cast<uint8_t>(sigma.size()), window, false_alarm, hold, settle, memory, {}, {}};
+        selfcal_gate_config_t config{static_cast<uint8_t>(sigma.size()), window, false_alarm, hold, settle, memory, {},
+            {}};
         std::copy(sigma.begin(), sigma.end(), config.sigma);
         std::copy(is_rate.begin(), is_rate.end(), config.is_rate);
         check(selfcal_gate_init(&gate_, &config));
@@ -404,8 +416,9 @@ private:
 using SourceTuple = std::tuple<int, int, float>; // kind, channel, number
 
 // The values [n, sources] of regressors over channels [n, c], after missing_before [n] samples each.
-static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s, const Rows &channels,
-                                          const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before) {
+using Missing = nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s,
+                                          const Rows &channels, const Missing &missing_before) {
     std::vector<selfcal_source_t> sources;
     for (const auto &[kind, channel, number] : tuples) {
         if (channel < 0 || static_cast<size_t>(channel) >= std::max<size_t>(channels.shape(1), 1))
@@ -452,7 +465,8 @@ NB_MODULE(MODULE_NAME, m) {
     nb::class_<Bank>(m, "Bank")
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t,
                       const std::optional<RegressorsTuple> &, double>(),
-             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(), nb::arg("half_life_s") = 0.0)
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(),
+                 nb::arg("half_life_s") = 0.0)
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
@@ -479,7 +493,8 @@ NB_MODULE(MODULE_NAME, m) {
     m.def("form", &MODULE_NAME::form);
     using MODULE_NAME::Gate;
     nb::class_<Gate>(m, "Gate")
-        .def(nb::init<uint32_t, float, uint32_t, uint32_t, uint32_t, const std::vector<float> &, const std::vector<bool> &>())
+        .def(nb::init<uint32_t, float, uint32_t, uint32_t, uint32_t, const std::vector<float> &,
+             const std::vector<bool> &>())
         .def("push", &Gate::push)
         .def("skip", &Gate::skip)
         .def("noise", &Gate::noise)

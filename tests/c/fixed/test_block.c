@@ -1,4 +1,4 @@
-/* A block's sums in integers (averager_fixed.c), under UBSan: what would overflow stops the test. */
+/* A block's sums in integers (intake_fixed.c), under UBSan: what would overflow stops the test. */
 #include <float.h>
 #include <math.h>
 
@@ -45,9 +45,10 @@ static void push(float value) {
     }
 }
 
-/* One block of sample[]: mean and scatter against sums in long double (64 bits of mantissa). The mean may be off by a step, 2^-28 of
- * the largest sample, and by its rounding to float, 2^-24 of its distance from the first. The scatter is a difference of float sums
- * about the first sample (2^-22 of the larger); its squares' roots are rounded by 2^-15 of the largest difference at most. */
+/* One block of sample[]: mean and scatter against sums in long double (64 bits of mantissa). The mean may be off by a
+ * step, 2^-28 of the largest sample, and by its rounding to float, 2^-24 of its distance from the first. The scatter is
+ * a difference of float sums about the first sample (2^-22 of the larger); its squares' roots are rounded by 2^-15 of
+ * the largest difference at most. */
 static void one_block(unsigned count) {
     init(count);
     long double sum = 0.0L, squares = 0.0L, scatter = 0.0L;
@@ -70,7 +71,8 @@ static void one_block(unsigned count) {
     if (count > 1U) {
         const long double found = (long double)selfcal_within_sd(&bank, 0) * selfcal_within_sd(&bank, 0) * (count - 1);
         const long double rounding = ldexpl((long double)furthest, -15);
-        const long double most = ldexpl(squares, -21) + 2.0L * rounding * sqrtl(count * squares) + count * rounding * rounding;
+        const long double most =
+            ldexpl(squares, -21) + 2.0L * rounding * sqrtl(count * squares) + count * rounding * rounding;
         TEST_ASSERT_TRUE(fabsl(found - scatter) <= most);
     }
 }
@@ -110,9 +112,9 @@ static void the_step_follows_any_sample(void) {
     }
 }
 
-/* Head-room: the longest block, in which all samples but the first are `times` the first, the other side of 0; the sums of those that
- * went before are put in their place. 8 times the first is just within ROOM of its step, so that the sum is its greatest; at 7 times
- * the differences are just within 2^15 of the squares' step, so that sum_sq is. */
+/* Head-room: the longest block, in which all samples but the first are `times` the first, the other side of 0; the sums
+ * of those that went before are put in their place. 8 times the first is just within ROOM of its step, so that the sum
+ * is its greatest; at 7 times the differences are just within 2^15 of the squares' step, so that sum_sq is. */
 static const selfcal_block_t *longest(float times) {
     const float first = -ldexpf(1.0F - FLT_EPSILON, 26), other = -times * first;
     init(UINT32_MAX);

@@ -1,4 +1,5 @@
-/* The number formats of kernel_fixed.c, built with SELFCAL_FIXED under UBSan: what would overflow stops the test. */
+/* The number formats of bank_kernel_fixed.c, built with SELFCAL_FIXED under UBSan: what would overflow stops the
+ * test. */
 #include <math.h>
 #include <string.h>
 
@@ -54,14 +55,16 @@ static void start(float sd) {
     (void)view(0);
 }
 
-/* The white noise of the first batch is 2^20 to 2^21 steps; here its sample sd over 15 differences, hence a factor 2 more. */
+/* The white noise of the first batch is 2^20 to 2^21 steps; here its sample sd over 15 differences, hence a factor 2
+ * more. */
 static void the_first_batch_sets_the_step(void) {
     start(0.04F);
     TEST_ASSERT_TRUE(0.04F / step() > 524288.0F && 0.04F / step() < 4194304.0F);
 }
 
-/* Every node at the bound of |y|, at random and then as it hurts most: the innovation doubles when the sign turns after a node has
- * followed. 20 000 samples pass all times 1/g that settle. The values are judged in tests/py/test_long.py. */
+/* Every node at the bound of |y|, at random and then as it hurts most: the innovation doubles when the sign turns after
+ * a node has followed. 20 000 samples pass all times 1/g that settle. The values are judged in
+ * tests/py/test_long.py. */
 static void nothing_overflows_at_the_bound(void) {
     start(0.04F);
     const float bound = (float)SELFCAL_FIXED_LIMIT * step() * 0.99999F - 0.2F;
@@ -79,7 +82,8 @@ static void nothing_overflows_at_the_bound(void) {
     TEST_ASSERT_EQUAL(0, selfcal_scale(&bank, 0)->coarser);
 }
 
-/* Node 0 is the constant law, whose C is the sum of y^2 about the offset: a leap of 10^6 sigma changes the step and nothing else. */
+/* Node 0 is the constant law, whose C is the sum of y^2 about the offset: a leap of 10^6 sigma changes the step and
+ * nothing else. */
 static void a_leap_coarsens_the_step_and_keeps_the_sums(void) {
     start(0.04F);
     for (int i = 0; i < 160; i++) {
@@ -105,7 +109,8 @@ static void any_leap_fits(void) {
     push(largest);
     const selfcal_wide_t c = view(0).c;
     TEST_ASSERT_TRUE(fabs(c / ((selfcal_wide_t)largest * (selfcal_wide_t)largest) - 1.0) < 1e-6);
-    TEST_ASSERT_TRUE(selfcal_scale(&bank, 0)->most_y > SELFCAL_FIXED_LIMIT / 2 && selfcal_scale(&bank, 0)->most_y <= SELFCAL_FIXED_LIMIT);
+    TEST_ASSERT_TRUE(selfcal_scale(&bank, 0)->most_y > SELFCAL_FIXED_LIMIT / 2 &&
+                     selfcal_scale(&bank, 0)->most_y <= SELFCAL_FIXED_LIMIT);
 }
 
 /* A first batch that was shaken makes the step too coarse by 1000; once the readings are small it shrinks again. */
@@ -148,9 +153,9 @@ static int32_t most_sum(void) {
     return selfcal_scale(&bank, 0)->most_sum;
 }
 
-/* The most that a sample can weigh, 1/s = 2^10 by selfcal_rate(), at the bound of |y|, with and without the longest gaps (which open
- * every gain), from full sums on: they turn back at 2^61, the mark within a factor 2 of it. Only the constant law can be told its
- * sums: C of all of y^2/r. */
+/* The most that a sample can weigh, 1/s = 2^10 by selfcal_rate(), at the bound of |y|, with and without the longest
+ * gaps (which open every gain), from full sums on: they turn back at 2^61, the mark within a factor 2 of it. Only the
+ * constant law can be told its sums: C of all of y^2/r. */
 static void the_heaviest_samples_make_room(void) {
     start(0.04F);
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 1, 1.0F / SELFCAL_VARIANCE_RATIO_MAX));
@@ -179,7 +184,8 @@ static void the_heaviest_samples_make_room(void) {
     TEST_ASSERT_TRUE(fabs(view(0).c / c - 1.0) < 1e-4);
 }
 
-/* Drives every axis over its range, as far as no sample counts as saturated, after a quiet first batch or from the start. */
+/* Drives every axis over its range, as far as no sample counts as saturated, after a quiet first batch or from the
+ * start. */
 static void full_scale(bool at_once) {
     static const int bound[AXES] = SELFCAL_MODEL_EXPONENTS;
     model.axis = selfcal_model.axis;
@@ -201,8 +207,8 @@ static void full_scale(bool at_once) {
     }
 }
 
-/* SELFCAL_MODEL_EXPONENTS: no reading within the range makes a step coarser, and some make it so within a factor 2. (Where the prior
- * lets a first batch from end to end pass for noise: tests/py/test_long.py.) */
+/* SELFCAL_MODEL_EXPONENTS: no reading within the range makes a step coarser, and some make it so within a factor 2.
+ * (Where the prior lets a first batch from end to end pass for noise: tests/py/test_long.py.) */
 static void the_models_exponents_bound_the_steps(void) {
     full_scale(true);
     full_scale(false);

@@ -1,14 +1,14 @@
-"""The C library from Python: the very code of the firmware, in its float, its two fixed-point forms, or in double."""
+"""The C library from Python: the very code of the firmware, in its float, in fixed point, or in double."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _coarse, _dense, _fixed16, _fixed32, _library32, _library64
+from selfcal import _coarse, _dense, _fixed, _library32, _library64
 from selfcal.errors import UserError
 from selfcal.laws import PLACES
 from selfcal.result import AxisResult, Estimate
@@ -34,7 +34,7 @@ class Bank:
     """A bank over the axes of `tables`.
 
     `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
-    module's reports, `fixed` the integer kernels by products of so many bits (SELFCAL_FIXED).
+    module's reports, `fixed` the integer kernels (SELFCAL_FIXED).
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class Bank:
         double: bool = False,
         dense: bool = False,
         coarse: bool = False,
-        fixed: Literal[16, 32] | None = None,
+        fixed: bool = False,
     ) -> None:
         self.tables = tables
         build = _dense if dense else _library64 if double else _coarse if coarse else _library32
-        if fixed is not None:
-            build = {16: _fixed16, 32: _fixed32}[fixed]
+        if fixed:
+            build = _fixed
         self.raw: Any = build.Bank(
             tables.dt_s,
             tables.block,

@@ -14,8 +14,21 @@ from selfcal.output import whole
 from selfcal.tables import AxisTable, Grid, HypothesisTable, RegressorTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
 
-#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in kernel_fixed.c.
+#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in bank_kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
+
+#: Nodes of a grid at least, of a model that has none.
+LEAST_GRID = 6
+#: By core: how finely a report integrates, and the lines it describes a spectrum by (on a Cortex-M0 as many as its RAM
+#: has room for: they do for 5000 bank samples); pushes between two steps of the nodes, of which a batch takes 4 sample
+#: periods at 819.2 Hz and 48 MHz there.
+CORES = {
+    "host": {"REPORT_QUALITY": 2, "LINES": 36, "PUSH_EVERY": 1},
+    "cortex-m4f": {"REPORT_QUALITY": 1, "LINES": 32, "PUSH_EVERY": 1},
+    "cortex-m0": {"REPORT_QUALITY": 1, "LINES": 20, "PUSH_EVERY": 16},
+}
+#: Cores whose samples are processed in integers.
+WITHOUT_FPU = ("cortex-m0",)
 
 
 def codegen(
@@ -26,7 +39,7 @@ def codegen(
     rate: float | None = None,
     axes: Sequence[str] | None = None,
 ) -> Tables:
-    """Write `selfcal_model.h` and `selfcal_model.c` into the folder `output` and return what they hold.
+    """Write `selfcal_model.h`, `selfcal_model.c` and `selfcal_config.h` into the folder `output`; return the tables.
 
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
     is a subset of the model's. Says so on stderr if the model's gate is left out.
@@ -34,7 +47,7 @@ def codegen(
     """
     loaded = Model.load(model)
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
-    write_tables(loaded, tables, Path(output))
+    write_tables(loaded, tables, Path(output), target)
     if loaded.gate is not None and gate_table(loaded, tables) is None:
         said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
@@ -48,21 +61,57 @@ def assumption(tables: Tables) -> str:
     return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
 
 
-def write_tables(model: Model, tables: Tables, folder: Path) -> None:
-    """Write both files into `folder`. Raises UserError if it cannot be written."""
+def write_tables(model: Model, tables: Tables, folder: Path, target: str) -> None:
+    """Write the files into `folder`, the sizes as for a core. Raises UserError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
-    with whole(folder / "selfcal_model.h") as header, whole(folder / "selfcal_model.c") as source:
-        header.write_text(_header(model, tables), encoding="utf-8")
-        source.write_text(_source(model, tables), encoding="utf-8")
+    for name, text in (
+        ("selfcal_config.h", _config(model, tables, target)),
+        ("selfcal_model.h", _header(model, tables)),
+        ("selfcal_model.c", _source(model, tables)),
+    ):
+        with whole(folder / name) as file:
+            file.write_text(text, encoding="utf-8")
+
+
+def sizes(tables: Tables, target: str) -> dict[str, int]:
+    """The library's sizes for these tables on a core, by their macros without SELFCAL_ (lib/selfcal.h)."""
+    grids = [grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid]
+    grid = max(grids, default=LEAST_GRID)
+    one = max(grid, *(h.nodes for h in tables.hypotheses))
+    return {
+        "AXES_MAX": len(tables.axes),
+        "HYPOTHESES_MAX": len(tables.hypotheses),
+        "GRID_MAX": grid,
+        "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=LEAST_GRID),
+        "HYPOTHESIS_NODES_MAX": one,
+        "NODES_MAX": max(one, tables.nodes),
+        "REGRESSORS_MAX": max(1, len(tables.regressors)),
+        "TERMS_MAX": 3 if tables.term_nodes else 1,
+        "BATCH": 16,
+        "PUSH_NODES": 1,
+        "RETIRE_BLOCKS": 60,
+        **CORES.get(target, CORES["host"]),
+    }
+
+
+def _config(model: Model, tables: Tables, target: str) -> str:
+    defined = [f"{name} {size}" for name, size in sizes(tables, target).items()]
+    defined += ["FIXED"] if target in WITHOUT_FPU else []
+    macros = "".join(f"#ifndef SELFCAL_{one.split()[0]}\n#define SELFCAL_{one}\n#endif\n" for one in defined)
+    return f"""/* Made by `selfcal codegen` from the model '{model.name}' for {target}. Do not edit.
+ * The compiler's command line may set any of these. lib/selfcal.h says what each is. */
+#ifndef SELFCAL_CONFIG_H
+#define SELFCAL_CONFIG_H
+
+{macros}
+#endif
+"""
 
 
 def _header(model: Model, tables: Tables) -> str:
-    largest = max((grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid), default=0)
-    alpha = max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=0)
-    most = max(h.nodes for h in tables.hypotheses)
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
     return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
 #ifndef SELFCAL_MODEL_H
@@ -78,7 +127,7 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_CHANNELS {len(tables.channels)}U
 /* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
 #define SELFCAL_MODEL_CHANNELS_READ {int(set(tables.channels) <= {("temp", "degC"), ("supply", "V")})}
-/* With SELFCAL_FIXED no record overflows (lib/kernel_fixed.c). The coarsest step of each axis that readings within
+/* With SELFCAL_FIXED no record overflows (lib/bank_kernel_fixed.c). The coarsest step of each axis that readings within
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
 #define SELFCAL_MODEL_EXPONENTS {{{", ".join(str(coarsest_exponent(axis, tables.dt_s)) for axis in tables.axes)}}}
@@ -97,22 +146,6 @@ def _header(model: Model, tables: Tables) -> str:
 /* 1: selfcal_model_gate is there. */
 #define SELFCAL_MODEL_GATE {int(gate_table(model, tables) is not None)}
 
-#if SELFCAL_GRID_MAX < {largest}
-#error "set SELFCAL_GRID_MAX to {largest}: this model has a grid of so many nodes"
-#elif SELFCAL_ALPHA_MAX < {alpha}
-#error "set SELFCAL_ALPHA_MAX to {alpha}: this model has a grid of so many nodes of alpha"
-#elif SELFCAL_HYPOTHESIS_NODES_MAX < {most}
-#error "set SELFCAL_HYPOTHESIS_NODES_MAX to {most}: this model has a hypothesis of so many nodes"
-#elif SELFCAL_NODES_MAX < {tables.nodes}
-#error "set SELFCAL_NODES_MAX to {tables.nodes}: this model has so many nodes"
-#endif
-#if SELFCAL_AXES_MAX < {axes}
-#error "set SELFCAL_AXES_MAX to {axes}: this model has so many axes"
-#endif
-#if SELFCAL_HYPOTHESES_MAX < {hypotheses}
-#error "set SELFCAL_HYPOTHESES_MAX to {hypotheses}: this model has so many hypotheses"
-#endif
-{_terms(tables)}
 extern const selfcal_model_t selfcal_model;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 #if SELFCAL_MODEL_CHANNELS > 0
@@ -127,7 +160,7 @@ extern const selfcal_gate_config_t selfcal_model_gate;
 
 
 def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
-    """Bound of `selfcal_scale_t.exponent`: lib/kernel_fixed.c sets it by the first batch's noise, then by |y|.
+    """Bound of `selfcal_scale_t.exponent`: lib/bank_kernel_fixed.c sets it by the first batch's noise, then by |y|.
 
     Bank samples less the first reach 2 range; so do differences, which pass for noise of 2 range / sqrt(2) within the
     prior's limits.
@@ -140,12 +173,6 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
 
 def _units(tables: Tables) -> str:
     return "".join(f"; {name} [{unit}]" for name, unit in tables.channels)
-
-
-def _terms(tables: Tables) -> str:
-    if not tables.term_nodes:
-        return ""
-    return '#if SELFCAL_TERMS_MAX < 3\n#error "set SELFCAL_TERMS_MAX to 3: this model has laws that are sums"\n#endif\n'
 
 
 def _source(model: Model, tables: Tables) -> str:
@@ -180,6 +207,7 @@ def _source(model: Model, tables: Tables) -> str:
         "    SELFCAL_MODEL_AXES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_NODES, axes, hypotheses,",
         f"    {'&regressors' if tables.regressors else 'NULL'},",
         f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
+        f"    {'&selfcal_states_code' if tables.term_nodes else 'NULL'},",
         "};",
         "",
     ]

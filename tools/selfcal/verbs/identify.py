@@ -53,8 +53,8 @@ def identify(
 ) -> dict[str, Any]:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
-    `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU,
-    by 16-bit products) or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
+    `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU)
+    or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
     `decimate`: rate of the block means in Hz, else the model's.
     `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
     `export`: a format of `selfcal.export` and the file to write.
@@ -185,7 +185,7 @@ def identify_axis(
     if engine in ("library", "fixed"):
         from selfcal.engines.library import Bank
 
-        bank = Bank(tables, fixed=16 if engine == "fixed" else None)
+        bank = Bank(tables, fixed=engine == "fixed")
         bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
         for choice in choices:
             results.append(bank.report(0, mask_of(regressors, choice)))

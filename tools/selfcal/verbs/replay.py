@@ -43,7 +43,7 @@ from selfcal.regressors import (
     offered,
 )
 from selfcal.result import AxisResult, in_unit
-from selfcal.tables import Tables, bank_block, gate_table, make_tables
+from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.units import factor as factor_of
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
@@ -158,14 +158,14 @@ def replay(
 def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host", nodes: str | None = None) -> Path:
     """The firmware of a target for a model, a sampling rate and a choice of axes; made only if it is not there.
 
-    `nodes`: whose node counts it gets (default: the target's own). Its folder is named by the content of all that it
-    is made of, and appears whole or not at all. Raises UserError if it cannot be made.
+    `nodes`: whose node counts and sizes it gets (default: the target's own). Its folder is named by the content of all
+    that it is made of, and appears whole or not at all. Raises UserError if it cannot be made.
     """
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         tables = Path(name)
         made = make_tables(model, rate_hz, tuple(axes), nodes or target)
-        write_tables(model, made, tables)
+        write_tables(model, made, tables, nodes or target)
         key = _content(tables, made_by.make)
         folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -176,28 +176,12 @@ def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host
                 shutil.rmtree(part, ignore_errors=True)  # a build that was killed leaves it
                 try:
                     shutil.copytree(tables, part)
-                    _make(made_by.make, target, part.relative_to(ROOT), model_flags(made))
+                    _make(made_by.make, target, part.relative_to(ROOT))
                     part.rename(folder)
                 except BaseException:
                     shutil.rmtree(part, ignore_errors=True)
                     raise
     return folder / made_by.image
-
-
-def model_flags(tables: Tables) -> str:
-    """Sizes that a firmware needs beyond the configured ones (port/arm.mk); none for the laws of the default model."""
-    if not tables.term_nodes and len(tables.hypotheses) <= 3:
-        return ""
-    grids = [grid.nodes for one in tables.hypotheses for grid in (one.rho, one.alpha) if grid]
-    sizes = {
-        "TERMS_MAX": 3 if tables.term_nodes else 1,
-        "HYPOTHESES_MAX": len(tables.hypotheses),
-        "GRID_MAX": max(grids, default=6),
-        "ALPHA_MAX": max((one.alpha.nodes for one in tables.hypotheses if one.alpha), default=6),
-        "HYPOTHESIS_NODES_MAX": max(*grids, *(one.nodes for one in tables.hypotheses)),
-        "NODES_MAX": tables.nodes,
-    }
-    return " ".join(f"-USELFCAL_{name} -DSELFCAL_{name}={size}" for name, size in sizes.items())
 
 
 def _content(tables: Path, name: str) -> str:
@@ -211,13 +195,13 @@ def _content(tables: Path, name: str) -> str:
     return said.hexdigest()[:16]
 
 
-def _make(name: str, target: str, folder: Path, flags: str) -> None:
+def _make(name: str, target: str, folder: Path) -> None:
     """Make a firmware in `folder`, which is relative to ROOT: a checkout's own path may hold spaces."""
     command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
     # Of a `make` around this program nothing is passed on: neither its options nor its variables.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
-        command += [f"CORE={target}", f"MODEL_FLAGS={flags}"]
+        command.append(f"CORE={target}")
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     except OSError as error:
         raise UserError(f"cannot build the firmware: make: {error.strerror}") from error

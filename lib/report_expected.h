@@ -1,4 +1,4 @@
-/* Expected variance of a filter's innovations: see posterior.c, which includes this once for each of its two types T. */
+/* Expected variance of a filter's innovations: report_expected.c includes this once for each of its two types T. */
 
 typedef struct {
     T v_less_1; /* the innovations' variance over sigma_v^2 of the data, less 1 */
@@ -6,7 +6,8 @@ typedef struct {
     T gain, p; /* phi K; 1 - psi */
 } NAME(expected_t);
 
-/* The predicted drift variance that the filter of (rho, 1 - phi = beta), a random walk with a beta of 0, converges to, over its sigma_v^2. */
+/* The predicted drift variance that the filter of (rho, 1 - phi = beta), a random walk with a beta of 0, converges to,
+ * over its sigma_v^2. */
 static T NAME(settled)(T ln_rho, T beta) {
     const T one_less_phi_sq = beta * (T_(2.0) - beta);
     const T q = T_exp(T_(2.0) * ln_rho) * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));
@@ -15,9 +16,9 @@ static T NAME(settled)(T ln_rho, T beta) {
     return b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
 }
 
-/* That filter over white noise and a first-order drift of deviation sqrt(truth->variance) and pole 1 - truth->rate. Its innovations
- * are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the delay; their variance is that of an ARMA(2,1) process, here written so
- * that nothing cancels when the poles are close to 1. */
+/* That filter over white noise and a first-order drift of deviation sqrt(truth->variance) and pole 1 - truth->rate. Its
+ * innovations are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the delay; their variance is that of an ARMA(2,1)
+ * process, here written so that nothing cancels when the poles are close to 1. */
 static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *truth) {
     const T p_inf = NAME(settled)(ln_rho, beta);
     const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf);

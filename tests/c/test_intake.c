@@ -140,7 +140,8 @@ static void less_than_half_a_block_is_dropped(void) {
     TEST_ASSERT_EQUAL(1, selfcal_counters(&bank)->blocks_lost);
 }
 
-/* Blocks stay on the even grid of sample instants: 3 before the gap, 24 missing, so the next full block starts 3 later. */
+/* Blocks stay on the even grid of sample instants: 3 before the gap, 24 missing, so the next full block starts 3
+ * later. */
 static void a_gap_keeps_the_grid(void) {
     for (unsigned i = 0; i < 2U * BLOCK + 3U; i++) {
         push(1.0F);
@@ -168,7 +169,7 @@ static void time_before_the_first_sample_does_not_count(void) {
     TEST_ASSERT_EQUAL(123456, selfcal_counters(&bank)->missing);
 }
 
-/* The bound of averager.c, driven to it: whatever the range says, sums stay finite and would for 2^32 bank samples. */
+/* The bound of intake.c, driven to it: whatever the range says, sums stay finite and would for 2^32 bank samples. */
 static void huge_samples_cannot_overflow_a_sum(void) {
     for (unsigned axis = 0; axis < AXES; axis++) {
         axes[axis].range = 0.0F;
@@ -264,7 +265,8 @@ static void a_dead_axis_is_retired_and_the_others_go_on(void) {
             out += kept_out;
         }
         /* RETIRE_BLOCKS whole blocks, and up to one more in which it was sound for a part */
-        TEST_ASSERT_TRUE(out >= SELFCAL_RETIRE_BLOCKS * BLOCK - BLOCK / 2U && out <= (SELFCAL_RETIRE_BLOCKS + 1U) * BLOCK);
+        TEST_ASSERT_TRUE(out >= SELFCAL_RETIRE_BLOCKS * BLOCK - BLOCK / 2U &&
+                         out <= (SELFCAL_RETIRE_BLOCKS + 1U) * BLOCK);
         others_equal();
         selfcal_report_t report;
         selfcal_node_view_t view;
@@ -330,7 +332,8 @@ static void only_an_axis_that_starves_the_others_is_retired(void) {
     TEST_ASSERT_EQUAL(1, !selfcal_retired(&bank, 3) + !selfcal_retired(&bank, 4) + !selfcal_retired(&bank, 5));
 }
 
-/* One in three samples beyond the range, as in a swing, or all of them: in motion as at rest the axis is judged by the sound ones too. */
+/* One in three samples beyond the range, as in a swing, or all of them: in motion as at rest the axis is judged by the
+ * sound ones too. */
 static void motion_retires_only_an_axis_that_is_mostly_at_fault(void) {
     for (unsigned every = 1; every <= 3U; every += 2U) {
         setUp();
@@ -372,14 +375,17 @@ static void a_sample_in_motion_passes_by(void) {
     }
     TEST_ASSERT_TRUE(saturated > 0U);
     TEST_ASSERT_TRUE(its->missing == mine->missing + saturated);
-    TEST_ASSERT_TRUE(mine->samples + mine->missing + saturated == 300U * BLOCK); /* each in one counter: one axis fails at a time */
-    TEST_ASSERT_TRUE(its->samples == mine->samples && its->blocks_moving == mine->blocks_moving && its->blocks_moving > 10U);
+    /* each in one counter: one axis fails at a time */
+    TEST_ASSERT_TRUE(mine->samples + mine->missing + saturated == 300U * BLOCK);
+    TEST_ASSERT_TRUE(its->samples == mine->samples && its->blocks_moving == mine->blocks_moving &&
+                     its->blocks_moving > 10U);
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(NULL, &axes[0].range));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_push_moving(&bank, NULL));
 }
 
-/* Readings that the sensor shifts, in the middle of a block and between two, against the same unshifted ones with the block lost: on a
- * lattice on which no sum rounds every report is the same to the bit, but for the bias, which has moved by that. Kept by a snapshot. */
+/* Readings that the sensor shifts, in the middle of a block and between two, against the same unshifted ones with the
+ * block lost: on a lattice on which no sum rounds every report is the same to the bit, but for the bias, which has
+ * moved by that. Kept by a snapshot. */
 static void a_shift_by_the_sensor_moves_the_bias_alone(void) {
     const float amount[2] = {-4.375F, 1.0F / 64.0F};
     float shifted[AXES] = {0.0F};
@@ -410,10 +416,12 @@ static void a_shift_by_the_sensor_moves_the_bias_alone(void) {
         TEST_ASSERT_EQUAL_FLOAT(shifted[axis], selfcal_shifted(&bank, axis));
         TEST_ASSERT_FLOAT_WITHIN(1e-6F, still.bias_mean + shifted[axis], moved.bias_mean);
         moved.bias_mean = still.bias_mean;
-        TEST_ASSERT_FLOAT_WITHIN(1e-5F * still.bias_sd, still.bias_sd, moved.bias_sd); /* of means that are rounded elsewhere */
+        /* of means that are rounded elsewhere */
+        TEST_ASSERT_FLOAT_WITHIN(1e-5F * still.bias_sd, still.bias_sd, moved.bias_sd);
         moved.bias_sd = still.bias_sd;
         for (unsigned h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
-            TEST_ASSERT_FLOAT_WITHIN(1e-6F, still.hypothesis[h].bias_mean + shifted[axis], moved.hypothesis[h].bias_mean);
+            TEST_ASSERT_FLOAT_WITHIN(1e-6F, still.hypothesis[h].bias_mean + shifted[axis],
+                                     moved.hypothesis[h].bias_mean);
             moved.hypothesis[h].bias_mean = still.hypothesis[h].bias_mean;
         }
         TEST_ASSERT_EQUAL_MEMORY(&still, &moved, sizeof still);
@@ -476,7 +484,8 @@ static void a_change_of_rate_changes_the_weight_alone(void) {
     TEST_ASSERT_FLOAT_WITHIN(1e-6F, 1.5F, (float)view.a);               /* 1 + 1/2 */
     TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.0F, (float)view.c);               /* 0 + 4/2 */
     TEST_ASSERT_FLOAT_WITHIN(1e-6F, logf(2.0F), (float)view.ln_s);      /* ln 1 + ln 2 */
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 4U * BLOCK, 1.0F)); /* the density stays: whole blocks weigh as ever */
+    /* the density stays: whole blocks weigh as ever */
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 4U * BLOCK, 1.0F));
     for (unsigned i = 0; i < 4U * BLOCK; i++) {
         push(1.0F);
     }
@@ -486,8 +495,8 @@ static void a_change_of_rate_changes_the_weight_alone(void) {
     TEST_ASSERT_EQUAL(10, selfcal_counters(&bank)->blocks_lost);
 }
 
-/* Found by fuzzing: a whole batch at a small ratio. The constant law's s is r, so D = n ln r; 1e-12 of it, for the long sum has twice
- * the digits of float. */
+/* Found by fuzzing: a whole batch at a small ratio. The constant law's s is r, so D = n ln r; 1e-12 of it, for the long
+ * sum has twice the digits of float. */
 static void better_samples_than_the_models_keep_ln_s(void) {
     const float ratio = 1.0F / 768.0F;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 1U, ratio));

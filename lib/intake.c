@@ -3,75 +3,21 @@
  * A boxcar turns white noise of variance V into V/block and leaves slow drift as it is; drift faster than the block is
  * smoothed. Sums are taken about the block's first sample, so that gravity or a turn-on bias costs no digits.
  *
- * Why no sum overflows a float while |sample| < L = SELFCAL_SAMPLE_MAX = 2^40: a block sums at most 2^32 squares of at most 2 L
- * about its first sample, 2^114 in all. Bank samples are differences of block means, |y| <= 2 L; the prediction x is a weighted
- * mean of such values and 0, so |nu| <= 4 L; s >= r >= 2^-10 (SELFCAL_VARIANCE_RATIO_MAX); a record has at most 2^32 bank samples.
- * So C = sum nu^2/s <= 2^(32 + 84 + 10) = 2^126 < FLT_MAX = 2^128, and B = sum u nu/s is less (|u| <= 1). */
-#include "internal.h"
+ * Why no sum overflows a float while |sample| < L = SELFCAL_SAMPLE_MAX = 2^40: a block sums at most 2^32 squares of at
+ * most 2 L about its first sample, 2^114 in all. Bank samples are differences of block means, |y| <= 2 L; the
+ * prediction x is a weighted mean of such values and 0, so |nu| <= 4 L; s >= r >= 2^-10 (SELFCAL_VARIANCE_RATIO_MAX); a
+ * record has at most 2^32 bank samples. So C = sum nu^2/s <= 2^(32 + 84 + 10) = 2^126 < FLT_MAX = 2^128, and B = sum u
+ * nu/s is less (|u| <= 1). */
+#include "bank.h"
 
-/* ------------------------------------------------------------------------------------------------------ a block's sums
- * start_sums(), add_sample(), and block_level(): mean of the block less the origin; `scatter`: sum of squares about that mean. */
-
-#ifdef SELFCAL_FIXED /* averager_fixed.c */
-
-static void start_sums(selfcal_t *self) {
-    memset(self->sums, 0, sizeof self->sums);
-}
-
-static void add_sample(selfcal_t *self, const float sample[], uint32_t live) {
-    selfcal_block_t *sums = self->sums;
-    for (; live != 0U; live >>= 1, sums++, sample++) {
-        if ((live & 1U) != 0U) {
-            (self->used == 0U ? selfcal_block_open : selfcal_block_add)(sums, *sample);
-        }
-    }
-}
-
-static selfcal_real_t block_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter) {
-    return selfcal_block_level(&self->sums[axis], self->used, self->origin[axis], scatter);
-}
-
-#else
-
-static void start_sums(selfcal_t *self) {
-    memset(self->sum, 0, sizeof self->sum);
-    memset(self->sum_sq, 0, sizeof self->sum_sq);
-}
-
-static void add_sample(selfcal_t *self, const float sample[], uint32_t live) {
-    const uint8_t axes = self->model->axes;
-    if (self->used == 0U) {
-        memcpy(self->first, sample, axes * sizeof sample[0]);
-    }
-    for (uint8_t axis = 0; axis < axes; axis++) {
-        if ((live >> axis & 1U) != 0U) {
-            const selfcal_real_t from_first = (selfcal_real_t)sample[axis] - (selfcal_real_t)self->first[axis];
-            self->sum[axis] += from_first;
-            self->sum_sq[axis] = r_fma(from_first, from_first, self->sum_sq[axis]);
-        }
-    }
-}
-
-static selfcal_real_t block_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter) {
-    const selfcal_real_t mean = self->sum[axis] / (selfcal_real_t)self->used;
-    *scatter = (selfcal_wide_t)r_fmax(r_fma(-self->sum[axis], mean, self->sum_sq[axis]), R(0.0));
-    return (selfcal_real_t)self->first[axis] - (selfcal_real_t)self->origin[axis] + mean;
-}
-
-#endif
-
-/* -------------------------------------------------------------------------------------------------------------- blocks */
+/* --------------------------------------------------------------------------------------------------------------
+ * blocks */
 
 static void start_block(selfcal_t *self) {
     self->position = 0;
     self->used = 0;
     self->dropped = false;
-    start_sums(self);
-}
-
-bool selfcal_retired(const selfcal_t *self, uint8_t axis) {
-    SELFCAL_ASSERT(axis < self->model->axes);
-    return (self->retired >> axis & 1U) != 0U;
+    selfcal_intake_start(self);
 }
 
 /* `count` bank intervals without a value. A counter that is at its end stays there. */
@@ -96,7 +42,7 @@ static void close_block(selfcal_t *self) {
             continue;
         }
         selfcal_wide_t scatter;
-        const selfcal_real_t level = block_level(self, axis, &scatter);
+        const selfcal_real_t level = selfcal_intake_level(self, axis, &scatter);
         if (first) {
             self->offset[axis] = level;
         }
@@ -152,8 +98,8 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
     return SELFCAL_OK;
 }
 
-/* Forgets what the block in progress holds; the rest of it will pass without a value. False where nothing of it has passed, or that
- * has been done. */
+/* Forgets what the block in progress holds; the rest of it will pass without a value. False where nothing of it has
+ * passed, or that has been done. */
 static bool drop_block(selfcal_t *self) {
     const uint32_t position = self->position;
     if (position == 0U || self->dropped) {
@@ -182,7 +128,8 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
         return SELFCAL_BAD_ARGUMENT;
     }
     (void)drop_block(self);
-    self->position = (uint32_t)((uint64_t)self->position * block / self->block); /* the same part of the interval has passed */
+    /* the same part of the interval has passed */
+    self->position = (uint32_t)((uint64_t)self->position * block / self->block);
     selfcal_bank_pace(self, block);
     self->variance_ratio = (selfcal_real_t)variance_ratio;
     memset(self->within, 0, sizeof self->within);
@@ -203,7 +150,8 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
     if (self->started) {
         const float before = self->origin[axis], sum = before + amount;
         const float part = sum - before;
-        const float lost = (before - (sum - part)) + (amount - part); /* of the sum's rounding, exactly (Knuth's TwoSum) */
+        /* of the sum's rounding, exactly (Knuth's TwoSum) */
+        const float lost = (before - (sum - part)) + (amount - part);
         self->origin[axis] = sum;
         self->offset[axis] += (selfcal_real_t)lost;
     }
@@ -219,15 +167,17 @@ float selfcal_shifted(const selfcal_t *self, uint8_t axis) {
 #define MAGNITUDE 0x7FFFFFFFU
 #define INFINITE 0x7F800000U
 
-/* Counts what is wrong with a sample; a bit for each axis at fault. By the bits of the values, since a comparison in software
- * floating point is a call. */
+/* Counts what is wrong with a sample; a bit for each axis at fault. By the bits of the values, since a comparison in
+ * software floating point is a call. */
 static uint32_t faults(selfcal_t *self, const float sample[]) {
     uint32_t bad = 0;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_axis_t *limits = &self->model->axis[axis];
-        const uint32_t value = float_bits(sample[axis]), last = float_bits(self->last[axis]), range = float_bits(limits->range);
+        const uint32_t value = float_bits(sample[axis]), last = float_bits(self->last[axis]),
+            range = float_bits(limits->range);
         const uint32_t magnitude = value & MAGNITUDE;
-        if (magnitude >= float_bits(SELFCAL_SAMPLE_MAX) || (range - 1U < INFINITE && magnitude >= range)) { /* range > 0 */
+        /* range > 0 */
+        if (magnitude >= float_bits(SELFCAL_SAMPLE_MAX) || (range - 1U < INFINITE && magnitude >= range)) {
             bad |= 1U << axis;
             if (magnitude >= INFINITE) {
                 self->counters.not_finite[axis]++;
@@ -246,8 +196,9 @@ static uint32_t faults(selfcal_t *self, const float sample[]) {
     return bad;
 }
 
-/* Retires the axes that keep the others waiting. `bad`, `live`: axes at fault, and not yet retired. Only samples in which some
- * live axis is sound are counted: where all fail (the sensor unplugged) nobody is kept waiting by anybody. */
+/* Retires the axes that keep the others waiting. `bad`, `live`: axes at fault, and not yet retired. Only samples in
+ * which some live axis is sound are counted: where all fail (the sensor unplugged) nobody is kept waiting by
+ * anybody. */
 static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
     if (bad == live) {
         return;
@@ -299,7 +250,7 @@ void selfcal_take(selfcal_t *self, const float sample[], const float regressors[
             self->origin[axis] = selfcal_retired(self, axis) ? 0.0F : sample[axis];
         }
     }
-    add_sample(self, sample, live);
+    selfcal_intake_add(self, sample, live);
     if (self->columns != NULL) {
         self->model->regressors->code->add(self, regressors);
     }
@@ -329,5 +280,6 @@ const selfcal_counters_t *selfcal_counters(const selfcal_t *self) {
 
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis) {
     SELFCAL_ASSERT(axis < self->model->axes);
-    return self->within_dof > 0U && !selfcal_retired(self, axis) ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof) : NAN;
+    return self->within_dof > 0U &&
+        !selfcal_retired(self, axis) ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof) : NAN;
 }

@@ -1,21 +1,21 @@
 /* Laws that are sums: nodes whose drift, or whose coloured noise, has several states.
  *
- * A reading is y_i = x0 + sum_j x_j + w_i, the states scaled so that each is read with a factor of 1. All variances are relative to
- * sigma_v^2, r that of a sample's white noise (1 for a whole block):
+ * A reading is y_i = x0 + sum_j x_j + w_i, the states scaled so that each is read with a factor of 1. All variances are
+ * relative to sigma_v^2, r that of a sample's white noise (1 for a whole block):
  *   x_j' = phi_j x_j + noise of variance q_j,   w_i ~ N(0, r/(1 + theta)^2).
- * A moving average (e_i + theta e_(i-1))/(1 + theta) is w_i = e_i/(1 + theta) and a last state theta e_(i-1)/(1 + theta), whose phi is 0
- * and whose noise is theta w_i. The filter with noise of reading and state correlated (Anderson & Moore, Optimal Filtering, 1979, section
- * 5.4), one step from prediction to prediction, with S = theta r/(1 + theta)^2 in the last place and else 0:
+ * A moving average (e_i + theta e_(i-1))/(1 + theta) is w_i = e_i/(1 + theta) and a last state theta e_(i-1)/(1 +
+ * theta), whose phi is 0 and whose noise is theta w_i. The filter with noise of reading and state correlated (Anderson
+ * & Moore, Optimal Filtering, 1979, section 5.4), one step from prediction to prediction, with S = theta r/(1 +
+ * theta)^2 in the last place and else 0:
  *   nu = y - sum x_j    s = r/(1 + theta)^2 + sum P    kappa = (phi_j sum_i P_ij + S_j)/s
  *   x_j' = phi_j x_j + kappa_j nu                      P' = phi P phi + Q - kappa kappa' s
- * P and the gains are in selfcal_wide_t, until P has converged; a sample then costs the filter alone. The bias and sigma_v are integrated
- * out from the same sums as for every node (bank.c), which are here taken to twice the digits, the regressors' columns among them
- * (regressors.c says why). */
-#include "kernel.h"
+ * P and the gains are in selfcal_wide_t, until P has converged; a sample then costs the filter alone. The bias and
+ * sigma_v are integrated out from the same sums as for every node (bank.c), which are here taken to twice the digits,
+ * the regressors' columns among them (regressors.c says why). */
+#include "bank.h"
 
-#if SELFCAL_TERMS_MAX > 1
-
-/* P has converged when no variance moves by this part of itself within a sample: at a gain of 1e-4 it then is within 1e-8. */
+/* P has converged when no variance moves by this part of itself within a sample: at a gain of 1e-4 it then is within
+ * 1e-8. */
 #define CONVERGED 1e-12
 
 /* Products of s are so far from 0 and infinity that the next s cannot reach either. */
@@ -26,20 +26,8 @@ static size_t order_of(const selfcal_law_t *law) {
     return (size_t)law->terms + (law->coloured_noise ? 1U : 0U);
 }
 
-size_t selfcal_terms_nodes(const selfcal_model_t *model) {
-    size_t nodes = 0;
-    for (uint8_t h = 0; h < model->hypotheses; h++) {
-        nodes += is_sum(model->hypothesis[h].law) ? hypothesis_nodes(&model->hypothesis[h]) : 0U;
-    }
-    return nodes;
-}
-
-static size_t columns_of(const selfcal_t *self) {
-    return self->model->regressors != NULL ? self->model->regressors->count : 0U;
-}
-
 static size_t series_of(const selfcal_t *self) {
-    return 1U + columns_of(self) + self->model->axes;
+    return 1U + regressors_of(self->model) + self->model->axes;
 }
 
 /* Node `j` among those of sums, and its law. */
@@ -62,33 +50,19 @@ static selfcal_sum_t *states(const selfcal_t *self, size_t index, size_t series)
     return &self->terms->x[(index * series_of(self) + series) * SELFCAL_TERMS_MAX];
 }
 
-static reading_sums_t reading_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
-#ifdef SELFCAL_FIXED
-    (void)j;
-    selfcal_sum_t *bc = &self->terms->bc[(index * self->model->axes + axis) * 2U];
-    const reading_sums_t sums = {bc, bc + 1};
-#else
-    (void)index;
-    const size_t k = j * self->model->axes + axis;
-    const reading_sums_t sums = {&self->b[k], &self->c[k]};
-#endif
-    return sums;
-}
-
 /* Behind the memory of the bank and its regressors; what SELFCAL_TERMS_SIZE() adds includes the room to align it. */
-void selfcal_terms_init(selfcal_t *self, unsigned char *memory) {
-    const size_t nodes = selfcal_terms_nodes(self->model);
+static void init_states(selfcal_t *self, unsigned char *memory) {
+    const size_t nodes = sum_nodes(self->model);
     memory += (8U - ((uintptr_t)memory & 7U)) & 7U;
     self->terms = (selfcal_terms_t *)(void *)memory;
     memory += (sizeof *self->terms + 7U) / 8U * 8U;
     self->terms->node = (selfcal_term_node_t *)(void *)memory;
     self->terms->x = (selfcal_sum_t *)(void *)(self->terms->node + nodes);
-#ifdef SELFCAL_FIXED
     self->terms->bc = self->terms->x + nodes * series_of(self) * SELFCAL_TERMS_MAX;
-#endif
 }
 
-/* ------------------------------------------------------------------------------------------------------------- gains */
+/* -------------------------------------------------------------------------------------------------------------
+ * gains */
 
 static selfcal_wide_t phi_of(const selfcal_term_node_t *node, size_t a) {
     return 1.0 - (selfcal_wide_t)node->beta[a];
@@ -100,7 +74,7 @@ static selfcal_wide_t white_of(const selfcal_term_node_t *node) {
     return 1.0 / (whole * whole);
 }
 
-void selfcal_terms_start(selfcal_t *self, size_t j, selfcal_place_t place) {
+static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
     const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
     const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho), second = exp((selfcal_wide_t)place.ln_alpha);
     const selfcal_wide_t dt_s = (selfcal_wide_t)self->model->dt_s;
@@ -151,7 +125,8 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
         gain.s += gain.kappa[a];
     }
     for (size_t a = 0; a < order; a++) {
-        gain.kappa[a] = (phi_of(node, a) * gain.kappa[a] + (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
+        gain.kappa[a] = (phi_of(node, a) * gain.kappa[a] +
+                         (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
     }
     return gain;
 }
@@ -186,23 +161,21 @@ static void settle(selfcal_node_t *node, const selfcal_term_node_t *term, size_t
     }
 }
 
-void selfcal_terms_settle(selfcal_t *self, size_t j) {
+static void settle_node(selfcal_t *self, size_t j) {
     const term_t term = term_of(self, j);
     settle(&self->node[j], &self->terms->node[term.index], term.order);
 }
 
-#ifdef SELFCAL_FIXED
-void selfcal_terms_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
+static void fade_states(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
     const term_t term = term_of(self, j);
-    for (size_t axis = 0; axis < self->model->axes; axis++) {
-        const reading_sums_t sums = reading_sums(self, j, term.index, axis);
+    for (size_t axis = 0; SELFCAL_STATE_SUMS > 0U && axis < self->model->axes; axis++) {
+        const reading_sums_t sums = selfcal_kernel_state_sums(self, j, term.index, axis);
         sum_fade(sums.b, keep_b);
         sum_fade(sums.c, keep_c);
     }
 }
-#endif
 
-static void gains_steady(const selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
+static void state_gains_steady(const selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
     const gain_t gain = gain_of(term, order, 1.0);
     gains->sums.scale = make_sum(1.0 / gain.s);
     for (uint32_t i = gains->sums.span.from; i < gains->sums.span.to; i++) {
@@ -214,7 +187,8 @@ static void gains_steady(const selfcal_term_node_t *term, size_t order, term_gai
 }
 
 /* What the rounding of 1/s loses on the mean of the span goes into the scale, as in bank.c. */
-static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term, size_t order,
+static void state_gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term,
+                                size_t order,
                           term_gains_t *gains) {
     const span_t span = gains->sums.span;
     selfcal_wide_t product = 1.0, ln_s = 0.0, short_of = 0.0;
@@ -242,10 +216,14 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, se
     term->steady = rests;
 }
 
-/* ------------------------------------------------------------------------------------------------------------ filter */
+/* ------------------------------------------------------------------------------------------------------------
+ * filter */
 
-/* One series, `y` [SELFCAL_BATCH] or all 1 if NULL, through a span; `x` are its states. Sums are taken to twice the digits. */
-static void filter(const selfcal_term_node_t *term, size_t order, const term_gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x[],
+/* One series, `y` [SELFCAL_BATCH] or all 1 if NULL, through a span; `x` are its states. Sums are taken to twice the
+ * digits. */
+static void filter_states(const selfcal_term_node_t *term, size_t order, const term_gains_t *gains,
+                          const selfcal_real_t *y,
+                   selfcal_sum_t x[],
                    innovations_t *out) {
     const uint32_t from = gains->sums.span.from, count = gains->sums.span.to - from;
     for (uint32_t i = 0; i < count; i++) {
@@ -267,10 +245,10 @@ static void filter(const selfcal_term_node_t *term, size_t order, const term_gai
     }
 }
 
-void selfcal_terms_run(selfcal_t *self, size_t j, const span_t *span) {
+static void run_states(selfcal_t *self, size_t j, const span_t *span) {
     const selfcal_batch_t *batch = waiting(self);
     const term_t at_node = term_of(self, j);
-    const size_t p = columns_of(self), axes = self->model->axes, order = at_node.order;
+    const size_t p = regressors_of(self->model), axes = self->model->axes, order = at_node.order;
     selfcal_node_t *node = &self->node[j];
     selfcal_term_node_t *term = &self->terms->node[at_node.index];
     bool whole = true;
@@ -280,25 +258,25 @@ void selfcal_terms_run(selfcal_t *self, size_t j, const span_t *span) {
     term_gains_t gains;
     gains.sums.span = *span;
     if (whole && term->steady) {
-        gains_steady(term, order, &gains);
+        state_gains_steady(term, order, &gains);
         node->steady += span->to - span->from;
     } else {
         settle(node, term, order);
-        gains_varying(batch, node, term, order, &gains);
+        state_gains_varying(batch, node, term, order, &gains);
     }
     innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
     selfcal_sum_t *a = p > 0U ? &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
     for (size_t k = 0; k <= p; k++) {
         const selfcal_real_t *y = k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering];
-        filter(term, order, &gains, y, states(self, at_node.index, k), &column[k]);
+        filter_states(term, order, &gains, y, states(self, at_node.index, k), &column[k]);
         for (size_t l = 0; p > 0U && l <= k; l++) {
             selfcal_add_products(a++, &gains.sums, &column[l], &column[k]);
         }
     }
     selfcal_add_products(&node->a, &gains.sums, &column[0], &column[0]);
     for (size_t axis = 0; axis < axes; axis++) {
-        const reading_sums_t sums = reading_sums(self, j, at_node.index, axis);
-        filter(term, order, &gains, batch->y[axis], states(self, at_node.index, 1U + p + axis), &reading);
+        const reading_sums_t sums = selfcal_kernel_state_sums(self, j, at_node.index, axis);
+        filter_states(term, order, &gains, batch->y[axis], states(self, at_node.index, 1U + p + axis), &reading);
         selfcal_add_products(sums.c, &gains.sums, &reading, &reading);
         selfcal_add_products(sums.b, &gains.sums, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
@@ -307,19 +285,20 @@ void selfcal_terms_run(selfcal_t *self, size_t j, const span_t *span) {
     }
 }
 
-void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
+static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     const term_t at_node = term_of(self, j);
     const size_t order = at_node.order;
     const selfcal_wide_t intervals = (selfcal_wide_t)count;
     selfcal_term_node_t *term = &self->terms->node[at_node.index];
     settle(&self->node[j], term, order);
     term->steady = false;
-    selfcal_wide_t less[SELFCAL_TERMS_MAX]; /* 1 - phi^count */
+    selfcal_wide_t less[SELFCAL_TERMS_MAX] = {0.0}; /* 1 - phi^count */
     for (size_t a = 0; a < order; a++) {
         less[a] = term->beta[a] < R(1.0) ? -expm1(intervals * log1p(-(selfcal_wide_t)term->beta[a])) : 1.0;
     }
     for (size_t a = 0; a < order; a++) {
-        const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a], theta = (selfcal_wide_t)term->theta;
+        const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a],
+            theta = (selfcal_wide_t)term->theta;
         for (size_t b = 0; b <= a; b++) {
             term->p[term_pair(a, b)] *= (1.0 - less[a]) * (1.0 - less[b]);
         }
@@ -334,14 +313,11 @@ void selfcal_terms_gap(selfcal_t *self, size_t j, uint32_t count) {
     }
 }
 
-/* -------------------------------------------------------------------------------------------------------------- views */
-
-size_t selfcal_terms_series(const selfcal_t *self, uint8_t axis) {
-    return 1U + columns_of(self) + axis;
-}
+/* --------------------------------------------------------------------------------------------------------------
+ * views */
 
 /* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
-void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
+static void drift_of(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
     const term_t at_node = term_of(self, j);
     const selfcal_term_node_t *term = &self->terms->node[at_node.index];
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
@@ -350,7 +326,7 @@ void selfcal_terms_drift(const selfcal_t *self, size_t j, size_t series, selfcal
     }
 }
 
-void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
+static void spread_of(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
     const term_t at_node = term_of(self, j);
     const selfcal_term_node_t *term = &self->terms->node[at_node.index];
     memset(spread, 0, SELFCAL_TERM_PAIRS * sizeof spread[0]);
@@ -363,11 +339,11 @@ void selfcal_terms_spread(const selfcal_t *self, size_t j, selfcal_wide_t spread
     }
 }
 
-void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
+static void view_states(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const term_t at_node = term_of(self, index);
     const selfcal_node_t *node = &self->node[index];
     const selfcal_term_node_t *term = &self->terms->node[at_node.index];
-    const reading_sums_t sums = reading_sums(self, index, at_node.index, axis);
+    const reading_sums_t sums = selfcal_kernel_state_sums(self, index, at_node.index, axis);
     view->a = sum_value(node->a);
     view->b = sum_value(*sums.b);
     view->c = sum_value(*sums.c);
@@ -376,13 +352,13 @@ void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, sel
         view->ln_s += (selfcal_wide_t)node->steady * log(gain_of(term, at_node.order, 1.0).s);
     }
     selfcal_wide_t of_one[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
-    selfcal_terms_drift(self, index, 0, of_one);
-    selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), of_reading);
+    drift_of(self, index, 0, of_one);
+    drift_of(self, index, series_of_readings(self, axis), of_reading);
     view->drift = 0.0;
     view->bias_left = 1.0;
     view->drift_var = 0.0;
     selfcal_wide_t spread[SELFCAL_TERM_PAIRS];
-    selfcal_terms_spread(self, index, spread);
+    spread_of(self, index, spread);
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
         view->drift += of_reading[a];
         view->bias_left -= of_one[a];
@@ -390,11 +366,12 @@ void selfcal_terms_view(const selfcal_t *self, uint8_t axis, uint16_t index, sel
             view->drift_var += (a == b ? 1.0 : 2.0) * spread[term_pair(a, b)];
         }
     }
-    view->drift_var = fmax(view->drift_var, 0.0); /* after the longest gap it is what is left of numbers 10^16 times as large */
+    /* after the longest gap it is what is left of numbers 10^16 times as large */
+    view->drift_var = fmax(view->drift_var, 0.0);
 }
 
-bool selfcal_terms_sound(const selfcal_t *self) {
-    const size_t nodes = selfcal_terms_nodes(self->model);
+static bool states_sound(const selfcal_t *self) {
+    const size_t nodes = sum_nodes(self->model);
     const selfcal_terms_t *terms = self->terms;
     const size_t values = nodes * series_of(self) * SELFCAL_TERMS_MAX;
     const uintptr_t after = ((uintptr_t)(terms + 1) + 7U) & ~(uintptr_t)7U;
@@ -406,23 +383,23 @@ bool selfcal_terms_sound(const selfcal_t *self) {
             return false;
         }
     }
-#ifdef SELFCAL_FIXED
     if (terms->bc != terms->x + values) {
         return false;
     }
-    for (size_t k = 0; k < nodes * self->model->axes * 2U; k++) {
+    const size_t sums = nodes * self->model->axes * SELFCAL_STATE_SUMS;
+    for (size_t k = 0; k < sums; k++) {
         if (!finite_sum(terms->bc[k]) || (k % 2U == 1U && !(terms->bc[k].hi >= R(0.0)))) {
             return false;
         }
     }
-#endif
     for (size_t k = 0; k < nodes; k++) {
         const selfcal_term_node_t *node = &terms->node[k];
         if (!is_bool(&node->steady) || !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
             return false;
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
-            if (!(node->beta[a] >= R(0.0)) || !(node->beta[a] <= R(1.0)) || !(node->q[a] >= R(0.0)) || !isfinite(node->q[a]) ||
+            if (!(node->beta[a] >= R(0.0)) || !(node->beta[a] <= R(1.0)) || !(node->q[a] >= R(0.0)) ||
+                !isfinite(node->q[a]) ||
                 !(node->p[term_pair(a, a)] >= 0.0)) {
                 return false;
             }
@@ -436,6 +413,40 @@ bool selfcal_terms_sound(const selfcal_t *self) {
     return true;
 }
 
-#else
-typedef int selfcal_no_terms_t; /* C99 wants a declaration in every file */
-#endif
+/* ---------------------------------------------------------------------------------------------------------------
+ * laws */
+
+/* Of a term's deviation and bandwidth. */
+#define FACTOR_MIN 1e-3F
+#define FACTOR_MAX 1e3F
+
+/* Bank intervals that a stated correlation time lasts at most: 1 - phi keeps its digits. */
+#define TIME_MAX 1e6F
+
+static bool valid_term(const selfcal_term_t *term, float dt_s) {
+    const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
+    const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
+    const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
+    const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
+    return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN &&
+        term->deviation <= FACTOR_MAX &&
+           (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
+}
+
+/* A sum that there are filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
+static bool valid_sum(const selfcal_law_t *law, float dt_s) {
+    unsigned by_ratio = 0;
+    for (uint8_t a = 0; a < law->terms; a++) {
+        if (!valid_term(&law->term[a], dt_s)) {
+            return false;
+        }
+        by_ratio += law->term[a].by_ratio ? 1U : 0U;
+    }
+    return law->terms > 0U && law->terms + (law->coloured_noise ? 1U : 0U) <= SELFCAL_TERMS_MAX &&
+           !(has_ratio(law) && has_alpha(law)) && (by_ratio == 0U || (by_ratio < law->terms && !law->coloured_noise));
+}
+
+const selfcal_states_code_t selfcal_states_code = {
+    valid_sum, init_states, states_sound, start_node, run_states, run_states_gap,
+    settle_node, fade_states, view_states, spread_of, drift_of,
+};

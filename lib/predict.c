@@ -1,15 +1,17 @@
 /* The bias after the report: where it goes under each law, and how the doubt about it grows. */
-#include "internal.h"
+#include "bank.h"
 
 typedef struct {
     selfcal_real_t mean, var;
 } moments_t;
 
 static moments_t predict_law(const selfcal_law_t *law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
-    moments_t now = {(selfcal_real_t)posterior->bias_mean, (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
+    moments_t now = {(selfcal_real_t)posterior->bias_mean,
+        (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
     for (uint8_t a = 0; a < law->terms; a++) {
         if (law->term[a].kind == SELFCAL_WALK) {
-            const selfcal_real_t deviation = (selfcal_real_t)law->term[a].deviation, rate = deviation * deviation * elapsed_s;
+            const selfcal_real_t deviation = (selfcal_real_t)law->term[a].deviation,
+                rate = deviation * deviation * elapsed_s;
             const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
             const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
             now.var = r_fma(r_fma(mean, mean, sd * sd), rate, now.var);
@@ -39,7 +41,8 @@ static moments_t predict_law(const selfcal_law_t *law, const selfcal_posterior_t
     return now;
 }
 
-selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s, float *bias, float *sd) {
+selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s,
+                                 float *bias, float *sd) {
     if (report == NULL || model == NULL || bias == NULL || sd == NULL || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         !(elapsed_s >= 0.0F) || !isfinite(elapsed_s)) {
         return SELFCAL_BAD_ARGUMENT;

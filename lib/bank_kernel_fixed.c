@@ -1,32 +1,37 @@
 /* The kernel in integers, for parts without an FPU: every axis of one node through a span.
  *
- * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis, chosen by the data since no model
- *   knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps (one is 5e-7 to 1e-6 sigma).
- *   Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the step doubles, as often as it takes; where
- *   the readings keep below 2^17 steps it shrinks again by 16. x, B and C are rescaled with it. So nothing saturates;
- *   selfcal_scale() tells how often it happened. What the range and the priors make of it is in the generated
- *   SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise, sigma <= sqrt(2) range.
+ * INPUT SCALING y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis, chosen by the data since
+ * no model
+ *   knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps (one is 5e-7 to
+ *   1e-6 sigma). Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the step doubles, as
+ *   often as it takes; where the readings keep below 2^17 steps it shrinks again by 16. x, B and C are rescaled with
+ *   it. So nothing saturates; selfcal_scale() tells how often it happened. What the range and the priors make of it is
+ *   in the generated SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise, sigma <=
+ *   sqrt(2) range.
  * HEAD-ROOM  Each function states its own; all rest on
  *     |y| <= LIMIT < 2^26.6                by selfcal_kernel_load()
- *     |x| < LIMIT + 2^24                   x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and 0, up to the
- *                                          rounding: one step a sample against the pull of g, less than 2^24 steps for g >= 2^-23
+ *     |x| < LIMIT + 2^24 x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and 0, up to the
+ *                                          rounding: one step a sample against the pull of g, less than 2^24 steps for
+ *                                          g >= 2^-23
  *     |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28
  *     u/s < 2^(11 - b_bits), 1/s <= 2^10   s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
  *     a span has 16 samples at most.
  *   None of it depends on the length of the record: sums that fill up make room for themselves (SUMS).
  *   tests/c/fixed/test_fixed.c drives each there under UBSan.
- * GUARD BITS  Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move each
- *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has grown, that much more.
- *   Rounding a square's argument to 4 steps, the most that is done, adds 4^2/12 steps^2 to it on the average: 2^-39 of sigma^2,
- *   and the same for all nodes.
- * SUMS  int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in 2^16 steps^2:
- *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once |B| or C has
- *   reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is never: C takes 2^35 samples,
- *   and the count is 32 bits. How long a record keeps its accuracy is another matter: GUARD BITS, selfcal.h at SELFCAL_FIXED.
+ * GUARD BITS Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move
+ * each
+ *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has grown,
+ *   that much more.
+ * SUMS int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in
+ * 2^16 steps^2:
+ *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once
+ *   |B| or C has reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is
+ *   never: C takes 2^35 samples, and the count is 32 bits. How long a record keeps its accuracy is another matter:
+ *   GUARD BITS, selfcal.h at SELFCAL_FIXED.
  *
- * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for all.
- * >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
-#include "kernel.h"
+ * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for
+ * all. >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
+#include "bank.h"
 
 #ifdef SELFCAL_FIXED
 
@@ -41,15 +46,18 @@
 /* The step grows by 2 to this many at a time: shifts stay within their types. */
 #define MOST_COARSER 30
 
-/* --------------------------------------------------------------------------------------------------- numbers from float */
+/* --------------------------------------------------------------------------------------------------- numbers from
+ * float */
 
-/* The shift with which a value has `bits` bits before the binary point: 2^(bits - 1) <= |value| 2^shift < 2^bits. At most 62. */
+/* The shift with which a value has `bits` bits before the binary point: 2^(bits - 1) <= |value| 2^shift < 2^bits. At
+ * most 62. */
 static int mantissa_shift(float value, int bits) {
     const int shift = 126 + bits - (int)((float_bits(value) >> 23) & 0xFFU);
     return shift < 62 ? shift : 62;
 }
 
-/* value / 2^shift rounded to nearest, 1 <= shift <= 63. Sums that floors went into would be off by half a unit a batch. */
+/* value / 2^shift rounded to nearest, 1 <= shift <= 63. Sums that floors went into would be off by half a unit a
+ * batch. */
 static inline int64_t scaled(int64_t value, uint32_t shift) {
     return ((value >> (shift - 1U)) + 1) >> 1;
 }
@@ -60,7 +68,8 @@ static int b_bits(const selfcal_node_t *node) {
     return -mantissa_shift(R(1.0) + p, 1);
 }
 
-/* -------------------------------------------------------------------------------------------------------------- scales */
+/* --------------------------------------------------------------------------------------------------------------
+ * scales */
 
 static int32_t larger(int32_t a, int32_t b) {
     return a > b ? a : b;
@@ -72,12 +81,12 @@ static inline int32_t high(int64_t sum) {
     return bits < 0 ? ~bits : bits;
 }
 
-/* Makes the step of an axis 2^bits times as large, 1 to 30, or smaller by FINER_BITS: may_be_finer() has seen to the room. x is
- * rounded to nearest, B and C lose less than one of their units. */
-static void rescale(selfcal_t *self, uint8_t axis, int bits) {
+/* Makes the step of an axis 2^bits times as large, 1 to 30, or smaller by FINER_BITS: may_be_finer() has seen to the
+ * room. x is rounded to nearest, B and C lose less than one of their units. */
+static void rescale_axis(selfcal_t *self, uint8_t axis, int bits) {
     const size_t axes = self->model->axes;
     const size_t cells = self->model->nodes * axes;
-    selfcal_scale_t *scale = &self->scale[axis];
+    selfcal_scale_t *scale = &self->integers.scale[axis];
     scale->most_y = scale->most_sum = 0;
     for (size_t k = axis; k < cells; k += axes) {
         if (bits > 0) {
@@ -105,7 +114,8 @@ static bool may_be_finer(const selfcal_t *self, uint8_t axis) {
     const size_t cells = self->model->nodes * axes;
     for (size_t k = axis; k < cells; k += axes) {
         const int64_t room = INT64_MAX >> (2 * FINER_BITS + 2);
-        if (self->x[k] > FEW_STEPS || self->x[k] < -FEW_STEPS || self->b[k] > room || self->b[k] < -room || self->c[k] > room) {
+        if (self->x[k] > FEW_STEPS || self->x[k] < -FEW_STEPS || self->b[k] > room || self->b[k] < -room ||
+            self->c[k] > room) {
             return false;
         }
     }
@@ -113,20 +123,20 @@ static bool may_be_finer(const selfcal_t *self, uint8_t axis) {
 }
 
 void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma) {
-    self->scale[axis].exponent = (int16_t)(floorf(ln_sigma * R(1.44269504)) - SIGMA_BITS); /* log2(e) */
+    self->integers.scale[axis].exponent = (int16_t)(floorf(ln_sigma * R(1.44269504)) - SIGMA_BITS); /* log2(e) */
 }
 
 const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis) {
     SELFCAL_ASSERT(axis < self->model->axes);
-    return &self->scale[axis];
+    return &self->integers.scale[axis];
 }
 
 /* Rounds y to steps, after making the step so coarse that |y| <= LIMIT and that a full sum has room again. */
 void selfcal_kernel_load(selfcal_t *self) {
     const selfcal_batch_t *batch = waiting(self);
-    self->step_from = self->step_to = 0U;
+    self->integers.step_from = self->integers.step_to = 0U;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        selfcal_scale_t *scale = &self->scale[axis];
+        selfcal_scale_t *scale = &self->integers.scale[axis];
         float peak = 0.0F;
         for (uint32_t i = 0; i < batch->count; i++) {
             peak = r_fmax(peak, r_fabs(batch->y[axis][i]));
@@ -134,17 +144,17 @@ void selfcal_kernel_load(selfcal_t *self) {
         int bits = scale->most_sum >= FULL ? 1 : 0;
         while (to_fixed(peak, -scale->exponent - bits) > LIMIT) {
             if (++bits == MOST_COARSER) {
-                rescale(self, axis, bits);
+                rescale_axis(self, axis, bits);
                 bits = 0;
             }
         }
         if (bits > 0) {
-            rescale(self, axis, bits);
+            rescale_axis(self, axis, bits);
         } else if (peak > 0.0F && to_fixed(peak, -scale->exponent) < FEW_STEPS && may_be_finer(self, axis)) {
-            rescale(self, axis, -FINER_BITS);
+            rescale_axis(self, axis, -FINER_BITS);
         }
         for (uint32_t i = 0; i < batch->count; i++) {
-            self->y_fixed[axis][i] = to_fixed(batch->y[axis][i], -scale->exponent);
+            self->integers.y[axis][i] = to_fixed(batch->y[axis][i], -scale->exponent);
         }
         const int32_t most = to_fixed(peak, -scale->exponent);
         scale->most_y = most > scale->most_y ? most : scale->most_y;
@@ -155,7 +165,7 @@ void selfcal_kernel_load(selfcal_t *self) {
 static inline void add_sums(selfcal_t *self, size_t k, size_t axis, int64_t b, int64_t c) {
     self->b[k] += b;
     self->c[k] += c;
-    selfcal_scale_t *scale = &self->scale[axis];
+    selfcal_scale_t *scale = &self->integers.scale[axis];
     const int32_t most_b = high(self->b[k]), most_c = (int32_t)(self->c[k] >> 32);
     if (most_b > scale->most_sum) {
         scale->most_sum = most_b;
@@ -180,9 +190,9 @@ static float greatest(const float v[SELFCAL_BATCH], span_t span) {
     return most;
 }
 
-/* 32-bit products, in 64 bits; x is rounded to nearest, and so are the span's sums. Per sample g, u/s, 1/s and beta with mantissas
- * below 2^30. One shift a span for g and beta and one for u/s; 1/s has its own, since it grows a millionfold in the first samples of
- * some nodes:
+/* 32-bit products, in 64 bits; x is rounded to nearest, and so are the span's sums. Per sample g, u/s, 1/s and beta
+ * with mantissas below 2^30. One shift a span for g and beta and one for u/s; 1/s has its own, since it grows a
+ * millionfold in the first samples of some nodes:
  *   g nu - beta y   < 2^59
  *   sum u/s nu      < 16 * 2^30 * 2^28 = 2^62
  *   sum (nu/s) nu   < 16 * 2^29 * 2^28 = 2^61, nu/s rounded to its 29th bit
@@ -214,7 +224,7 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
         int32_t x = self->x[k];
         int64_t b = 0, c = 0;
         for (uint32_t i = span.from; i < span.to; i++) {
-            const int32_t y = self->y_fixed[axis][i];
+            const int32_t y = self->integers.y[axis][i];
             const int32_t nu = y - x;
             b += (int64_t)u[i] * nu;
             const int32_t weighted = (int32_t)(((int64_t)w[i] * nu + (1L << 28)) >> 29);
@@ -226,12 +236,13 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     }
 }
 
-/* --------------------------------------------------------------------------------------------------------- level nodes */
+/* --------------------------------------------------------------------------------------------------------- level
+ * nodes */
 
 /* Predicting nu needs one product a sample and node:
  *   nu_i = d_i + nu_(i-1) - g nu_(i-1),   d_i = y_i - y_(i-1) + beta y_(i-1),
- * where d is common to the nodes of one pole: hence their order. It starts from -x with d_0 = y_0, and d_count = y - beta y of the
- * last gives x = d_count - (nu - g nu). |d| < 3 LIMIT < 2^29. */
+ * where d is common to the nodes of one pole: hence their order. It starts from -x with d_0 = y_0, and d_count = y -
+ * beta y of the last gives x = d_count - (nu - g nu). |d| < 3 LIMIT < 2^29. */
 size_t kernel_node(const selfcal_t *self, size_t i) {
     const node_of_t node = node_of(self->model, i);
     const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[node.hypothesis];
@@ -243,70 +254,22 @@ size_t kernel_node(const selfcal_t *self, size_t i) {
     return i - node.index + row * grid_nodes(hypothesis->alpha) + column;
 }
 
-/* What a span adds: the sum of nu in 2^SUM_BITS steps, the sum of nu^2 in 2^16 steps^2. */
+/* What a span adds: the sum of nu in steps, the sum of nu^2 in 2^16 steps^2. */
 typedef struct {
     int64_t b;
     uint64_t c;
 } level_sums_t;
 
-#if SELFCAL_FIXED == 16
-
-/* A number of steps, |v| < 2^28: v = 2^14 hi + 4 lo + (0 to 3), |hi| < 2^14, 0 <= lo < 2^12. */
-#define HI(v) ((v) >> 14)
-#define LO(v) ((int32_t)((uint32_t)(v) << 18 >> 20))
-
-/* Bits of g and beta: 2^16 to 2^17, hence 4e-6 of them. */
-#define GAIN_BITS 17
-
-/* mantissa 2^-(shift + 14) v for shift 1 to 31: products below 2^31 and 2^29, rounded; what falls off v first is 1.5 steps
- * of nu on the average, the same for all. */
-static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
-    return (mantissa * HI(v) + (mantissa * LO(v) >> 12) + (int32_t)(1U << (shift - 1U))) >> shift;
-}
-
-#define SUM_BITS 2
-
-/* g nu is rounded down here; that leaves half a step too much in nu, which every second d makes up for. */
-#define FLOORED true
-
-/* 16-bit products, in 32 bits; nu^2 is summed over nu rounded down to 4 steps. Sums over up to 16 samples of
- *   nu/4 2^30, hi^2 < 16 * (2^27.6 / 2^14)^2 < 2^32, |hi lo| < 2^30, lo^2 2^28;
- *   nu/4 = 2^12 hi + lo, (nu/4)^2 = 2^24 hi^2 + 2^13 hi lo + lo^2: nothing is rounded. */
-static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
-    const int32_t g = node->gains.settled.g;
-    const uint32_t shift = node->g_shift;
-    const int32_t *const end = d + count;
-    int32_t v = -*x, sum = 0, cross = 0;
-    uint32_t square = 0, square_lo = 0;
-    do {
-        v += *d++;
-        sum += v >> 2;
-        const int32_t hi = HI(v), lo = LO(v);
-        square += (uint32_t)(hi * hi);
-        cross += hi * lo;
-        square_lo += (uint32_t)(lo * lo);
-        v -= (g * hi + (g * lo >> 12)) >> shift;
-    } while (d < end);
-    *x = *end - v;
-    const int32_t rest = 2 * cross + (int32_t)((square_lo + 0x800U) >> 12);
-    const level_sums_t sums = {sum, ((uint64_t)square << 12) + (uint64_t)(int64_t)rest};
-    return sums;
-}
-
-#else
-
 #define GAIN_BITS 30
-#define FLOORED false
-#define SUM_BITS 0
 
 /* mantissa 2^-(shift + 14) v, rounded; the product is below 2^58. */
 static inline int32_t part_of(int32_t mantissa, uint32_t shift, int32_t v) {
     return (int32_t)(((int64_t)mantissa * v + ((int64_t)1 << (shift + 13U))) >> (shift + 14U));
 }
 
-/* 32-bit products, in 64 bits; g nu is rounded to nearest. Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits 2^62),
- * nu^2 < 2^60. */
-static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
+/* 32-bit products, in 64 bits; g nu is rounded to nearest. Sums over up to 16 samples: nu 2^32 (times u/s with 30 bits
+ * 2^62), nu^2 < 2^60. */
+static level_sums_t run_level_axis(const selfcal_node_t *node, const int32_t *d, uint32_t count, int32_t *x) {
     const int32_t g = node->gains.settled.g;
     const uint32_t shift = node->g_shift;
     const int32_t *const end = d + count;
@@ -323,18 +286,13 @@ static level_sums_t run_level(const selfcal_node_t *node, const int32_t *d, uint
     return sums;
 }
 
-#endif
-
 static uint32_t gain_shift(float gain) {
     const int shift = mantissa_shift(gain, GAIN_BITS) - 14;
     return shift < 31 ? (uint32_t)shift : 31U;
 }
 
-void selfcal_kernel_settle(selfcal_t *self, size_t j) {
-    selfcal_kernel_mantissas(&self->node[j]);
-}
-
-void selfcal_kernel_mantissas(selfcal_node_t *node) {
+/* g, u/s and 1/s of a level node, in place of how they moved. */
+static void set_mantissas(selfcal_node_t *node) {
     const selfcal_sum_t inv_s = steady_inv_s(node);
     const selfcal_real_t g = steady_g(node), u = inv_s.hi * node->u_inf;
     const selfcal_real_t u_lo = r_fma_exact(inv_s.hi, node->u_inf, -u) + inv_s.lo * node->u_inf;
@@ -342,59 +300,40 @@ void selfcal_kernel_mantissas(selfcal_node_t *node) {
     node->gains.settled.g = to_fixed(g, node->g_shift + 14);
     const int u_shift = mantissa_shift(u, 30);
     node->gains.settled.u = to_fixed(u, u_shift) + to_fixed(u_lo, u_shift);
-    node->u_shift = (uint8_t)(u_shift - SUM_BITS - 6 - b_bits(node));
+    node->u_shift = (uint8_t)(u_shift - 6 - b_bits(node));
     node->w_shift = (uint8_t)mantissa_shift(inv_s.hi, 30);
     node->gains.settled.w = to_fixed(inv_s.hi, node->w_shift) + to_fixed(inv_s.lo, node->w_shift);
+}
+
+void selfcal_kernel_settle(selfcal_t *self, size_t j) {
+    set_mantissas(&self->node[j]);
 }
 
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j) {
     self->node[j].gains.moving = moving_of(&self->node[j]);
 }
 
-/* `floored`: the nodes round g nu down. */
-static void make_steps(selfcal_t *self, span_t span, float beta, bool floored) {
-    if (self->step_from == span.from && self->step_to == span.to && self->step_beta == beta && self->step_floored == floored) {
+static void make_steps(selfcal_t *self, span_t span, float beta) {
+    if (self->integers.step_from == span.from && self->integers.step_to == span.to &&
+        self->integers.step_beta == beta) {
         return;
     }
-    self->step_from = span.from;
-    self->step_to = span.to;
-    self->step_beta = beta;
-    self->step_floored = floored;
+    self->integers.step_from = span.from;
+    self->integers.step_to = span.to;
+    self->integers.step_beta = beta;
     const uint32_t shift = gain_shift(beta);
     const int32_t mantissa = to_fixed(beta, (int)shift + 14);
     const uint32_t count = span.to - span.from;
     for (size_t axis = 0; axis < self->model->axes; axis++) {
-        const int32_t *y = &self->y_fixed[axis][span.from];
-        int32_t *d = self->step[axis];
+        const int32_t *y = &self->integers.y[axis][span.from];
+        int32_t *d = self->integers.step[axis];
         int32_t held = 0; /* phi y of the sample before */
         for (uint32_t i = 0; i < count; i++) {
-            d[i] = y[i] - held - (floored ? (int32_t)(i & 1U) : 0);
+            d[i] = y[i] - held;
             held = y[i] - part_of(mantissa, shift, y[i]);
         }
         d[count] = held;
     }
-}
-
-bool selfcal_kernel_steps_sound(const selfcal_t *self) {
-    if (self->step_from > self->step_to || self->step_to > SELFCAL_BATCH || !(self->step_beta >= 0.0F) || !(self->step_beta < 1.0F)) {
-        return false;
-    }
-    const uint32_t shift = gain_shift(self->step_beta), count = self->step_to - self->step_from;
-    const int32_t mantissa = to_fixed(self->step_beta, (int)shift + 14);
-    for (size_t axis = 0; axis < self->model->axes && count > 0U; axis++) {
-        const int32_t *y = &self->y_fixed[axis][self->step_from], *d = self->step[axis];
-        int32_t held = 0;
-        for (uint32_t i = 0; i < count; i++) {
-            if (d[i] != y[i] - held - (self->step_floored ? (int32_t)(i & 1U) : 0)) {
-                return false;
-            }
-            held = y[i] - part_of(mantissa, shift, y[i]);
-        }
-        if (d[count] != held) {
-            return false;
-        }
-    }
-    return true;
 }
 
 /* w (mantissa 2^-shift) times c, c < 2^44: in two parts where it does not fit 32 bits, each product below 2^62. */
@@ -411,7 +350,7 @@ static void level_node(selfcal_t *self, size_t j, uint32_t count) {
     const size_t axes = self->model->axes;
     for (size_t axis = 0; axis < axes; axis++) {
         const size_t k = j * axes + axis;
-        const level_sums_t sums = run_level(node, self->step[axis], count, &self->x[k]);
+        const level_sums_t sums = run_level_axis(node, self->integers.step[axis], count, &self->x[k]);
         const int64_t b = node->gains.settled.u != 0 ? scaled(sums.b * node->gains.settled.u, node->u_shift) : 0;
         add_sums(self, k, axis, b, weigh(sums.c, (uint32_t)node->gains.settled.w, node->w_shift));
     }
@@ -422,13 +361,14 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) 
         const size_t j = kernel_node(self, i);
         const selfcal_node_t *node = &self->node[j];
         if (node->level) {
-            make_steps(self, span, node->beta, FLOORED && node->gains.settled.g != 0);
+            make_steps(self, span, node->beta);
             level_node(self, j, span.to - span.from);
         }
     }
 }
 
-/* ----------------------------------------------------------------------------------------------------------- the rest */
+/* ----------------------------------------------------------------------------------------------------------- the
+ * rest */
 
 static selfcal_total_t faded(selfcal_total_t sum, selfcal_wide_t keep) {
     return (selfcal_total_t)(keep * (selfcal_wide_t)sum + (sum < 0 ? -0.5 : 0.5));
@@ -439,6 +379,10 @@ void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfc
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
         self->b[k] = faded(self->b[k], keep_b);
         self->c[k] = faded(self->c[k], keep_c);
+        if (self->columns != NULL) {
+            sum_fade(&self->columns->reading[k].b, keep_b);
+            sum_fade(&self->columns->reading[k].c, keep_c);
+        }
     }
 }
 
@@ -451,10 +395,119 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
 }
 
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
-    const int exponent = self->scale[k % self->model->axes].exponent;
+    if (self->columns != NULL) {
+        const selfcal_reading_t *reading = &self->columns->reading[k];
+        *b = sum_value(reading->b);
+        *c = sum_value(reading->c);
+        *x = sum_value(reading->x);
+        return;
+    }
+    const int exponent = self->integers.scale[k % self->model->axes].exponent;
     *b = ldexp((selfcal_wide_t)self->b[k], exponent - 6 - b_bits(&self->node[k / self->model->axes]));
     *c = ldexp((selfcal_wide_t)self->c[k], 2 * exponent + 16);
     *x = ldexp((selfcal_wide_t)self->x[k], exponent);
 }
 
+reading_sums_t selfcal_kernel_reading(const selfcal_t *self, size_t at) {
+    const reading_sums_t sums = {&self->columns->reading[at].b, &self->columns->reading[at].c};
+    return sums;
+}
+
+selfcal_sum_t selfcal_kernel_reading_drift(const selfcal_t *self, size_t at) {
+    return self->columns->reading[at].x;
+}
+
+void selfcal_kernel_set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->columns->reading[at].x = x;
+}
+
+reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
+    (void)j;
+    selfcal_sum_t *bc = &self->terms->bc[(index * self->model->axes + axis) * SELFCAL_STATE_SUMS];
+    const reading_sums_t sums = {bc, bc + 1};
+    return sums;
+}
+
+/* ---------------------------------------------------------------------------------------------------------
+ * invariants */
+
+#define MOST_SUM ((int64_t)1 << 62)
+#define MOST_X (LIMIT + (1L << 24))
+
+bool selfcal_kernel_readings_sound(const selfcal_t *self) {
+    const size_t cells = (size_t)self->model->nodes * self->model->axes;
+    for (size_t k = 0; k < cells; k++) {
+        const selfcal_reading_t *reading = &self->columns->reading[k];
+        if (!finite_sum(reading->b) || !finite_sum(reading->c) || !finite_sum(reading->x) ||
+            !(reading->c.hi >= R(0.0))) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* Whether the steps of the span that they were made for are those of its readings. */
+static bool steps_are_sound(const selfcal_t *self) {
+    if (self->integers.step_from > self->integers.step_to || self->integers.step_to > SELFCAL_BATCH ||
+        !(self->integers.step_beta >= 0.0F) || !(self->integers.step_beta < 1.0F)) {
+        return false;
+    }
+    const uint32_t shift = gain_shift(self->integers.step_beta),
+        count = self->integers.step_to - self->integers.step_from;
+    const int32_t mantissa = to_fixed(self->integers.step_beta, (int)shift + 14);
+    for (size_t axis = 0; axis < self->model->axes && count > 0U; axis++) {
+        const int32_t *y = &self->integers.y[axis][self->integers.step_from], *d = self->integers.step[axis];
+        int32_t held = 0;
+        for (uint32_t i = 0; i < count; i++) {
+            if (d[i] != y[i] - held) {
+                return false;
+            }
+            held = y[i] - part_of(mantissa, shift, y[i]);
+        }
+        if (d[count] != held) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool selfcal_kernel_sound(const selfcal_t *self) {
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        const selfcal_scale_t *scale = &self->integers.scale[axis];
+        if (scale->exponent < -200 || scale->exponent > 200 || scale->most_y < 0 || scale->most_sum < 0) {
+            return false;
+        }
+        for (uint32_t i = 0; i < SELFCAL_BATCH; i++) {
+            if (self->integers.y[axis][i] > LIMIT || self->integers.y[axis][i] < -LIMIT) {
+                return false;
+            }
+        }
+    }
+    return steps_are_sound(self);
+}
+
+/* A level node's numbers follow from its gains. */
+bool selfcal_kernel_node_sound(const selfcal_t *self, size_t j) {
+    const selfcal_node_t *node = &self->node[j];
+    if (node->level) {
+        selfcal_node_t settled = *node;
+        set_mantissas(&settled);
+        if (settled.gains.settled.g != node->gains.settled.g || settled.gains.settled.u != node->gains.settled.u ||
+            settled.gains.settled.w != node->gains.settled.w || settled.g_shift != node->g_shift ||
+            settled.u_shift != node->u_shift || settled.w_shift != node->w_shift) {
+            return false;
+        }
+    }
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        if (self->b[k] > MOST_SUM || self->b[k] < -MOST_SUM || self->c[k] < 0 || self->c[k] > MOST_SUM ||
+            self->x[k] > MOST_X || self->x[k] < -MOST_X) {
+            return false;
+        }
+    }
+    return true;
+}
+
+#else
+typedef int selfcal_no_fixed_kernel_t; /* C99 wants a declaration in every file */
 #endif

@@ -1,20 +1,20 @@
 /* Regressors beside the constant, and the normal equations of a node.
  *
  * A reading is y_i = x0 + c' z_i + x_i + v_i with known columns z (time, temperature, a step, ...) and coefficients
- * c ~ N(0, diag(sd^2)). As the constant does, every column goes through the node's zero-bias filter; with u = (u_0, u_1, ...) the
- * innovations of "1" and of the columns, the sums A = sum u u'/s, B = sum u nu/s and C = sum nu^2/s give the likelihood of every
- * subset of columns (generalised least squares; de Jong, Biometrika 78 (1991) 143-151). A belongs to the node, B to a node and
- * an axis. Columns are taken about their first bank sample, as the readings are.
+ * c ~ N(0, diag(sd^2)). As the constant does, every column goes through the node's zero-bias filter; with u = (u_0,
+ * u_1, ...) the innovations of "1" and of the columns, the sums A = sum u u'/s, B = sum u nu/s and C = sum nu^2/s give
+ * the likelihood of every subset of columns (generalised least squares; de Jong, Biometrika 78 (1991) 143-151). A
+ * belongs to the node, B to a node and an axis. Columns are taken about their first bank sample, as the readings are.
  *
- * What a regressor explains may be a thousand times the noise, and C - B'A^-1 B is what is left of it: all columns, "1" among them,
- * and the readings must go through one and the same linear filter. Its gains may be rounded, for they are the same for all; the
- * states carry twice the digits of selfcal_real_t, and so do the sums.
+ * What a regressor explains may be a thousand times the noise, and C - B'A^-1 B is what is left of it: all columns, "1"
+ * among them, and the readings must go through one and the same linear filter. Its gains may be rounded, for they are
+ * the same for all; the states carry twice the digits of selfcal_real_t, and so do the sums.
  *
  * All of it lies behind SELFCAL_SIZE() in the caller's memory; a model without regressors has none. */
-#include "kernel.h"
+#include "bank.h"
 
-/* A pivot below this part of its diagonal: the column is one of the others in all that was seen (or was constant). Nothing is lost
- * by taking it so: what the estimate then leaves is carried along (`rest`). */
+/* A pivot below this part of its diagonal: the column is one of the others in all that was seen (or was constant).
+ * Nothing is lost by taking it so: what the estimate then leaves is carried along (`rest`). */
 #define COLLINEAR 1e-9
 
 static size_t columns_of(const selfcal_t *self) {
@@ -43,7 +43,7 @@ static bool valid_regressors(const selfcal_model_t *model) {
 }
 
 /* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
-static void init(selfcal_t *self, unsigned char *memory) {
+static void init_columns(selfcal_t *self, unsigned char *memory) {
     const size_t p = columns_of(self), nodes = self->model->nodes, axes = self->model->axes;
     memory += (8U - ((uintptr_t)memory & 7U)) & 7U;
     self->columns = (selfcal_columns_t *)(void *)memory;
@@ -51,52 +51,10 @@ static void init(selfcal_t *self, unsigned char *memory) {
     self->columns->a = (selfcal_sum_t *)(void *)(self->columns->column + p);
     self->columns->b = self->columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U);
     self->columns->x = self->columns->b + nodes * axes * p;
-#ifdef SELFCAL_FIXED
-    self->columns->reading = self->columns->x + nodes * (p + 1U);
-#else
-    self->columns->low = (selfcal_real_t *)(void *)(self->columns->x + nodes * (p + 1U));
-#endif
+    self->columns->reading = (selfcal_reading_t *)(void *)(self->columns->x + nodes * (p + 1U));
 }
 
-/* What a node keeps of the readings of an axis, `at` = node * axes + axis: sums B of "1" and C, and the predicted drift. */
-#ifdef SELFCAL_FIXED
-static reading_sums_t reading_sums(const selfcal_t *self, size_t at) {
-    const reading_sums_t sums = {&self->columns->reading[3U * at], &self->columns->reading[3U * at + 1U]};
-    return sums;
-}
-
-static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
-    return self->columns->reading[3U * at + 2U];
-}
-
-static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
-    self->columns->reading[3U * at + 2U] = x;
-}
-
-static void view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
-    const reading_sums_t sums = reading_sums(self, k);
-    *b = sum_value(*sums.b);
-    *c = sum_value(*sums.c);
-    *x = sum_value(reading_drift(self, k));
-}
-#else
-static reading_sums_t reading_sums(const selfcal_t *self, size_t at) {
-    const reading_sums_t sums = {&self->b[at], &self->c[at]};
-    return sums;
-}
-
-static selfcal_sum_t reading_drift(const selfcal_t *self, size_t at) {
-    const selfcal_sum_t x = {self->x[at], self->columns->low[at]};
-    return x;
-}
-
-static void set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
-    self->x[at] = x.hi;
-    self->columns->low[at] = x.lo;
-}
-#endif
-
-static bool sound(const selfcal_t *self) {
+static bool columns_sound(const selfcal_t *self) {
     const size_t p = columns_of(self), nodes = self->model->nodes, cells = nodes * self->model->axes;
     const selfcal_columns_t *columns = self->columns;
     const selfcal_sum_t *end = columns->x + nodes * (p + 1U);
@@ -104,26 +62,9 @@ static bool sound(const selfcal_t *self) {
         columns->b != columns->a + nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) || columns->x != columns->b + cells * p) {
         return false;
     }
-#ifdef SELFCAL_FIXED
-    if (columns->reading != end) {
+    if (columns->reading != (const void *)end || !selfcal_kernel_readings_sound(self)) {
         return false;
     }
-    end += 3U * cells;
-    for (size_t k = 0; k < cells; k++) {
-        if (!(reading_sums(self, k).c->hi >= R(0.0))) {
-            return false;
-        }
-    }
-#else
-    if (columns->low != (const void *)end) {
-        return false;
-    }
-    for (size_t k = 0; k < cells; k++) {
-        if (!isfinite(columns->low[k])) {
-            return false;
-        }
-    }
-#endif
     for (const selfcal_sum_t *sum = columns->a; sum < end; sum++) {
         if (!finite_sum(*sum)) {
             return false;
@@ -131,7 +72,8 @@ static bool sound(const selfcal_t *self) {
     }
     for (size_t k = 0; k < p; k++) {
         const selfcal_column_t *column = &columns->column[k];
-        if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) || !isfinite(column->offset) ||
+        if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) ||
+            !isfinite(column->offset) ||
             !isfinite(column->sum)) {
             return false;
         }
@@ -139,9 +81,9 @@ static bool sound(const selfcal_t *self) {
     return true;
 }
 
-static bool usable(selfcal_t *self, const float values[]) {
+static bool usable_values(selfcal_t *self, const float values[]) {
     for (size_t k = 0; k < columns_of(self); k++) {
-        if (!(fabsf(values[k]) < SELFCAL_SAMPLE_MAX)) { /* the bound of averager.c holds for A as well */
+        if (!(fabsf(values[k]) < SELFCAL_SAMPLE_MAX)) { /* the bound of intake.c holds for A as well */
             self->counters.regressor_not_finite++;
             return false;
         }
@@ -149,7 +91,7 @@ static bool usable(selfcal_t *self, const float values[]) {
     return true;
 }
 
-static void add(selfcal_t *self, const float values[]) {
+static void add_values(selfcal_t *self, const float values[]) {
     for (size_t k = 0; k < columns_of(self); k++) {
         selfcal_column_t *column = &self->columns->column[k];
         if (self->used == 0U) {
@@ -160,7 +102,7 @@ static void add(selfcal_t *self, const float values[]) {
     }
 }
 
-static void close_block(selfcal_t *self) {
+static void close_columns(selfcal_t *self) {
     const bool first = selfcal_count(self) == 0U;
     for (size_t k = 0; k < columns_of(self); k++) {
         selfcal_column_t *column = &self->columns->column[k];
@@ -174,7 +116,7 @@ static void close_block(selfcal_t *self) {
     }
 }
 
-static void hand_over(selfcal_t *self) {
+static void hand_over_columns(selfcal_t *self) {
     const uint8_t handed_over = (uint8_t)(1U - self->gathering);
     const uint32_t count = waiting(self)->count;
     for (size_t k = 0; k < columns_of(self) && count > 0U; k++) {
@@ -182,24 +124,10 @@ static void hand_over(selfcal_t *self) {
     }
 }
 
-void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innovations_t *one, const innovations_t *other) {
-    selfcal_sum_t value = {R(0.0), R(0.0)};
-    const uint32_t count = gains->span.to - gains->span.from;
-    for (uint32_t i = 0; i < count; i++) {
-        const selfcal_real_t product = one->weighted[i] * other->nu[i];
-        const selfcal_sum_t total = two_sum(value.hi, product);
-        value.hi = total.hi;
-        value.lo += r_fma_exact(one->low[i], other->nu[i], r_fma_exact(one->weighted[i], other->nu[i], -product)) + total.lo;
-    }
-    const selfcal_sum_t scale = gains->scale;
-    const selfcal_real_t product = scale.hi * value.hi;
-    const selfcal_real_t rest = r_fma_exact(scale.hi, value.lo, r_fma_exact(scale.lo, value.hi, r_fma_exact(scale.hi, value.hi, -product)));
-    sum_add(sum, product, rest);
-}
-
-/* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What is rounded
- * off each step is a part of its change, and the change is small where the filter is slow. */
-static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y, selfcal_sum_t x,
+/* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What
+ * is rounded off each step is a part of its change, and the change is small where the filter is slow. */
+static selfcal_sum_t filter_column(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y,
+                            selfcal_sum_t x,
                             innovations_t *out) {
     const selfcal_real_t minus_beta = -self->node[j].beta;
     const uint32_t from = gains->span.from, count = gains->span.to - gains->span.from;
@@ -215,20 +143,23 @@ static selfcal_sum_t filter(const selfcal_t *self, size_t j, const gains_t *gain
 }
 
 /* What selfcal_kernel_run() does for a model without regressors. */
-static void run(selfcal_t *self, size_t j, const gains_t *gains) {
+static void run_columns(selfcal_t *self, size_t j, const gains_t *gains) {
     const size_t p = columns_of(self), axes = self->model->axes;
     innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
     selfcal_sum_t *a = &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)];
     for (size_t k = 0; k <= p; k++) {
         selfcal_sum_t *x = &self->columns->x[j * (p + 1U) + k];
-        *x = filter(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x, &column[k]);
+        *x = filter_column(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x,
+                    &column[k]);
         for (size_t l = 0; l <= k; l++) {
             selfcal_add_products(a++, gains, &column[l], &column[k]);
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
-        const reading_sums_t sums = reading_sums(self, at);
-        set_reading_drift(self, at, filter(self, j, gains, waiting(self)->y[at - j * axes], reading_drift(self, at), &reading));
+        const reading_sums_t sums = selfcal_kernel_reading(self, at);
+        selfcal_kernel_set_reading_drift(self, at,
+                                         filter_column(self, j, gains, waiting(self)->y[at - j * axes],
+                                                selfcal_kernel_reading_drift(self, at), &reading));
         selfcal_add_products(sums.c, gains, &reading, &reading);
         selfcal_add_products(sums.b, gains, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
@@ -237,29 +168,32 @@ static void run(selfcal_t *self, size_t j, const gains_t *gains) {
     }
 }
 
-static void gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
+static void gap_columns(selfcal_t *self, size_t j, selfcal_wide_t less) {
     const size_t rows = columns_of(self) + 1U, axes = self->model->axes;
     for (size_t k = j * rows; k < (j + 1U) * rows; k++) {
         self->columns->x[k] = make_sum(sum_value(self->columns->x[k]) * (1.0 - less));
     }
     for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
-        set_reading_drift(self, k, make_sum(sum_value(reading_drift(self, k)) * (1.0 - less)));
+        selfcal_kernel_set_reading_drift(self, k,
+                                         make_sum(sum_value(selfcal_kernel_reading_drift(self, k)) * (1.0 - less)));
     }
 }
 
-/* -------------------------------------------------------------------------------------------------- normal equations */
+/* -------------------------------------------------------------------------------------------------- normal
+ * equations */
 
 #define UNKNOWNS_MAX (1 + SELFCAL_REGRESSORS_MAX)
 
-/* Least squares at one node, relative to sigma_v, over the level (x0 at the first sample of every regressor, less the offset) and
- * the coefficients of a subset of the regressors. Matrices are symmetric, the lower half is held. */
+/* Least squares at one node, relative to sigma_v, over the level (x0 at the first sample of every regressor, less the
+ * offset) and the coefficients of a subset of the regressors. Matrices are symmetric, the lower half is held. */
 typedef struct {
     selfcal_node_view_t node;
     uint8_t order;                   /* unknowns: the level and the coefficients */
     uint8_t regressor[UNKNOWNS_MAX]; /* of each, from 1 on */
     selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], b[UNKNOWNS_MAX]; /* sums A and B */
     selfcal_wide_t sd[UNKNOWNS_MAX];       /* of the priors of x0 and of the coefficients */
-    selfcal_wide_t first[UNKNOWNS_MAX];    /* offset from the prior; first values of the regressors less their references */
+    /* offset from the prior; first values of the regressors less their references */
+    selfcal_wide_t first[UNKNOWNS_MAX];
     selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
     selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
     selfcal_wide_t lost[UNKNOWNS_MAX][SELFCAL_TERMS_MAX]; /* what the drift, each term of it, takes of that */
@@ -273,16 +207,19 @@ typedef struct {
  *   -2 ln p(Y | node, sigma_v) = n ln(2 pi sigma_v^2) + D + residual / sigma_v^2 + ln_det + miss. */
 typedef struct {
     selfcal_wide_t ln_det;   /* ln det(1 + P0 A / sigma_v^2), P0 the covariance of all priors */
-    selfcal_wide_t miss;     /* square of what the estimate misses the priors' mean by, over the sum of their covariances */
-    selfcal_wide_t share;    /* of samples that went into the unknowns: tr U, U = (A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2, 0 to order */
+    /* square of what the estimate misses the priors' mean by, over the sum of their covariances */
+    selfcal_wide_t miss;
+    /* of samples that went into the unknowns: tr U, U = (A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2, 0 to order */
+    selfcal_wide_t share;
     selfcal_wide_t noise;    /* part of `miss` that goes as 1/sigma_v^2: what the priors leave unexplained */
-    selfcal_wide_t bent;     /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
+    /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
+    selfcal_wide_t bent;
     selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
     selfcal_now_t now;
 } fit_t;
 
-/* a = L D L' of the first `order` rows; D on the diagonal, L (unit) below it. A pivot at or below `least` of its diagonal becomes 0:
- * solve() leaves that unknown at 0. */
+/* a = L D L' of the first `order` rows; D on the diagonal, L (unit) below it. A pivot at or below `least` of its
+ * diagonal becomes 0: solve() leaves that unknown at 0. */
 static void factorise(selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], uint8_t order, selfcal_wide_t least) {
     for (uint8_t i = 0; i < order; i++) {
         const selfcal_wide_t diagonal = a[i][i];
@@ -340,13 +277,11 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->first[0] = selfcal_bank_from_prior(self, axis);
     const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;
-#if SELFCAL_TERMS_MAX > 1
-    const bool sum = selfcal_is_term_node(&self->node[index]);
-    if (sum) {
-        selfcal_terms_drift(self, index, 0, normal->lost[0]);
-        selfcal_terms_drift(self, index, selfcal_terms_series(self, axis), normal->drift);
+    const selfcal_states_code_t *states = is_state_node(self, &self->node[index]) ? self->model->states : NULL;
+    if (states != NULL) {
+        states->drift(self, index, 0, normal->lost[0]);
+        states->drift(self, index, series_of_readings(self, axis), normal->drift);
     }
-#endif
     const selfcal_sum_t *a = p > 0U ? &self->columns->a[index * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;
     if (p > 0U) {
         normal->a[0][0] = sum_value(a[0]); /* the same as node.a, to more digits */
@@ -366,13 +301,13 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
         normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
-        normal->left[row] = normal->last[row] - normal->lost[row][0];
-#if SELFCAL_TERMS_MAX > 1
-        if (sum) {
-            selfcal_terms_drift(self, index, k + 1U, normal->lost[row]);
-            normal->left[row] = normal->last[row] - normal->lost[row][0] - normal->lost[row][1] - normal->lost[row][2];
+        if (states != NULL) {
+            states->drift(self, index, k + 1U, normal->lost[row]);
         }
-#endif
+        normal->left[row] = normal->last[row];
+        for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+            normal->left[row] -= normal->lost[row][t];
+        }
         normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
         normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
                              (selfcal_wide_t)self->model->regressors->reference[k];
@@ -392,9 +327,44 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     }
 }
 
-/* Least squares about `estimate`, with the square completed: the residual does not feel the priors, what they pull at is the sum of
- * two squares (and of what `rest` is worth, where columns could not be told apart). Unknowns inside: c, and the level x0 + c' first - offset of the readings about their first samples, so that the
- * prior is (level + offset - c' first)^2 / P0 + sum c^2 / sd^2. */
+/* Sums over the columns of G^-1, from its factors. */
+static void inverse_sums(const normal_t *normal, selfcal_wide_t variance, selfcal_wide_t g[UNKNOWNS_MAX][UNKNOWNS_MAX],
+                         const selfcal_wide_t pulled[], fit_t *fit) {
+    const uint8_t order = normal->order;
+    selfcal_wide_t taken[UNKNOWNS_MAX][UNKNOWNS_MAX];
+    memset(fit->now.own, 0, sizeof fit->now.own);
+    fit->share = fit->bent = 0.0;
+    for (uint8_t i = 0; i < order; i++) {
+        selfcal_wide_t column[UNKNOWNS_MAX] = {0.0};
+        column[i] = 1.0;
+        solve(g, order, column);
+        fit->var[i] = column[i];
+        for (uint8_t j = 0; j < order; j++) {
+            fit->now.own[0] += normal->left[i] * column[j] * normal->left[j] / variance;
+            for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+                fit->now.own[1 + t] += normal->left[i] * column[j] * normal->lost[j][t] / variance;
+                for (size_t u = 0; u <= t; u++) { /* all i and j: G^-1 is symmetric */
+                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] *
+                        normal->lost[j][u] / variance;
+                }
+            }
+            fit->bent += 2.0 * pulled[i] * column[j] * pulled[j];
+            taken[i][j] = 0.0;
+            for (uint8_t k = 0; k < order; k++) {
+                taken[i][j] += column[k] * (j <= k ? normal->a[k][j] : normal->a[j][k]) / variance;
+            }
+        }
+        fit->share += taken[i][i];
+        for (uint8_t j = 0; j <= i; j++) {
+            fit->bent += (j < i ? 2.0 : 1.0) * taken[i][j] * taken[j][i];
+        }
+    }
+}
+
+/* Least squares about `estimate`, with the square completed: the residual does not feel the priors, what they pull at
+ * is the sum of two squares (and of what `rest` is worth, where columns could not be told apart). Unknowns inside: c,
+ * and the level x0 + c' first - offset of the readings about their first samples, so that the prior is (level + offset
+ * - c' first)^2 / P0 + sum c^2 / sd^2. */
 static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit) {
     const uint8_t order = normal->order;
     const selfcal_wide_t p0 = normal->sd[0] * normal->sd[0];
@@ -430,7 +400,7 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
     fit->now.mean = normal->node.drift;
     memcpy(fit->now.drift, normal->drift, sizeof fit->now.drift);
     selfcal_wide_t x0_off = 0.0;
-    selfcal_wide_t pulled[UNKNOWNS_MAX], taken[UNKNOWNS_MAX][UNKNOWNS_MAX];
+    selfcal_wide_t pulled[UNKNOWNS_MAX];
     fit->noise = 0.0;
     for (uint8_t i = 0; i < order; i++) {
         pulled[i] = 0.0;
@@ -448,33 +418,7 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
         }
     }
     fit->miss += x0_off * x0_off / p0 + fit->noise;
-    /* Columns of G^-1. */
-    memset(fit->now.own, 0, sizeof fit->now.own);
-    fit->share = fit->bent = 0.0;
-    for (uint8_t i = 0; i < order; i++) {
-        selfcal_wide_t column[UNKNOWNS_MAX] = {0.0};
-        column[i] = 1.0;
-        solve(g, order, column);
-        fit->var[i] = column[i];
-        for (uint8_t j = 0; j < order; j++) {
-            fit->now.own[0] += normal->left[i] * column[j] * normal->left[j] / variance;
-            for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
-                fit->now.own[1 + t] += normal->left[i] * column[j] * normal->lost[j][t] / variance;
-                for (size_t u = 0; u <= t; u++) { /* all i and j: G^-1 is symmetric */
-                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] * normal->lost[j][u] / variance;
-                }
-            }
-            fit->bent += 2.0 * pulled[i] * column[j] * pulled[j];
-            taken[i][j] = 0.0;
-            for (uint8_t k = 0; k < order; k++) {
-                taken[i][j] += column[k] * (j <= k ? normal->a[k][j] : normal->a[j][k]) / variance;
-            }
-        }
-        fit->share += taken[i][i];
-        for (uint8_t j = 0; j <= i; j++) {
-            fit->bent += (j < i ? 2.0 : 1.0) * taken[i][j] * taken[j][i];
-        }
-    }
+    inverse_sums(normal, variance, g, pulled, fit);
 }
 
 selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, uint16_t node, uint8_t mask,
@@ -500,9 +444,15 @@ selfcal_status_t selfcal_log_likelihood_subset(selfcal_t *self, uint8_t axis, ui
     return SELFCAL_OK;
 }
 
+selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t node, selfcal_wide_t sigma_v,
+                                        selfcal_wide_t *ln_p) {
+    return selfcal_log_likelihood_subset(self, axis, node, 0U, sigma_v, ln_p);
+}
+
 /* ---------------------------------------------------------------------------------------------------------- report */
 
-static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t least, selfcal_field_t *result) {
+static void field_with_columns(const selfcal_work_t *work, uint16_t index, selfcal_wide_t least,
+                               selfcal_field_t *result) {
     const selfcal_wide_t n = work->bank->weight, beginning = work->bank->beginning;
     normal_t normal;
     fit_t fit;
@@ -510,7 +460,7 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t lea
     const selfcal_wide_t residual = fmax(normal.residual, least);
     selfcal_wide_t variance = residual / (n - (selfcal_wide_t)work->unknowns), before;
     unsigned turns = SELFCAL_MODE_TURNS;
-    do { /* as node_field() in posterior.c */
+    do { /* as node_field() in report_node.c */
         before = variance;
         make_fit(&normal, variance, &fit);
         variance = (residual + beginning * fit.noise * variance) / (n - beginning * fit.share);
@@ -522,8 +472,9 @@ static void field(const selfcal_work_t *work, uint16_t index, selfcal_wide_t lea
     result->share = (selfcal_real_t)(beginning * fit.bent);
 }
 
-/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own variances. */
-static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *result) {
+/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own
+ * variances. */
+static void now_with_columns(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *result) {
     normal_t normal;
     fit_t fit;
     make_normal(work->bank, work->axis, (uint16_t)(work->first_node + k), work->mask, &normal);
@@ -534,28 +485,28 @@ static void now(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance,
         const uint8_t r = normal.regressor[i];
         if (k == 0U) {
             of->mean[r] = (float)fit.mean[i];
-            of->first[r] = of->second[r] = of->own[r] = 0.0;
+            of->moment[0][r] = of->moment[1][r] = of->moment[2][r] = 0.0;
         }
         const selfcal_wide_t off = fit.mean[i] - (selfcal_wide_t)of->mean[r];
-        of->first[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
-        of->second[r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off * off;
-        of->own[r] += (selfcal_wide_t)work->scratch.grid.spline[1][k] * fit.var[i];
+        of->moment[0][r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+        of->moment[1][r] += (selfcal_wide_t)work->scratch.grid.spline[0][k] * off * off;
+        of->moment[2][r] += (selfcal_wide_t)work->scratch.grid.spline[1][k] * fit.var[i];
     }
 }
 
-static void finish(const selfcal_work_t *work) {
+static void finish_coefficients(const selfcal_work_t *work) {
     selfcal_coefficients_t *of = work->coefficients == NULL ? NULL : &work->coefficients[work->hypothesis];
     for (uint8_t r = 0; of != NULL && r < SELFCAL_REGRESSORS_MAX; r++) {
         if (((unsigned)work->mask >> r & 1U) != 0U) {
-            const selfcal_wide_t mean = of->first[r] / work->bias_weight;
-            const selfcal_wide_t scatter = of->second[r] / work->bias_weight - mean * mean;
-            of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->own[r] / work->mass_sq, 0.0));
+            const selfcal_wide_t mean = of->moment[0][r] / work->bias.weight;
+            const selfcal_wide_t scatter = of->moment[1][r] / work->bias.weight - mean * mean;
+            of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->moment[2][r] / work->sum.mass_sq, 0.0));
             of->mean[r] = (float)((selfcal_wide_t)of->mean[r] + mean);
         }
     }
 }
 
-static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one) {
+static void fade_columns(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t part_of_one) {
     const size_t p = columns_of(self), axes = self->model->axes;
     selfcal_sum_t *a = &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)];
     selfcal_wide_t of[1 + SELFCAL_REGRESSORS_MAX] = {part_of_one};
@@ -568,11 +519,6 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
         }
     }
     for (size_t at = j * axes; at < (j + 1U) * axes; at++) {
-#ifdef SELFCAL_FIXED
-        const reading_sums_t sums = reading_sums(self, at);
-        sum_fade(sums.b, part * part_of_one);
-        sum_fade(sums.c, self->keep);
-#endif
         for (size_t k = 0; k < p; k++) {
             sum_fade(&self->columns->b[at * p + k], part * of[k + 1U]);
         }
@@ -580,8 +526,7 @@ static void fade(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal_wide_t 
 }
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
-    valid_regressors, init, sound, usable, add, close_block, hand_over, run, gap, fade, field, now, finish,
-#ifdef SELFCAL_FIXED
-    view,
-#endif
+    valid_regressors, init_columns,      columns_sound, usable_values, add_values,         close_columns,
+    hand_over_columns, run_columns,       gap_columns,   fade_columns,  field_with_columns, now_with_columns,
+    finish_coefficients,
 };

@@ -1,6 +1,6 @@
-/* The kernel in selfcal_real_t: every axis of one node through a span. Sums of a span are short enough for selfcal_real_t; they
- * go into the long ones scaled in full. */
-#include "kernel.h"
+/* The kernel in selfcal_real_t: every axis of one node through a span. Sums of a span are short enough for
+ * selfcal_real_t; they go into the long ones scaled in full. */
+#include "bank.h"
 
 #ifndef SELFCAL_FIXED
 
@@ -25,7 +25,8 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     }
 }
 
-/* A level node's sums are held as plain sums of nu and nu^2: B over u/s, C over 1/s. Where u is 0 its B stays as it is. */
+/* A level node's sums are held as plain sums of nu and nu^2: B over u/s, C over 1/s. Where u is 0 its B stays as it
+ * is. */
 static selfcal_sum_t times(selfcal_sum_t sum, selfcal_sum_t factor) {
     selfcal_sum_t product = {R(0.0), R(0.0)};
     sum_add_scaled(&product, factor, sum.hi);
@@ -33,7 +34,7 @@ static selfcal_sum_t times(selfcal_sum_t sum, selfcal_sum_t factor) {
     return product;
 }
 
-static void rescale(selfcal_t *self, size_t j, bool level) {
+static void rescale_node(selfcal_t *self, size_t j, bool level) {
     const selfcal_node_t *node = &self->node[j];
     const selfcal_wide_t s = 1.0 + (selfcal_wide_t)node->p_inf, u = (selfcal_wide_t)node->u_inf;
     const selfcal_sum_t of_c = make_sum(level ? s : 1.0 / s);
@@ -46,15 +47,15 @@ static void rescale(selfcal_t *self, size_t j, bool level) {
 }
 
 void selfcal_kernel_settle(selfcal_t *self, size_t j) {
-    rescale(self, j, true);
+    rescale_node(self, j, true);
 }
 
 void selfcal_kernel_unsettle(selfcal_t *self, size_t j) {
-    rescale(self, j, false);
+    rescale_node(self, j, false);
 }
 
-/* Four samples: x goes on, sums of nu and nu^2 are added. By fours, which keeps the sums short: squares of lattice values would
- * round to one side (1e-7 of C, seen with 64 in a row). */
+/* Four samples: x goes on, sums of nu and nu^2 are added. By fours, which keeps the sums short: squares of lattice
+ * values would round to one side (1e-7 of C, seen with 64 in a row). */
 typedef struct {
     selfcal_real_t x, b, c;
 } track_t;
@@ -74,52 +75,8 @@ static inline track_t run_four(track_t t, const selfcal_real_t y[4], selfcal_rea
     return t;
 }
 
-#ifdef SELFCAL_KERNEL_M4F
-#if SELFCAL_BATCH != 16 || defined(SELFCAL_REAL_DOUBLE) || !defined(__ARM_FP)
-#error "SELFCAL_KERNEL_M4F is for a SELFCAL_BATCH of 16 in single precision"
-#endif
-
-/* run_level() of a whole batch, operation for operation and hence bit for bit: 111 instructions an axis. The batch of an axis is one
- * block load, and the pointers go on by themselves.
- * s0 x, s3 and s4 the sums of nu and nu^2, s16 to s31 the batch. */
-#define M4F_FOUR(y0, y1, y2, y3, b, c)                                                               \
-    "vsub.f32 s5, " y0 ", s0\n vfma.f32 s0, %[g], s5\n vfma.f32 s0, %[m], " y0 "\n vmul.f32 " c ", s5, s5\n"  \
-    "vsub.f32 s6, " y1 ", s0\n vfma.f32 s0, %[g], s6\n vfma.f32 s0, %[m], " y1 "\n vfma.f32 " c ", s6, s6\n"  \
-    "vadd.f32 s5, s5, s6\n"                                                                          \
-    "vsub.f32 s6, " y2 ", s0\n vfma.f32 s0, %[g], s6\n vfma.f32 s0, %[m], " y2 "\n vfma.f32 " c ", s6, s6\n"  \
-    "vsub.f32 s7, " y3 ", s0\n vfma.f32 s0, %[g], s7\n vfma.f32 s0, %[m], " y3 "\n vfma.f32 " c ", s7, s7\n"  \
-    "vadd.f32 s6, s6, s7\n vadd.f32 " b ", s5, s6\n"
-#define M4F_MORE(y0, y1, y2, y3) \
-    M4F_FOUR(y0, y1, y2, y3, "s8", "s9") "vadd.f32 s3, s3, s8\n vadd.f32 s4, s4, s9\n"
-/* sum_add_value() */
-#define M4F_ADD(sum, value)                                                                           \
-    "vldr s5, [" sum "]\n vldr s6, [" sum ", #4]\n vadd.f32 s7, s5, " value "\n vsub.f32 s8, s7, s5\n"       \
-    "vsub.f32 s9, s7, s8\n vsub.f32 s5, s5, s9\n vsub.f32 s8, " value ", s8\n vadd.f32 s5, s5, s8\n"         \
-    "vadd.f32 s5, s5, s6\n vadd.f32 s8, s7, s5\n vsub.f32 s7, s8, s7\n vsub.f32 s9, s5, s7\n"                \
-    "vstmia " sum "!, {s8-s9}\n"
-
-static inline void run_level_whole(const float *y, float *x, selfcal_sum_t *b, selfcal_sum_t *c, float g, float minus_beta, size_t axes) {
-    __asm__ volatile("1:\n"
-                     "vldr s0, [%[x]]\n"
-                     "vldmia %[y]!, {s16-s31}\n"
-                     M4F_FOUR("s16", "s17", "s18", "s19", "s3", "s4")
-                     M4F_MORE("s20", "s21", "s22", "s23")
-                     M4F_MORE("s24", "s25", "s26", "s27")
-                     M4F_MORE("s28", "s29", "s30", "s31")
-                     "vstmia %[x]!, {s0}\n"
-                     M4F_ADD("%[b]", "s3")
-                     M4F_ADD("%[c]", "s4")
-                     "subs %[axes], %[axes], #1\n"
-                     "bne 1b\n"
-                     : [y] "+r"(y), [x] "+r"(x), [b] "+r"(b), [c] "+r"(c), [axes] "+r"(axes)
-                     : [g] "t"(g), [m] "t"(minus_beta)
-                     : "s0", "s3", "s4", "s5", "s6", "s7", "s8", "s9", "s16", "s17", "s18", "s19", "s20", "s21", "s22", "s23",
-                       "s24", "s25", "s26", "s27", "s28", "s29", "s30", "s31", "cc", "memory");
-}
-#endif
-
 /* Nearly all samples of a long record go through here: five arithmetic instructions an axis and sample. */
-static void run_level(selfcal_t *self, span_t span, size_t j) {
+static void run_level_node(selfcal_t *self, span_t span, size_t j) {
     const selfcal_batch_t *batch = waiting(self);
     const selfcal_node_t *node = &self->node[j];
     const selfcal_real_t minus_beta = -node->beta;
@@ -155,25 +112,10 @@ static void run_level(selfcal_t *self, span_t span, size_t j) {
 }
 
 void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) {
-#ifdef SELFCAL_KERNEL_M4F
-    const bool whole = span.to - span.from == SELFCAL_BATCH;
-    const size_t axes = self->model->axes;
-    selfcal_sum_t unused[SELFCAL_AXES_MAX] = {{0.0F, 0.0F}}; /* B where u is 0 */
-#endif
     for (size_t j = from; j < to; j++) {
-        const selfcal_node_t *node = &self->node[j];
-        if (!node->level) {
-            continue;
+        if (self->node[j].level) {
+            run_level_node(self, span, j);
         }
-#ifdef SELFCAL_KERNEL_M4F
-        if (whole) {
-            const size_t k = j * axes;
-            run_level_whole(waiting(self)->y[0], &self->x[k], node->u_inf > 0.0F ? &self->b[k] : unused, &self->c[k],
-                            steady_g(node), -node->beta, axes);
-            continue;
-        }
-#endif
-        run_level(self, span, j);
     }
 }
 
@@ -204,4 +146,61 @@ void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, sel
     *x = (selfcal_wide_t)self->x[k];
 }
 
+reading_sums_t selfcal_kernel_reading(const selfcal_t *self, size_t at) {
+    const reading_sums_t sums = {&self->b[at], &self->c[at]};
+    return sums;
+}
+
+selfcal_sum_t selfcal_kernel_reading_drift(const selfcal_t *self, size_t at) {
+    const selfcal_sum_t x = {self->x[at], self->columns->reading[at].low};
+    return x;
+}
+
+void selfcal_kernel_set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t x) {
+    self->x[at] = x.hi;
+    self->columns->reading[at].low = x.lo;
+}
+
+bool selfcal_kernel_readings_sound(const selfcal_t *self) {
+    const size_t cells = (size_t)self->model->nodes * self->model->axes;
+    for (size_t k = 0; k < cells; k++) {
+        if (!isfinite(self->columns->reading[k].low)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
+    (void)index;
+    return selfcal_kernel_reading(self, j * self->model->axes + axis);
+}
+
+void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma) {
+    (void)self;
+    (void)axis;
+    (void)ln_sigma;
+}
+
+void selfcal_kernel_load(selfcal_t *self) {
+    (void)self;
+}
+
+bool selfcal_kernel_sound(const selfcal_t *self) {
+    (void)self;
+    return true;
+}
+
+bool selfcal_kernel_node_sound(const selfcal_t *self, size_t j) {
+    const size_t axes = self->model->axes;
+    for (size_t k = j * axes; k < (j + 1U) * axes; k++) {
+        if (!finite_sum(self->b[k]) || !finite_sum(self->c[k]) || !(self->c[k].hi >= R(0.0)) || !isfinite(self->x[k])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+#else
+typedef int selfcal_no_float_kernel_t; /* C99 wants a declaration in every file */
 #endif

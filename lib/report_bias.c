@@ -1,0 +1,130 @@
+/* Bias: moments of x0 + drift now over the nodes, and how a decaying drift will move them. */
+#include "report.h"
+
+/* What of `now` belongs to the terms of a node of a sum, x0 given with its variance. */
+static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance,
+                      selfcal_wide_t bias_left,
+                      selfcal_now_t *now) {
+    const size_t index = (size_t)work->first_node + k;
+    selfcal_wide_t lost[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
+    const selfcal_states_code_t *states = work->bank->model->states;
+    states->drift(work->bank, index, 0, lost);
+    states->drift(work->bank, index, series_of_readings(work->bank, work->axis), of_reading);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        now->drift[a] = of_reading[a] - x0 * lost[a];
+        now->own[1 + a] = bias_left * lost[a] * variance;
+        for (size_t b = 0; b <= a; b++) {
+            now->own[1 + SELFCAL_TERMS_MAX + term_pair(a, b)] = lost[a] * lost[b] * variance;
+        }
+    }
+}
+
+/* As a term decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
+ * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) stationary, times sigma_v^2. `off`: the
+ * node's mean less bias_about. */
+static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_view_t *v, const selfcal_now_t *now,
+                         selfcal_wide_t own,
+                         selfcal_wide_t off) {
+    const selfcal_law_t *law = hypothesis_of(work)->law;
+    const size_t terms = terms_of(law);
+    const selfcal_wide_t square = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v->ln_rho);
+    selfcal_wide_t *decay = work->bias.decay[k % grid_nodes(hypothesis_of(work)->alpha)];
+    selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
+    const bool sum = is_sum(law);
+    const selfcal_wide_t second = sum ? exp(v->ln_alpha) : 0.0, dt_s = (selfcal_wide_t)work->bank->model->dt_s;
+    if (sum) {
+        work->bank->model->states->spread(work->bank, (size_t)work->first_node + k, spread);
+    }
+    for (size_t a = 0; a < terms; a++) {
+        selfcal_wide_t stationary = square;
+        if (sum) { /* a walk does not decay: its psi is 0 */
+            const selfcal_term_t *term = &law->term[a];
+            stationary = term->kind == SELFCAL_WALK ? 0.0 : markov_variance(law, term, square, second, dt_s);
+        }
+        const selfcal_wide_t weighed_fall = (selfcal_wide_t)work->scratch.grid.spline[0][k] * now->drift[a];
+        selfcal_wide_t with_all = 0.0;
+        for (size_t b = 0; b < terms; b++) {
+            const size_t pair = b <= a ? term_pair(a, b) : term_pair(b, a);
+            with_all += spread[pair];
+            if (b <= a) {
+                decay[(size_t)2 * SELFCAL_TERMS_MAX + pair] +=
+                    own * (spread[pair] + now->own[1 + SELFCAL_TERMS_MAX + pair] - (a == b ? stationary : 0.0)) +
+                    weighed_fall * now->drift[b];
+            }
+        }
+        decay[a] += weighed_fall;
+        decay[SELFCAL_TERMS_MAX + a] += 2.0 * (own * (stationary - with_all + now->own[1 + a]) - weighed_fall * off);
+    }
+}
+
+/* Moments of x0 + drift now, with regressors of x0 + c' z + drift: the mean over the nodes, the scatter of their means,
+ * and their own variance. That goes with sigma_v^2, and so does how far the bias prior pulls, by a node's conditional
+ * mode: where the drift may hide the white noise one sigma_v for all nodes would be off by decades, and rho^2 alone
+ * change too much from node to node. */
+void selfcal_bias_step(selfcal_work_t *work) {
+    const selfcal_wide_t offset = selfcal_bank_from_prior(work->bank, work->axis);
+    const uint16_t k = work->at++;
+    if (k == 0U) {
+        work->bias.mean_sq = work->sum.mass_sq / work->sum.mass;
+    }
+    selfcal_now_t now;
+    selfcal_field_t field;
+    selfcal_node_field(work, k, &field);
+    const selfcal_node_view_t *v = &field.node;
+    if (work->mask == 0U) {
+        selfcal_bank_now(work->bank, (uint16_t)(work->first_node + k), &field.node);
+    }
+    const selfcal_wide_t mode_sq = field.var * (selfcal_wide_t)field.ratio, sigma_sq = mode_sq * work->bias.mean_sq;
+    const selfcal_wide_t own = (selfcal_wide_t)work->scratch.grid.spline[1][k] * mode_sq;
+    if (work->mask != 0U) {
+        work->bank->model->regressors->code->now(work, k, sigma_sq, &now);
+    } else {
+        const selfcal_wide_t prior_precision = sigma_sq * work->per_bias_sd * work->per_bias_sd;
+        const selfcal_wide_t variance = (selfcal_wide_t)(R(1.0) / (selfcal_real_t)(v->a + prior_precision)),
+            lost = 1.0 - v->bias_left;
+        const selfcal_wide_t x0 = (v->b - offset * prior_precision) * variance;
+        now.mean = v->drift + x0 * v->bias_left;
+        now.drift[0] = now.mean - x0;
+        now.own[0] = v->bias_left * v->bias_left * variance;
+        now.own[1] = v->bias_left * lost * variance;
+        now.own[1 + SELFCAL_TERMS_MAX] = lost * lost * variance;
+        if (is_sum(hypothesis_of(work)->law)) {
+            now_terms(work, k, x0, variance, v->bias_left, &now);
+        }
+    }
+    if (k == 0U) {
+        work->bias.about = now.mean;
+    }
+    const selfcal_wide_t off = now.mean - work->bias.about,
+        weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+    work->bias.weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
+    work->bias.first += weighed;
+    work->bias.second += weighed * off;
+    work->bias.own += own * (v->drift_var + now.own[0]);
+    if (has_decay(hypothesis_of(work)->law)) {
+        gather_decay(work, k, v, &now, own, off);
+    }
+}
+
+void selfcal_bias_finish(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
+    const selfcal_wide_t mean = work->bias.first / work->bias.weight;
+    const selfcal_wide_t scatter = work->bias.second / work->bias.weight - mean * mean;
+    const selfcal_wide_t own = work->bias.own / work->sum.mass;
+    posterior->bias_mean = (float)(work->bias.about + mean + selfcal_offset(work->bank, work->axis));
+    posterior->bias_sd = (float)sqrt(fmax(scatter, 0.0) + fmax(own, 0.0));
+    for (uint16_t j = 0; has_decay(hypothesis_of(work)->law) && j < grid_nodes(hypothesis_of(work)->alpha); j++) {
+        const selfcal_wide_t *decay = work->bias.decay[j];
+        if (hypothesis_of(work)->alpha != NULL) {
+            posterior->decay[j].alpha =
+                (float)r_exp(selfcal_bank_place(work->bank, (uint16_t)(work->first_node + j)).ln_alpha);
+        }
+        for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+            posterior->decay[j].mean[a] = (float)(decay[a] / work->bias.weight);
+            posterior->decay[j].var[a] =
+                (float)((decay[SELFCAL_TERMS_MAX + a] + 2.0 * mean * decay[a]) / work->bias.weight);
+        }
+        for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
+            posterior->decay[j].var_sq[a] = (float)(decay[(size_t)2 * SELFCAL_TERMS_MAX + a] / work->bias.weight);
+        }
+    }
+}

@@ -1,0 +1,97 @@
+/* Expectation: the likelihood that a filter is expected to give data of the best of all nodes.
+ *
+ * The innovations' variance of a filter over such data has a closed form. It carries the terms of order n of a node's
+ * ln-likelihood, so that the splines have to hold the rest alone. */
+#include "report.h"
+
+/* In selfcal_real_t, which is right to some 2e-7 n/2 ln V nats, and in selfcal_wide_t for what is longer than that. */
+#define NAME(name) name
+#define T selfcal_real_t
+#define T_(x) R(x)
+#define T_exp r_exp
+#define T_log1p r_log1p
+#define T_sqrt r_sqrt
+#include "report_expected.h"
+#undef NAME
+#undef T
+#undef T_
+#undef T_exp
+#undef T_log1p
+#undef T_sqrt
+#define NAME(name) name##_wide
+#define T selfcal_wide_t
+#define T_(x) x
+#define T_exp exp
+#define T_log1p log1p
+#define T_sqrt sqrt
+#include "report_expected.h"
+
+selfcal_real_t selfcal_expected_beta(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    return has_pole(work) ? -r_expm1(-r_exp(ln_alpha) * (selfcal_real_t)work->bank->model->dt_s) : R(0.0);
+}
+
+static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    return has_pole(work) ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
+}
+
+/* What lines, and behind them an edge and a level for each three, add to the variance. */
+static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e) {
+    selfcal_real_t more = R(0.0), ends = R(0.0);
+    const selfcal_real_t *end = &truth->power[truth->lines];
+    for (unsigned m = 0; m < truth->lines; m++) {
+        const selfcal_real_t distance = truth->distance[m];
+        const selfcal_real_t passed = r_fma(e->phi, distance, e->beta_sq), held_back = r_fma(e->psi, distance, e->p_sq);
+        if (m % 3U == 0U) {
+            ends = r_fma(e->edge, end[0], e->level * end[1]);
+            end += 2;
+        }
+        more += r_fma(passed, truth->power[m], ends) / held_back;
+    }
+    return more;
+}
+
+/* `beta`: selfcal_expected_beta() the alpha. */
+void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
+                      expectation_t *e) {
+    const selfcal_truth_t *truth = &work->truth;
+    if (!has_expectation(work)) {
+        memset(e, 0, sizeof *e);
+        return;
+    }
+    e->profile = e->ln_sigma = e->ln_v = 0.0;
+    const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
+    expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
+    expected_t real;
+    ln_rho -= truth->ln_noise;
+    if (truth->wide) {
+        wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
+        real.v_less_1 = (selfcal_real_t)wide.v_less_1;
+        real.gain = (selfcal_real_t)wide.gain;
+        real.p = (selfcal_real_t)wide.p;
+    } else {
+        real = expected(ln_rho, beta, truth);
+    }
+    const selfcal_real_t h = real.gain / real.p;
+    e->beta_sq = beta * beta;
+    e->phi = R(1.0) - beta;
+    e->p_sq = real.p * real.p;
+    e->psi = R(1.0) - real.p;
+    e->edge = real.gain * h / (R(2.0) - real.p);
+    e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
+    e->per_v = R(1.0) / (R(1.0) + real.v_less_1);
+    const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
+    if (truth->wide) {
+        e->ln_v = log1p(wide.v_less_1 + (selfcal_wide_t)more);
+        e->ln_sigma = 0.5 * (e->ln_v - log1p(wide.s_less_1));
+        e->profile = -0.5 * work->bank->weight * (e->ln_v - truth->ln_v);
+    } else {
+        const selfcal_real_t ln_v = r_log1p(real.v_less_1 + more);
+        e->ln_v = (selfcal_wide_t)ln_v;
+        e->ln_sigma = (selfcal_wide_t)(R(0.5) * (ln_v - r_log1p(real.s_less_1)));
+        e->profile = (selfcal_wide_t)(R(-0.5) * n * (ln_v - (selfcal_real_t)truth->ln_v));
+    }
+}
+
+selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta) {
+    return settled(ln_rho, beta);
+}

@@ -1,0 +1,466 @@
+/* The structs that a caller places, with their sizes. selfcal.h includes this file. Members belong to the library, save
+ * those that selfcal.h says may be read. */
+#ifndef SELFCAL_LAYOUT_H
+#define SELFCAL_LAYOUT_H
+
+/* Sums over the whole record. ln-likelihoods differ by (n/2) ln(ratio), which one float cannot carry beyond n = 10^4.
+ * The value is hi + lo, twice the digits of selfcal_real_t by its own arithmetic. Compilers must not reassociate: no
+ * -ffast-math. */
+typedef struct {
+    selfcal_real_t hi, lo;
+} selfcal_sum_t;
+
+#ifdef SELFCAL_FIXED
+
+/* Of each node and axis: its predicted drift, and its sums B and C. */
+typedef int32_t selfcal_drift_t;
+typedef int64_t selfcal_total_t;
+
+/* One axis of the block in progress, about its first sample (intake_fixed.c). */
+typedef struct {
+    int64_t sum;      /* steps */
+    int64_t sum_sq;   /* (2^shift steps)^2 */
+    int32_t first;    /* the first sample, steps */
+    int16_t exponent; /* a step is 2^exponent unit */
+    uint8_t shift;
+} selfcal_block_t;
+
+/* Beside regressors the readings are not in integers: sums B of "1" and C, and their predicted drift. */
+typedef struct {
+    selfcal_sum_t b, c, x;
+} selfcal_reading_t;
+
+/* Sums B and C of a node of several states, beside the states. */
+#define SELFCAL_STATE_SUMS 2U
+
+/* Most samples that a span has head-room for. */
+#define SELFCAL_BATCH_ROOM 16
+
+/* Cells that one step of a report sums. As a rule all floats are software here. */
+#define SELFCAL_STEP_CELLS 10U
+
+/* The build, for a snapshot: bytes of a real, and 32 for integers. */
+#define SELFCAL_ARITHMETIC 32U
+
+/* The batch that the nodes run over. */
+typedef struct {
+    selfcal_scale_t scale[SELFCAL_AXES_MAX];
+    int32_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH];
+    /* growth of nu before each sample and after the last, for a pole */
+    int32_t step[SELFCAL_AXES_MAX][SELFCAL_BATCH + 1];
+    uint32_t step_from, step_to;                       /* samples of those steps; from == to: none */
+    float step_beta;                                   /* 1 - the pole */
+} selfcal_integers_t;
+
+#else
+
+typedef selfcal_real_t selfcal_drift_t;
+typedef selfcal_sum_t selfcal_total_t;
+
+typedef struct {
+    selfcal_real_t sum, sum_sq;
+    float first;
+} selfcal_block_t;
+
+/* Beside regressors: low part of the readings' predicted drift. */
+typedef struct {
+    selfcal_real_t low;
+} selfcal_reading_t;
+
+#define SELFCAL_STATE_SUMS 0U
+#define SELFCAL_BATCH_ROOM 64
+#define SELFCAL_STEP_CELLS 16U
+#define SELFCAL_ARITHMETIC sizeof(selfcal_real_t)
+
+/* Kernels in selfcal_real_t take the batch as it is. */
+typedef struct {
+    uint32_t unused;
+} selfcal_integers_t;
+
+#endif
+
+/* ------------------------------------------------------------------------------------------------------------- bank */
+
+/* How a filter's gains move. */
+typedef struct {
+    selfcal_real_t c; /* phi^2 / (1 + p_inf): contraction of d */
+    selfcal_real_t d; /* predicted variance less p_inf; exactly 0 once converged */
+    selfcal_real_t e; /* innovation of the regressor "1" at the next sample less u_inf */
+} selfcal_moving_t;
+
+/* What the integer kernels keep once they do not: phi K + beta, u/s and 1/s, each times 2^shift. */
+typedef struct {
+    int32_t g, u, w;
+} selfcal_settled_t;
+
+/* Gain side of one filter, relative to sigma_v. All axes share it, because covariances do not depend on the data. */
+typedef struct {
+    selfcal_real_t beta;  /* 1 - phi */
+    selfcal_real_t q;     /* drift variance added per interval */
+    selfcal_real_t p_inf; /* predicted variance once converged */
+    selfcal_real_t u_inf; /* innovation of the regressor "1" once settled */
+    union {
+        selfcal_moving_t moving;
+        selfcal_settled_t settled; /* of a level node in the integer kernels */
+    } gains;
+    bool level;                         /* d = e = 0: the kernel sums plain nu */
+    uint8_t g_shift, u_shift, w_shift;  /* of `settled` */
+    uint32_t steady;     /* samples seen with d = 0: their ln s is added when asked for */
+    uint32_t level_from; /* steady when it became level: what later samples add to A is added when asked for */
+    selfcal_sum_t a;     /* sum u^2 / s */
+    selfcal_sum_t ln_s;  /* sum ln s of the other samples */
+} selfcal_node_t;
+
+/* Bytes of memory for the bank: for each node 56, and 20 more per axis (check.c holds it to that). */
+#define SELFCAL_SIZE(nodes, axes) \
+    ((size_t)(nodes) * \
+     (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
+
+/* Bank samples on their way into the sums. */
+typedef struct {
+    selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
+    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over a whole block's */
+    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
+    uint32_t gap_after;
+    uint32_t count;
+    bool part; /* some r is not 1 */
+} selfcal_batch_t;
+
+/* One regressor's front end. */
+typedef struct {
+    selfcal_real_t z[2][SELFCAL_BATCH]; /* beside the batches, less the first bank sample's value */
+    selfcal_real_t last;                /* of the last bank sample that the nodes run over */
+    float origin, first;                /* the first sample of all, and of this block */
+    selfcal_real_t offset;              /* the first bank sample less origin */
+    selfcal_real_t sum;                 /* of this block about its first */
+} selfcal_column_t;
+
+typedef struct {
+    selfcal_column_t *column;   /* [regressors] */
+    /* [nodes][rows]: for "1" and each regressor, sums of its innovation times those up to its own, over s */
+    selfcal_sum_t *a;
+    selfcal_sum_t *b;           /* [nodes][axes][regressors]: sum of its innovation times nu over s */
+    selfcal_sum_t *x;           /* [nodes][1 + regressors]: predicted drift of the zero-bias filter over each column */
+    selfcal_reading_t *reading; /* [nodes][axes] */
+} selfcal_columns_t;
+
+/* Sums of the first p rows of A. */
+#define SELFCAL_REGRESSORS_ROWS(p) ((size_t)(p) * ((size_t)(p) + 1U) / 2U)
+
+/* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per
+ * axis 8 p + 4; 8 p + 24 in the integer one. */
+#define SELFCAL_REGRESSORS_SIZE(nodes, axes, p) \
+    ((size_t)(p) == 0U \
+         ? (size_t)0U \
+         : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) + \
+               (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) * \
+                                      sizeof(selfcal_sum_t) + \
+                                  (size_t)(axes) * sizeof(selfcal_reading_t)))
+
+/* Gain side of a node of several states, relative to sigma_v. States are scaled so that the reading is their sum and
+ * white noise. */
+typedef struct {
+    selfcal_wide_t p[SELFCAL_TERM_PAIRS];                         /* predicted covariance of the states, lower half */
+    selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX]; /* 1 - pole, and variance added per interval */
+    selfcal_real_t theta; /* of a moving average, whose part e_(i-1) is the last state */
+    bool steady;          /* p has converged */
+} selfcal_term_node_t;
+
+typedef struct {
+    selfcal_term_node_t *node; /* [nodes of sums] */
+    /* [those][1 + regressors + axes][SELFCAL_TERMS_MAX]: predicted states over "1", the columns, the readings */
+    selfcal_sum_t *x;
+    selfcal_sum_t *bc;         /* [those][axes][SELFCAL_STATE_SUMS]: sums B and C of the readings */
+} selfcal_terms_t;
+
+/* Bytes beyond those for a model with `nodes` nodes of sums, 0 for none. For each in the float build 104 + 24 p, and
+ * per axis 24. */
+#define SELFCAL_TERMS_SIZE(nodes, axes, p) \
+    ((size_t)(nodes) == 0U \
+         ? (size_t)0U \
+         : 7U + sizeof(selfcal_terms_t) + \
+               (size_t)(nodes) * (sizeof(selfcal_term_node_t) + \
+                                  (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + \
+                                   (size_t)(axes) * (SELFCAL_TERMS_MAX + SELFCAL_STATE_SUMS)) * sizeof(selfcal_sum_t)))
+
+/* Pointers first: a snapshot is what follows them. */
+struct selfcal {
+    const selfcal_model_t *model;
+    selfcal_terms_t *terms;     /* of the laws that are sums; NULL: there are none */
+    selfcal_columns_t *columns; /* of the regressors; NULL: there are none */
+    selfcal_node_t *node;       /* [nodes] */
+    selfcal_total_t *b, *c;     /* [nodes][axes]: sums u nu / s and nu^2 / s */
+    selfcal_drift_t *x;         /* [nodes][axes]: predicted drift of the zero-bias filter */
+    uint32_t n;                 /* bank samples in all sums */
+    selfcal_wide_t weight;      /* what they count for: n without forgetting */
+    selfcal_wide_t keep;        /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */
+    selfcal_wide_t beginning;   /* what the first batch counts for */
+    selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX]; /* ln of the nodes */
+    selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
+    /* One batch is gathered while the nodes run, some at every push, over the one before. */
+    selfcal_batch_t batch[2];
+    uint8_t gathering;    /* which of them is gathered */
+    uint16_t ran;         /* nodes that have run over the other */
+    uint16_t push_nodes;  /* to run at a push */
+    uint32_t pending_gap; /* bank intervals without a sample after the last one gathered */
+    uint32_t batches;     /* that the nodes have begun with */
+    selfcal_integers_t integers;
+    /* intake */
+    bool started;
+    float origin[SELFCAL_AXES_MAX];          /* the first sample, unit */
+    selfcal_real_t offset[SELFCAL_AXES_MAX]; /* the first bank sample less origin */
+    uint32_t block;                          /* samples a bank interval now has */
+    selfcal_real_t variance_ratio;           /* r of a whole block */
+    selfcal_block_t sums[SELFCAL_AXES_MAX];
+    uint32_t position, used; /* samples of this block: passed, and usable */
+    bool dropped;            /* the rest of it counts for nothing */
+    selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
+    uint64_t within_dof;
+    float last[SELFCAL_AXES_MAX];
+    uint32_t equal[SELFCAL_AXES_MAX];
+    bool in_gap;
+    float shifted[SELFCAL_AXES_MAX]; /* by selfcal_shift(), in all, unit */
+    uint32_t retired;                /* a bit for each axis */
+    uint32_t watched;                /* samples looked at since the axes were last judged ... */
+    uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
+    uint32_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
+    selfcal_counters_t counters;
+};
+
+/* No snapshot of a model without regressors and sums is longer. With them it is longer by no more than
+ * SELFCAL_REGRESSORS_SIZE and SELFCAL_TERMS_SIZE. For a flash slot or a buffer laid out by the compiler. */
+#define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
+
+/* ------------------------------------------------------------------------------------------ values of regressors */
+
+/* Bins that a window is held in. More: a finer edge of the window, 4 bytes each and column. */
+#define SELFCAL_COLUMN_BINS 32U
+
+typedef struct {
+    uint64_t step;        /* STEP: its sample; SINE, COSINE: 2^64 turns a sample */
+    uint32_t window, bin; /* samples */
+    uint32_t bins, in_bin;
+    float ring[SELFCAL_COLUMN_BINS + 2U];
+    float sum, first, last;
+} selfcal_trail_t;
+
+struct selfcal_former {
+    const selfcal_model_t *model;
+    uint64_t samples; /* before the newest, missing ones too */
+    bool begun;
+    selfcal_trail_t trail[SELFCAL_REGRESSORS_MAX];
+};
+
+/* ----------------------------------------------------------------------------------------------------------- report */
+
+/* By SELFCAL_REPORT_QUALITY: cells a dimension, cells of sigma_v where a limit cuts, bins of a parameter's
+ * histogram. */
+#define SELFCAL_BY_QUALITY(fuzz, module, host, reference) \
+    (SELFCAL_REPORT_QUALITY == 0 ? (fuzz) \
+                                 : SELFCAL_REPORT_QUALITY == 1 ? (module) \
+                                                               : SELFCAL_REPORT_QUALITY == 2 ? (host) : (reference))
+#define SELFCAL_REPORT_CELLS SELFCAL_BY_QUALITY(16, 24, 80, 192)
+#define SELFCAL_SIGMA_CELLS SELFCAL_BY_QUALITY(8, 24, 48, 96)
+#define SELFCAL_HISTOGRAM SELFCAL_BY_QUALITY(32, 64, 128, 512)
+
+/* report_expected.c: what is supposed to have made the data, when the expected likelihood is taken off the interpolated
+ * one; report_spectrum.c: what the data's spectrum has beyond that. */
+#define SELFCAL_FITTED (SELFCAL_LINES + (SELFCAL_LINES + 2) / 3 * 2)
+typedef struct {
+    /* ln of the samples' noise, their geometric mean, over a whole block's at the model's rate */
+    selfcal_real_t ln_noise;
+    selfcal_real_t missed;   /* nats of a node's ln-likelihood, the most of all, that come of what is uneven in noise or
+                                time */
+    selfcal_real_t variance, rate; /* of a first-order drift over that noise's variance; 1 - its pole */
+    selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
+    bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
+    uint8_t lines;
+    bool fitted, pair; /* what the nodes show besides is known; there are nodes in two dimensions */
+    /* Of either sign: lines at frequencies omega, and behind them two of each three lines' band, edges and level. */
+    selfcal_real_t distance[SELFCAL_LINES]; /* |1 - e^(i omega)|^2 */
+    selfcal_real_t power[SELFCAL_FITTED];
+} selfcal_truth_t;
+
+/* Least squares for them by rotations: a triangle, row by row, its right side behind each. */
+#define SELFCAL_TRIANGLE (SELFCAL_FITTED * (SELFCAL_FITTED + 3) / 2)
+typedef struct {
+    selfcal_real_t triangle[SELFCAL_TRIANGLE], least;
+    selfcal_real_t scatter[SELFCAL_NODES_MAX]; /* of every node, ln of the readings' scatter from the best node's */
+} selfcal_fit_t;
+
+/* report_node.c: of the best node, variance of its residuals, the inverse, D; what the priors of the bias and the
+ * coefficients add. */
+typedef struct {
+    selfcal_wide_t var, per_var, ln_s;
+    selfcal_real_t cost, extra;
+} selfcal_top_t;
+
+/* report_marginal.c: sigma_v about its mode at a node, in ln. */
+typedef struct {
+    selfcal_real_t mass, first, second; /* moments where no limit cuts it */
+    selfcal_real_t lo, hi;              /* where it ends if no limit does */
+    selfcal_real_t from, width;         /* the first of the cells in hand, their width */
+    /* of the ln-likelihood from the mode to the priors' limits, in each law's best cell */
+    selfcal_real_t drop[SELFCAL_HYPOTHESES_MAX];
+} selfcal_sigma_t;
+
+/* report_integral.c: one row of cells, coefficients of the two splines in rho, alpha taken out. */
+typedef struct {
+    selfcal_real_t profile[SELFCAL_GRID_MAX], ln_sigma[SELFCAL_GRID_MAX];
+    selfcal_real_t basis[6]; /* of alpha */
+    uint8_t basis_first;
+    selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
+    const selfcal_prior_t *prior; /* of the hypothesis on the axis */
+    selfcal_parameter_t drift;    /* which parameter goes with rho */
+} selfcal_cell_row_t;
+
+/* Where in ln rho or ln alpha the likelihood counts. */
+typedef struct {
+    selfcal_real_t lo, hi;
+} selfcal_range_t;
+
+#define SELFCAL_SEARCH_SAMPLES 8 /* of one search pass */
+typedef struct {
+    uint8_t pass;
+    selfcal_real_t limit_lo[2], limit_hi[2]; /* what the priors permit of (ln rho, ln alpha) */
+    selfcal_range_t range[2];                /* of these the row in hand, and the rows */
+    uint8_t least[2];                        /* cells that its peak needs */
+    selfcal_real_t row_best;                 /* ln-likelihood of the row in hand */
+    selfcal_real_t depth;                    /* below the best at which no more counts */
+    selfcal_real_t best, best_ln[SELFCAL_PARAMETERS];
+} selfcal_search_t;
+
+typedef struct {
+    uint8_t rows;
+    selfcal_real_t range_lo[SELFCAL_PARAMETERS], range_hi[SELFCAL_PARAMETERS]; /* ln of the parameters */
+    selfcal_wide_t mass, off_grid;
+    selfcal_wide_t mass_sq; /* mass with sigma_v^2 over the mode's */
+    selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
+} selfcal_integral_t;
+
+/* report_bias.c: x0 + drift now, about the first node's. */
+typedef struct {
+    selfcal_wide_t about, weight, first, second;
+    selfcal_wide_t mean_sq; /* of sigma_v^2 over the mode's */
+    selfcal_wide_t own;     /* its variance at the nodes */
+    /* sums of selfcal_decay_t over the nodes of each alpha */
+    selfcal_wide_t decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
+} selfcal_bias_t;
+
+struct selfcal_work {
+    selfcal_t *bank;
+    uint8_t axis, hypothesis, stage;
+    uint16_t first_node;
+    uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
+    uint32_t batches; /* of the bank, when the sums came to rest */
+    bool gathered;    /* the nodes run over the last batch: what is pushed now is later than the report */
+    uint8_t mask, unknowns;               /* regressors in use; those and the bias */
+    selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
+    uint16_t best_node;                   /* of all: the likeliest */
+    selfcal_top_t top;                    /* ... whatever its law, and its ln var and ln-likelihood */
+    selfcal_wide_t per_n, per_bias_sd, ln_top, top_profile;
+    /* Of every node, of the profile ln-likelihood and of ln of sigma_v's conditional mode, from those of the best; then
+     * of the hypothesis in hand less their expectation; then posterior means of the basis functions. */
+    selfcal_real_t field[2][SELFCAL_NODES_MAX];
+    selfcal_wide_t ln_sigma_off; /* there, of sigma_v's mode from its expectation */
+    selfcal_truth_t truth;
+    /* of the hypothesis in hand */
+    selfcal_real_t peak;  /* of the nodes' profile ln-likelihood */
+    selfcal_real_t n_eff; /* bank samples less those that bias and coefficients took */
+    selfcal_sigma_t sigma;
+    selfcal_search_t search;
+    selfcal_integral_t sum;
+    selfcal_bias_t bias;
+    union {
+        selfcal_fit_t fit; /* before the first hypothesis */
+        struct {
+            /* B-spline coefficients; later weights of the nodes, as they are, and with sigma_v^2 over its mode's */
+            selfcal_real_t spline[2][SELFCAL_HYPOTHESIS_NODES_MAX];
+            /* a mass that ends at the last bin's end reaches beyond it */
+            selfcal_real_t histogram[SELFCAL_PARAMETERS][SELFCAL_HISTOGRAM + 2];
+            /* of each sigma_v cell: the offset's exponential, less 1; the weight */
+            selfcal_real_t delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS];
+            selfcal_range_t found[SELFCAL_SEARCH_SAMPLES]; /* the rows of the search, and how high they are, ln */
+            selfcal_real_t height[SELFCAL_SEARCH_SAMPLES];
+            uint8_t least[SELFCAL_SEARCH_SAMPLES];
+            /* of N and the drift parameter, sigma_v at its mode, where no limit cuts it */
+            selfcal_real_t modes[2][SELFCAL_HISTOGRAM + 2];
+            selfcal_cell_row_t row;
+        } grid;
+    } scratch;
+};
+
+/* ------------------------------------------------------------------------------------------------------------- gate */
+
+/* A level and its variance over sigma^2 of each axis. */
+typedef struct {
+    float mean[SELFCAL_AXES_MAX];
+    selfcal_real_t gamma;
+} selfcal_level_t;
+
+/* A chi-square threshold under way. */
+typedef struct {
+    selfcal_wide_t a, ln_p, ln_gamma, x; /* half the degrees of freedom, ln of the probability, half the threshold */
+    selfcal_wide_t b, c, d, h;           /* of the continued fraction */
+    uint16_t term;
+    uint8_t rounds, at;
+} selfcal_quantile_t;
+
+struct selfcal_gate {
+    selfcal_gate_config_t config;
+    selfcal_gate_noise_t axis[SELFCAL_AXES_MAX];
+    selfcal_motion_t state;
+    selfcal_gate_counters_t counters;
+    float t1, t2;
+    float shaken_above, moved_above, rate_moved_above;
+    float whole_above;                 /* shaken_above of a window without missing samples */
+    uint8_t work;                      /* which threshold is being worked out; 0: none */
+    uint8_t judged_axes, judged_rates; /* axes that moved_above is for, gyros that rate_moved_above is for */
+    selfcal_quantile_t quantile;
+    uint32_t at_once; /* windows that had to have theirs worked out at their end */
+    bool started;
+    float origin[SELFCAL_AXES_MAX]; /* the first sample: gravity or a turn-on bias costs no digits */
+    /* window in progress */
+    float first[SELFCAL_AXES_MAX];
+    selfcal_real_t sum[SELFCAL_AXES_MAX], sum_sq[SELFCAL_AXES_MAX]; /* about the first sample */
+    uint32_t position, used;                                        /* samples of this window: passed, and sound */
+    bool blind;
+    /* levels: of the rest, and of the windows in a row since motion, calm by the noise the gate started from, the last
+     * ones quiet by the measured noise */
+    selfcal_level_t rest, found;
+    bool rested, unseen;
+    uint32_t quiet, calm;
+    float off_sum;                 /* of T2 over those windows; at rest one that forgets */
+    float grown[SELFCAL_AXES_MAX]; /* their mean square about the mean over the measured noise's */
+    /* measured over whole windows of rest */
+    uint64_t measured;
+    selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
+};
+
+/* -------------------------------------------------------------------------------------------------------- telemetry */
+
+struct selfcal_telemetry {
+    const selfcal_model_t *model;
+    const selfcal_module_t *module;
+    const selfcal_sent_coefficient_t *coefficient; /* [regressors of the model], or NULL */
+    uint16_t first_id;                 /* of the node */
+    uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
+    /* of the frames under way */
+    uint8_t source;
+    uint8_t part; /* of a report */
+    uint16_t id;
+    const selfcal_report_t *report;
+    const selfcal_corrected_t *corrected;
+    uint32_t answer;
+    const selfcal_counters_t *counters;
+    selfcal_wide_t ln_best;
+    uint32_t report_number;
+    uint32_t time_ms;
+    selfcal_state_t state;
+    uint8_t item;  /* to look at next */
+    uint8_t items; /* past the last one: 0 with nothing under way */
+    uint8_t made;  /* frames of this report or status */
+    uint32_t frames; /* made since selfcal_telemetry_init() */
+};
+
+#endif

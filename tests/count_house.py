@@ -1,0 +1,145 @@
+"""House rules that are counted: `python tests/count_house.py` prints what breaks them. Called by `make check`.
+
+Lines of at most 120 columns; in `lib/`, without the generated files: few conditional lines of the preprocessor, no
+circle among its files, no function above 80 lines, no two static functions of one name.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+COLUMNS = 120
+#: `#if`, `#ifdef`, `#ifndef` and `#elif` in `lib/`, include guards among them.
+CONDITIONALS = 45
+FUNCTION = 80
+#: Files whose lines a person writes.
+WRITTEN = (".c", ".h", ".cpp", ".hpp", ".py", ".pyi", ".mk", ".ld", ".txt", ".sh", "Makefile")
+#: Guides, once they are wrapped: add ".md".
+GUIDES = (".md",)
+#: Made by programs.
+GENERATED = ("lib/selfcal_frames.h", "tools/requirements", "tests/long_runs.txt")
+#: To be wrapped: not looked at yet.
+LATER = ("port/",)
+
+_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+_HEAD = re.compile(
+    r"^(static )?(?:inline )?(?:const )?[a-z_0-9]+ \*?([a-z_0-9]+)\((?:[^;{}()]|\([^()]*\))*\)\s*\{", re.MULTILINE
+)
+
+
+def tracked(suffixes: Iterable[str]) -> list[Path]:
+    """Files of the repository with these endings, without what is generated."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [
+        ROOT / name
+        for name in listed.splitlines()
+        if name.endswith(tuple(suffixes)) and not name.startswith(GENERATED + LATER) and (ROOT / name).is_file()
+    ]
+
+
+def long_lines(files: Iterable[Path]) -> list[str]:
+    """`file:line: columns` of every line above COLUMNS."""
+    return [
+        f"{path.relative_to(ROOT)}:{number}: {len(line)} columns"
+        for path in files
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if len(line) > COLUMNS
+    ]
+
+
+def functions(text: str) -> list[tuple[str, bool, int]]:
+    """Name, whether it is static, and lines of each function of a C file, from its head to the brace that ends it."""
+    found = []
+    for head in _HEAD.finditer(text):
+        end = text.index("\n}", head.start())
+        found.append((head[2], head[1] is not None, text.count("\n", head.start(), end) + 2))
+    return found
+
+
+def circle(edges: Mapping[str, set[str]]) -> list[str]:
+    """Nodes of a circle in a graph, in order; empty if there is none."""
+    done: set[str] = set()
+
+    def walk(node: str, path: list[str]) -> list[str]:
+        if node in path:
+            return [*path[path.index(node) :], node]
+        if node in done:
+            return []
+        for other in sorted(edges.get(node, ())):
+            found = walk(other, [*path, node])
+            if found:
+                return found
+        done.add(node)
+        return []
+
+    for node in sorted(edges):
+        found = walk(node, [])
+        if found:
+            return found
+    return []
+
+
+def includes(texts: Mapping[str, str]) -> dict[str, set[str]]:
+    """Which file of `texts` includes which."""
+    return {
+        name: {other for other in re.findall(r'^#include "([^"]+)"', text, re.MULTILINE) if other in texts}
+        for name, text in texts.items()
+    }
+
+
+def calls(texts: Mapping[str, str]) -> dict[str, set[str]]:
+    """Which C file calls a function of which other; through a pointer that a model gives does not count. A file that is
+    one of two for the same functions (integers or float) counts as both."""
+    made_by: dict[str, set[str]] = {}
+    for name, text in texts.items():
+        for function, static, _ in functions(text):
+            if not static and name.endswith(".c"):
+                made_by.setdefault(function, set()).add(name)
+    edges: dict[str, set[str]] = {}
+    for name, text in texts.items():
+        code = _COMMENT.sub("", text)
+        for function in set(re.findall(r"\b([a-z_0-9]+)\(", code)) & made_by.keys():
+            if name.endswith(".c") and name not in made_by[function]:
+                edges.setdefault(name, set()).update(made_by[function])
+    return edges
+
+
+def complaints() -> list[str]:
+    """What breaks the rules, a line each."""
+    files = [path for path in tracked([".c", ".h"]) if path.parent.name == "lib"]
+    library = {path.name: path.read_text(encoding="utf-8") for path in files}
+    found = long_lines(tracked((*WRITTEN, *GUIDES)))
+    conditionals = sum(len(re.findall(r"^\s*#\s*(?:if|elif)", text, re.MULTILINE)) for text in library.values())
+    if conditionals > CONDITIONALS:
+        found.append(f"lib: {conditionals} conditional lines, {CONDITIONALS} are allowed")
+    for kind, edges in (("include", includes(library)), ("call", calls(library))):
+        way = circle(edges)
+        if way:
+            found.append(f"lib: files {kind} each other in a circle: {' > '.join(way)}")
+    statics: dict[str, set[str]] = {}
+    for name, text in library.items():
+        for function, static, lines in functions(text):
+            if lines > FUNCTION:
+                found.append(f"lib/{name}: {function}() has {lines} lines, {FUNCTION} are allowed")
+            if static:
+                statics.setdefault(function, set()).add(name)
+    for function, names in statics.items():
+        if len(names) > 1:
+            found.append(f"lib: {function}() is static in {', '.join(sorted(names))}")
+    return found
+
+
+def main() -> int:
+    """Exit code: 1 with complaints."""
+    found = complaints()
+    print("".join(f"{line}\n" for line in found), end="")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
