@@ -24,8 +24,8 @@ void selfcal_bank_gap(selfcal_t *self, uint64_t count);
 void selfcal_bank_pace(selfcal_t *self, uint32_t block);
 /* Runs up to `nodes` nodes over the batch that waits; false with none waiting. */
 bool selfcal_bank_run(selfcal_t *self, uint16_t nodes);
-/* Hands over what has been gathered, a batch that is not yet full or a gap after it; false if that is nothing. None may
- * wait. */
+/* Hands over the gathered bank samples: a batch that is not yet full, or a gap after it. False: there are none. No
+ * batch may wait. */
 bool selfcal_bank_hand_over(selfcal_t *self);
 /* Both, to the end. */
 void selfcal_bank_flush(selfcal_t *self);
@@ -38,7 +38,7 @@ typedef struct {
     selfcal_real_t ln_rho, ln_alpha;
 } selfcal_place_t;
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index);
-/* selfcal_node() of the sums as they are, without what has only been gathered. */
+/* selfcal_node() of the sums as they are, without the gathered bank samples. */
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 /* Parts of that: A, B, C and, as its drift, the prediction; D; then from the first all but D. Of a sum's nodes the
  * first is the whole. */
@@ -48,14 +48,15 @@ selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x);
 void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
 void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
 
-/* Forgetting leaves so much of a column's sum of squares: in a filter that has let go of the column nothing comes
- * after, and neither a float nor an integer could hold what B and A are then far below their sizes. */
+/* Forgetting leaves so much of a column's sum of squares. In a filter that has let go of the column nothing comes
+ * after. B and A would shrink far below their sizes then, where neither a float nor an integer holds them. */
 #define SELFCAL_KEPT_MIN 1e-9
 
-/* What is read now at one node, given sigma_v: its mean less the offset, the drift's part of that, and its variance
- * over sigma_v^2 without that of the drift given the bias (and the coefficients): as it is now, and with d of the drift
- * gone own[0] + 2 d own[1] + d^2 own[2]. With several terms, d_a of each gone, that is own[0] + 2 sum d_a own[1 + a] +
- * sum d_a d_b own[..]: all pairs, as selfcal_decay_t has them. */
+/* The reading now at one node, given sigma_v: its mean less the offset, the drift's part of it, and its variance
+ * over sigma_v^2. The variance is without the drift's own, given the bias (and the coefficients).
+ * As it is now it is own[0]. With a part d of the drift gone it is own[0] + 2 d own[1] + d^2 own[2]. With d_a of
+ * each of several terms gone it is own[0] + 2 sum d_a own[1 + a] + sum d_a d_b own[..], all pairs as selfcal_decay_t
+ * has them. */
 typedef struct {
     selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
@@ -63,9 +64,9 @@ typedef struct {
 /* sigma_v's mode at a node is found by turns, to this part of its square. */
 #define SELFCAL_MODE_TURNS 20U
 #define SELFCAL_MODE_LEFT R(1e-5)
-/* What a report takes of one node: its view; variance of the residuals; the mode of sigma_v^2 over that; what half the
- * curvature in ln sigma_v lacks of n: a sample for the bias and each coefficient that the data tell, none for those
- * that their priors tell; and what these priors add to -2 ln p. */
+/* One node for a report: its view; variance of the residuals; the mode of sigma_v^2 over that variance. `share`:
+ * half the curvature in ln sigma_v is n less this, a sample for the bias and each coefficient that the data tell,
+ * none for those that their priors tell. `extra`: added to -2 ln p by these priors. */
 typedef struct {
     selfcal_node_view_t node;
     selfcal_wide_t var;
@@ -127,7 +128,7 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to);
 /* A gap: the drift of every axis of node `j` loses the part `less` (1 - phi^count). */
 void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
 
-/* Forgetting: sums B and C of every axis of node `j`, times what is kept of each. */
+/* Forgetting: sums B and C of every axis of node `j`, times the part that is kept of each. */
 void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
 
 /* The nodes have been placed: chooses an axis's step by ln of its white noise per bank sample. */
@@ -210,7 +211,7 @@ struct selfcal_regressors_code {
     void (*finish)(const selfcal_work_t *work);
 };
 
-/* bank_states.c, for the nodes of laws that are sums: what bank.c does for the others. */
+/* bank_states.c: does for the nodes of laws that are sums as bank.c does for the others. */
 struct selfcal_states_code {
     /* Whether there are filters for a law that is not plain. */
     bool (*valid)(const selfcal_law_t *law, float dt_s);
@@ -221,7 +222,7 @@ struct selfcal_states_code {
     void (*start)(selfcal_t *self, size_t j, selfcal_place_t place);
     void (*run)(selfcal_t *self, size_t j, const span_t *span);
     void (*gap)(selfcal_t *self, size_t j, uint32_t count);
-    /* Forgetting: what of D has only been counted comes due; selfcal_kernel_fade() of its own sums. */
+    /* Forgetting: the samples of D that were only counted come due. Then selfcal_kernel_fade() of its own sums. */
     void (*settle)(selfcal_t *self, size_t j);
     void (*fade)(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
     /* All but the node's place. */
@@ -271,7 +272,7 @@ static inline selfcal_moving_t moving_of(const selfcal_node_t *node) {
     return node->gains.moving;
 }
 
-/* What a level node's samples have added to A since it became level. */
+/* A level node's samples have added this to A since it became level. */
 static inline selfcal_wide_t level_a(const selfcal_node_t *node) {
     const selfcal_wide_t u = (selfcal_wide_t)node->u_inf;
     return node->level ? (selfcal_wide_t)(node->steady - node->level_from) * u * u /

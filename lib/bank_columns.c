@@ -142,7 +142,7 @@ static selfcal_sum_t filter_column(const selfcal_t *self, size_t j, const gains_
     return x;
 }
 
-/* What selfcal_kernel_run() does for a model without regressors. */
+/* As selfcal_kernel_run() for a model without regressors. */
 static void run_columns(selfcal_t *self, size_t j, const gains_t *gains) {
     const size_t p = columns_of(self), axes = self->model->axes;
     innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;

@@ -19,8 +19,8 @@ static selfcal_wide_t part_kept(selfcal_t *self) {
     return keep;
 }
 
-/* What the node has only counted comes due first. Readings and columns each shrink by a factor, and products of them by
- * both, so that the sums remain those of some record (positive definite). */
+/* Samples that the node has only counted come due first. Readings and columns each shrink by a factor, and products
+ * of them by both factors. So the sums remain the sums of some record (positive definite). */
 static void fade_node(selfcal_t *self, size_t j) {
     selfcal_node_t *node = &self->node[j];
     const bool of_sum = is_state_node(self, node);

@@ -161,7 +161,7 @@ void selfcal_kernel_load(selfcal_t *self) {
     }
 }
 
-/* What a span adds to the sums of a cell. */
+/* Adds a span's sums to a cell's. */
 static inline void add_sums(selfcal_t *self, size_t k, size_t axis, int64_t b, int64_t c) {
     self->b[k] += b;
     self->c[k] += c;
@@ -254,7 +254,7 @@ size_t kernel_node(const selfcal_t *self, size_t i) {
     return i - node.index + row * grid_nodes(hypothesis->alpha) + column;
 }
 
-/* What a span adds: the sum of nu in steps, the sum of nu^2 in 2^16 steps^2. */
+/* A span's sum of nu in steps, and of nu^2 in 2^16 steps^2. */
 typedef struct {
     int64_t b;
     uint64_t c;
@@ -446,7 +446,7 @@ bool selfcal_kernel_readings_sound(const selfcal_t *self) {
     return true;
 }
 
-/* Whether the steps of the span that they were made for are those of its readings. */
+/* Whether the steps are those that the readings of their span make. */
 static bool steps_are_sound(const selfcal_t *self) {
     if (self->integers.step_from > self->integers.step_to || self->integers.step_to > SELFCAL_BATCH ||
         !(self->integers.step_beta >= 0.0F) || !(self->integers.step_beta < 1.0F)) {

@@ -1,4 +1,4 @@
-/* Invariants of a bank: what every push, skip and report leaves true, whatever came in. */
+/* Invariants of a bank. Every push, skip and report leaves them true, whatever came in. */
 #include "bank.h"
 
 /* Sizes of selfcal_config.h that the code can do with. */
@@ -89,7 +89,7 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
     return true;
 }
 
-/* What the samples count for: one each, or less where they are forgotten. */
+/* Weight of the samples: one each, or less where they are forgotten. */
 static bool weight_is_sound(const selfcal_t *self) {
     if (self->model->forgetting != NULL) {
         /* nothing to forget yet */

@@ -1,4 +1,4 @@
-/* What the tables say of laws, hypotheses and their nodes. Not for users. */
+/* Laws, hypotheses and their nodes by the tables. Not for users. */
 #ifndef SELFCAL_LAWS_H
 #define SELFCAL_LAWS_H
 
@@ -9,7 +9,7 @@ static inline size_t term_pair(size_t a, size_t b) {
     return a * (a + 1U) / 2U + b;
 }
 
-/* What a law has. Terms that this build has room for: a law with more is refused. */
+/* Terms that this build has room for. A law with more is refused. */
 static inline size_t terms_of(const selfcal_law_t *law) {
     return law->terms < SELFCAL_TERMS_MAX ? law->terms : SELFCAL_TERMS_MAX;
 }

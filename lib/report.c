@@ -34,7 +34,7 @@ static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *p
     }
 }
 
-/* No law has an evidence, nor what follows from one. */
+/* No law has an evidence, so there is no probability and no bias. */
 static void know_nothing(const selfcal_work_t *work, selfcal_report_t *report) {
     for (int h = 0; h < SELFCAL_HYPOTHESES_MAX; h++) {
         selfcal_posterior_t *posterior = &report->hypothesis[h];
@@ -247,7 +247,7 @@ static selfcal_status_t step_whole(selfcal_work_t *work, selfcal_report_t *repor
     return SELFCAL_OK;
 }
 
-/* By stage. Each step says SELFCAL_BUSY, or what the report ends with. */
+/* By stage. Each step says SELFCAL_BUSY, or the status that ends the report. */
 typedef selfcal_status_t (*stage_t)(selfcal_work_t *, selfcal_report_t *);
 static const stage_t stages[] = {
     step_gather, step_truth, step_fit,     step_sigma, step_values,    step_spline,   step_spline, step_search,

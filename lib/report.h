@@ -1,11 +1,11 @@
-/* The report's inside: its stages, and what one file of them needs of another. Not for users.
+/* The report's inside: its stages, and the functions that one file of them calls in another. Not for users.
  *
- *   report.c           the stages in order, probabilities, what an axis's report says in all
+ *   report.c           the stages in order, probabilities, the bias over all laws
  *   report_node.c      every node once: profile ln-likelihood, sigma_v's mode
  *   report_expected.c  the expected likelihood, taken off before interpolation
- *   report_spectrum.c  what the data's spectrum has beyond it
+ *   report_spectrum.c  the data's spectrum beyond it
  *   report_spline.c    interpolation of the rest
- *   report_cells.c     what all that gives in a cell
+ *   report_cells.c     likelihood and parameters in a cell
  *   report_search.c    where the likelihood counts
  *   report_integral.c  the sums over the cells there
  *   report_marginal.c  sigma_v, histograms, estimates
@@ -92,11 +92,11 @@ static inline uint16_t step_part(selfcal_work_t *work, unsigned step, uint16_t w
 /* Of the hypothesis's node k. */
 void selfcal_node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *field);
 
-/* Looks at some of all nodes; after the last, the best of those with an expectation is the first guess of what made the
- * data. */
+/* Some of all nodes; after the last, the best of those with an expectation is the first guess of the process that
+ * made the data. */
 void selfcal_node_step_truth(selfcal_work_t *work);
 
-/* What the splines have to carry at some of the hypothesis's nodes. */
+/* Some of the hypothesis's node values, less their expectation: the splines carry these. */
 void selfcal_node_step_values(selfcal_work_t *work);
 
 /* --------------------------------------------------------------------------------------------------------
@@ -159,8 +159,8 @@ typedef struct {
     bool off_grid;
 } cell_t;
 
-/* What counts of sigma_v in a cell: the part of [sigma.lo, sigma.hi] about the height's peak that the limits leave. How
- * far from the conditional mode that peak lies, and how far below it, in ln. Nothing is left unless from < to. */
+/* The part of [sigma.lo, sigma.hi] that counts in a cell: the limits leave it about the height's peak. How far from
+ * the conditional mode that peak lies, and how far below it, in ln. Nothing is left unless from < to. */
 typedef struct {
     selfcal_real_t from, to, drop, peak;
     /* drop where the limits leave a flank alone or little. Else 0, and all of [sigma.lo, sigma.hi], of which parts do
@@ -187,7 +187,7 @@ void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_
 void selfcal_cells_parameters(const selfcal_work_t *work, const cell_t *cell,
                               selfcal_real_t ln_value[SELFCAL_PARAMETERS]);
 
-/* `half`: what N and the drift parameter run through from the middle of a cell to its side, so that so far beyond the
+/* `half`: N and the drift parameter run through so much from the middle of a cell to its side. So far beyond the
  * limits parts of the cell count. It becomes 0 for N where even that does not bring the mode within them: then the
  * profile as a rule rises as fast to the other side. */
 reach_t selfcal_cells_reach(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]);

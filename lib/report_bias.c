@@ -1,7 +1,7 @@
 /* Bias: moments of x0 + drift now over the nodes, and how a decaying drift will move them. */
 #include "report.h"
 
-/* What of `now` belongs to the terms of a node of a sum, x0 given with its variance. */
+/* The terms' part of `now` at a node of a sum, x0 given with its variance. */
 static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance,
                       selfcal_wide_t bias_left,
                       selfcal_now_t *now) {

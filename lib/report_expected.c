@@ -4,7 +4,7 @@
  * ln-likelihood, so that the splines have to hold the rest alone. */
 #include "report.h"
 
-/* In selfcal_real_t, which is right to some 2e-7 n/2 ln V nats, and in selfcal_wide_t for what is longer than that. */
+/* In selfcal_real_t, right to some 2e-7 n/2 ln V nats, and in selfcal_wide_t for longer records. */
 #define NAME(name) name
 #define T selfcal_real_t
 #define T_(x) R(x)
@@ -34,7 +34,7 @@ static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_al
     return has_pole(work) ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
-/* What lines, and behind them an edge and a level for each three, add to the variance. */
+/* Variance that the lines add, and behind them an edge and a level for each three. */
 static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e) {
     selfcal_real_t more = R(0.0), ends = R(0.0);
     const selfcal_real_t *end = &truth->power[truth->lines];

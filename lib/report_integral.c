@@ -71,8 +71,8 @@ void selfcal_integral_begin(selfcal_work_t *work) {
  * between them. Its mass stays a float, and the report says that the grid does not bear it. */
 #define LOST R(30.0)
 
-/* What a cell adds to the sums, sigma_v integrated: its mass, the same times sigma_v^2 over that of the mode, and first
- * and second moments of N and of the drift parameter about the best cell, relative. */
+/* A cell's part of the sums, sigma_v integrated: its mass, its mass times sigma_v^2 over the mode's, and first and
+ * second moments of N and of the drift parameter about the best cell, relative. */
 typedef struct {
     selfcal_real_t mass, mass_sq, first[2], second[2];
 } sums_t;

@@ -91,7 +91,7 @@ static void keep_node(selfcal_work_t *work, uint16_t k, const selfcal_field_t *f
     work->scratch.fit.scatter[k] = scatter;
 }
 
-/* Looks at all nodes. The best of those with an expectation is the first guess of what made the data. */
+/* Some of all nodes. The best of those with an expectation is the first guess of the process that made the data. */
 void selfcal_node_step_truth(selfcal_work_t *work) {
     const selfcal_model_t *model = work->bank->model;
     selfcal_truth_t *truth = &work->truth;
@@ -145,7 +145,7 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
     work->hypothesis = 0;
 }
 
-/* What the splines have to carry at the nodes. */
+/* The node values less their expectation. */
 void selfcal_node_step_values(selfcal_work_t *work) {
     const uint16_t nodes = nodes_of(work);
     for (uint16_t k = step_part(work, STEP_VALUES, nodes); k < work->at; k++) {

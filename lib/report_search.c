@@ -153,7 +153,7 @@ void selfcal_search_begin(selfcal_work_t *work) {
     begin_pass(work);
 }
 
-/* What N and the drift parameter run through in a row: both are monotonic in rho. */
+/* Ranges of N and the drift parameter in a row: both are monotonic in rho. */
 static void note_ranges(selfcal_work_t *work) {
     for (int end = 0; end < 2; end++) {
         cell_t cell;

@@ -23,11 +23,11 @@
 #define UNSETTLED R(200.0)
 /* Of more nodes those that hardly settle at all are left out; fewer tell too little without. */
 #define UNSETTLED_NODES 150U
-/* Less, by nats below the best node, where intervals or samples are missing, the rate has changed, or regressors are in
- * use: what a node makes of the level on both sides of a gap, of noise that varies, or of what the coefficients take
- * up, depends on more than psi, and by some part in a hundred of those nats. */
+/* Less, by nats below the best node, where intervals or samples are missing, the rate has changed, or regressors are
+ * in use. The level on both sides of a gap, uneven noise and the coefficients then count as well as psi, by some
+ * part in a hundred of those nats. */
 #define FAR R(0.033)
-/* What a float holds of those nats, over the 0.01. */
+/* A float's digits of those nats, over the 0.01. */
 #define FAR_EVEN R(2e-4)
 
 /* Lines are so far apart in ln omega, as far as there are so many. */
@@ -96,9 +96,9 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
     }
 }
 
-/* Takes the best node as what made the data. A drift slower than the record looks like a random walk within it, and its
- * level is taken up by the bias: the pole is moved to 3/n at equal steps (for a random walk: the mean square about the
- * mean). */
+/* Takes the best node for the process that made the data. A drift slower than the record looks like a random walk
+ * within it, and the bias takes up its level. So the pole is moved to 3/n at equal steps (for a random walk: the
+ * mean square about the mean). */
 static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const bool pole = has_pole(work);
@@ -148,8 +148,8 @@ void selfcal_spectrum_solve(selfcal_work_t *work) {
     truth->fitted = true;
 }
 
-/* First the best node of all, for what made the data; then one after the other: its row is its variance over that
- * expected, less that of the best, by lines and edges of their prior deviations. */
+/* First the best node of all, for the process that made the data; then every node. Its row is its variance over the
+ * expected one, less the best node's, by lines and edges of their prior deviations. */
 void selfcal_spectrum_step(selfcal_work_t *work) {
     selfcal_truth_t *truth = &work->truth;
     const uint16_t at = work->at++, k = at == 0U ? work->best_node : (uint16_t)(at - 1U);

@@ -175,7 +175,7 @@ typedef struct {
 typedef enum {
     SELFCAL_COLUMN_TIME = 0,    /* s */
     SELFCAL_COLUMN_CHANNEL = 1, /* a channel; with a window its mean over that time up to the sample */
-    SELFCAL_COLUMN_RATE = 2,    /* what a channel gained over the window, per second */
+    SELFCAL_COLUMN_RATE = 2,    /* gain of a channel over the window, per second */
     SELFCAL_COLUMN_SINE = 3,    /* of a line */
     SELFCAL_COLUMN_COSINE = 4,
     SELFCAL_COLUMN_STEP = 5     /* 0, and 1 from a time on */
@@ -187,7 +187,7 @@ typedef struct {
     float number;    /* CHANNEL, RATE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz; STEP: time, s */
 } selfcal_source_t;
 
-/* Code for what is optional. Only a model that names one links it. */
+/* Optional code. Only a model that names it links it. */
 typedef struct selfcal_regressors_code selfcal_regressors_code_t;
 extern const selfcal_regressors_code_t selfcal_regressors_code;
 typedef struct selfcal_forgetting_code selfcal_forgetting_code_t;
@@ -365,7 +365,7 @@ typedef struct {
 #define SELFCAL_FIXED_LIMIT (3 * (1L << 25))
 const selfcal_scale_t *selfcal_scale(const selfcal_t *self, uint8_t axis);
 
-/* What one node knows of one axis, for tests and tools. It folds the batch first, hence not const. */
+/* State of one node for one axis, for tests and tools. The call folds the batch first, hence it is not const. */
 typedef struct {
     uint8_t hypothesis;
     selfcal_wide_t ln_rho, ln_alpha; /* the node; NaN where the law has none */
@@ -626,10 +626,10 @@ typedef struct {
     uint8_t data[8];
 } selfcal_frame_t;
 
-/* What the module does, for its status: finished once no sample will follow. */
+/* State of the module, for its status: finished once no sample will follow. */
 typedef enum { SELFCAL_RUNNING, SELFCAL_FINISHED } selfcal_state_t;
 
-/* What a module tells of itself beside the bank; meanings and codes as in selfcal.dbc. */
+/* A module's state beside the bank; meanings and codes as in selfcal.dbc. */
 typedef struct {
     uint32_t reset_cause;
     uint32_t fault_address;
@@ -654,7 +654,7 @@ typedef struct {
     uint32_t retired; /* a bit for each axis of the model */
     uint32_t command_count;
     uint32_t command_refused_count;
-    /* of each axis of the model, unit: what the sensor adds by itself, see selfcal_shift() */
+    /* of each axis of the model, unit: added by the sensor itself, see selfcal_shift() */
     float offset[SELFCAL_AXES_MAX];
 } selfcal_module_t;
 
@@ -688,8 +688,8 @@ void selfcal_mix_coefficients(const selfcal_report_t *report, const selfcal_mode
                               const selfcal_coefficients_t coefficients[], float probability,
                               selfcal_sent_coefficient_t sent[]);
 
-/* What the following reports tell of the regressors' coefficients on their axis, by column of the model. They must stay
- * as the report must. NULL, as at the start: nothing. */
+/* Coefficients for the following reports, by column of the model, on their axis. They must stay as the report must.
+ * NULL, as at the start: none. */
 void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[]);
 
 /* Sends one axis's report next: 7 frames, and of each hypothesis 3 and 5 for each of its parameters. The paper's three
@@ -699,7 +699,7 @@ void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sen
 selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
                                           const selfcal_counters_t *counters, uint32_t time_ms);
 
-/* What the following statuses tell of the module; it must stay. NULL: zeros. */
+/* The module's state for the following statuses; it must stay. NULL: zeros. */
 void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module);
 
 /* Sends the status next, 46 frames; otherwise as selfcal_telemetry_report(). */

@@ -88,7 +88,7 @@ typedef struct {
     selfcal_real_t e; /* innovation of the regressor "1" at the next sample less u_inf */
 } selfcal_moving_t;
 
-/* What the integer kernels keep once they do not: phi K + beta, u/s and 1/s, each times 2^shift. */
+/* Gains of a level node in the integer kernels: phi K + beta, u/s and 1/s, each times 2^shift. */
 typedef struct {
     int32_t g, u, w;
 } selfcal_settled_t;
@@ -183,7 +183,7 @@ typedef struct {
                                   (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + \
                                    (size_t)(axes) * (SELFCAL_TERMS_MAX + SELFCAL_STATE_SUMS)) * sizeof(selfcal_sum_t)))
 
-/* Pointers first: a snapshot is what follows them. */
+/* Pointers first: a snapshot has the members that follow them. */
 struct selfcal {
     const selfcal_model_t *model;
     selfcal_terms_t *terms;     /* of the laws that are sums; NULL: there are none */
@@ -192,9 +192,9 @@ struct selfcal {
     selfcal_total_t *b, *c;     /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_drift_t *x;         /* [nodes][axes]: predicted drift of the zero-bias filter */
     uint32_t n;                 /* bank samples in all sums */
-    selfcal_wide_t weight;      /* what they count for: n without forgetting */
+    selfcal_wide_t weight;      /* of these samples: n without forgetting */
     selfcal_wide_t keep;        /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */
-    selfcal_wide_t beginning;   /* what the first batch counts for */
+    selfcal_wide_t beginning;   /* weight of the first batch */
     selfcal_real_t rho_lo[SELFCAL_HYPOTHESES_MAX], rho_step[SELFCAL_HYPOTHESES_MAX]; /* ln of the nodes */
     selfcal_real_t alpha_lo[SELFCAL_HYPOTHESES_MAX], alpha_step[SELFCAL_HYPOTHESES_MAX];
     /* One batch is gathered while the nodes run, some at every push, over the one before. */
@@ -263,8 +263,8 @@ struct selfcal_former {
 #define SELFCAL_SIGMA_CELLS SELFCAL_BY_QUALITY(8, 24, 48, 96)
 #define SELFCAL_HISTOGRAM SELFCAL_BY_QUALITY(32, 64, 128, 512)
 
-/* report_expected.c: what is supposed to have made the data, when the expected likelihood is taken off the interpolated
- * one; report_spectrum.c: what the data's spectrum has beyond that. */
+/* report_expected.c: the process supposed to have made the data, for the expected likelihood; report_spectrum.c: the
+ * data's spectrum beyond it. */
 #define SELFCAL_FITTED (SELFCAL_LINES + (SELFCAL_LINES + 2) / 3 * 2)
 typedef struct {
     /* ln of the samples' noise, their geometric mean, over a whole block's at the model's rate */
@@ -275,7 +275,7 @@ typedef struct {
     selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
     uint8_t lines;
-    bool fitted, pair; /* what the nodes show besides is known; there are nodes in two dimensions */
+    bool fitted, pair; /* the spectrum is fitted; there are nodes in two dimensions */
     /* Of either sign: lines at frequencies omega, and behind them two of each three lines' band, edges and level. */
     selfcal_real_t distance[SELFCAL_LINES]; /* |1 - e^(i omega)|^2 */
     selfcal_real_t power[SELFCAL_FITTED];
@@ -288,8 +288,8 @@ typedef struct {
     selfcal_real_t scatter[SELFCAL_NODES_MAX]; /* of every node, ln of the readings' scatter from the best node's */
 } selfcal_fit_t;
 
-/* report_node.c: of the best node, variance of its residuals, the inverse, D; what the priors of the bias and the
- * coefficients add. */
+/* report_node.c: of the best node, variance of its residuals, the inverse, and D; the cost of sigma_v's mode, and
+ * the priors' part. */
 typedef struct {
     selfcal_wide_t var, per_var, ln_s;
     selfcal_real_t cost, extra;
@@ -322,7 +322,7 @@ typedef struct {
 #define SELFCAL_SEARCH_SAMPLES 8 /* of one search pass */
 typedef struct {
     uint8_t pass;
-    selfcal_real_t limit_lo[2], limit_hi[2]; /* what the priors permit of (ln rho, ln alpha) */
+    selfcal_real_t limit_lo[2], limit_hi[2]; /* permitted by the priors: (ln rho, ln alpha) */
     selfcal_range_t range[2];                /* of these the row in hand, and the rows */
     uint8_t least[2];                        /* cells that its peak needs */
     selfcal_real_t row_best;                 /* ln-likelihood of the row in hand */
@@ -353,7 +353,7 @@ struct selfcal_work {
     uint16_t first_node;
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     uint32_t batches; /* of the bank, when the sums came to rest */
-    bool gathered;    /* the nodes run over the last batch: what is pushed now is later than the report */
+    bool gathered;    /* the nodes run over the last batch: samples from now on come later than the report */
     uint8_t mask, unknowns;               /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     uint16_t best_node;                   /* of all: the likeliest */

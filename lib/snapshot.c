@@ -79,7 +79,7 @@ static uint32_t number_at(const uint8_t *bytes, size_t size) {
     return number;
 }
 
-/* What makes an image another build's. */
+/* Facts of the build. An image of other facts is refused. */
 static uint32_t layout(void) {
     const uint32_t facts[] = {
         sizeof(void *),
@@ -176,7 +176,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
 /* -----------------------------------------------------------------------------------------------------------
  * restore */
 
-/* What the header and the checksum say. */
+/* Judges the header and the checksum. */
 static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *bytes, size_t length) {
     if (length < HEADER + TRAILER) {
         return SELFCAL_SNAPSHOT_TRUNCATED;

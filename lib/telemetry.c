@@ -331,7 +331,7 @@ static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t coun
     return held_count(sum);
 }
 
-/* What the module tells of the axis that has message `message`, as a number; 0 if none has. */
+/* Offset of the axis that has message `message`, as a number; 0 if none has. */
 static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message)
 {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
