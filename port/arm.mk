@@ -1,8 +1,8 @@
 # NODE=n on the command line: the module's number on its bus. A variable of that name in the environment is another's.
 NODE_FLAGS := $(if $(filter command%,$(origin NODE)),-DSELFCAL_NODE=$(NODE))
 
-# How the library and the application are compiled for the cores; included by whatever builds for one. Sizes, and whether
-# samples are processed in integers, stand in the selfcal_config.h beside a model.
+# How the library and the application are compiled for the cores; included by whatever builds for one. Sizes, and
+# whether samples are processed in integers, stand in the selfcal_config.h beside a model.
 ARM_cortex-m4f := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
 ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb -fconserve-stack
 ARM_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror

@@ -393,7 +393,7 @@ def test_priors_that_the_library_cannot_hold(tmp_path: Path, limits: dict[str, f
 
 
 def test_a_bias_prior_that_the_library_cannot_hold(tmp_path: Path) -> None:
-    """Wider by 10^9 than the white noise it would take that for none: residuals end at 1e-9 of it (lib/posterior.c)."""
+    """Wider by 10^9 than the white noise it would take that for none: it ends at 1e-9 of it (lib/report_node.c)."""
     path = tmp_path / "model.yaml"
     text = MODEL.path.read_text()
     path.write_text(text.replace("bias: {law: normal, sd: 10.0}", "bias: {law: normal, sd: 1.0e+6}"))

@@ -427,8 +427,8 @@ def test_report_of_noise_that_varies(what: str) -> None:
 
 
 def test_a_grid_too_coarse_for_the_record_says_so() -> None:
-    """As measured in lib/posterior.c: 14 x 7 nodes hold for an hour's samples and not for 10^4, 9 x 6 are too few from
-    the start, the others hold to 1e5. Parameters in the middle of the priors, none off the grid."""
+    """As measured in lib/report_integral.c: 14 x 7 nodes hold for an hour's samples and not for 10^4, 9 x 6 are too few
+    from the start, the others hold to 1e5. Parameters in the middle of the priors, none off the grid."""
     truth = {"N": 0.03, "sigma_m": 0.03, "alpha": 0.01}
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 100_000, 5)[0][:, None]
     found = {}

@@ -12,7 +12,7 @@ from functools import cached_property
 
 #: Terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
 MOST_TERMS = 3
-#: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank.c.
+#: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
 FACTORS = (1e-3, 1e3)
 #: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")

@@ -23,7 +23,7 @@ DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
-#: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/posterior.c).
+#: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
 WIDEST_BIAS = 1e8
 #: Characters of a name or another text.
 LONGEST_TEXT = 200

@@ -21,7 +21,7 @@ from selfcal.units import same_kind
 RATE_LIMITS = (1e-6, 1e6)
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/internal.h, TIME_MAX in lib/bank.c.
+#: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/bank.h, TIME_MAX in lib/bank_states.c.
 ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
 
 
@@ -35,7 +35,7 @@ class Grid:
 
 @functools.cache
 def make_grid(nodes: int) -> Grid:
-    """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/posterior.c)."""
+    """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/report_spline.c)."""
     z = np.arange(nodes, dtype=float)
     knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
     return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
