@@ -260,7 +260,9 @@ def table(bench: Bench) -> str:
 
     def number(title: str, kind: str, name: str) -> None:
         rows_of = {t: f["sizes"] if kind == "sizes" else f["facts"] for t, f in targets.items()}
-        row(title, {target: f"{of[name]:,}" for target, of in rows_of.items() if name in of})
+        cells = {target: f"{of[name]:,}" for target, of in rows_of.items() if name in of}
+        if cells:  # a file that is younger than counts.json has none
+            row(title, cells)
 
     row("**instructions**", {})
     number("filters (nodes) of the default model", "facts", "nodes")
