@@ -37,7 +37,7 @@ SENSITIVITIES = (1.0, 0.5, 0.25)
 KIND_LEAST = 2.0
 #: Pieces at most: they take 3 KB each.
 PIECES_MOST = 40_000
-#: ln of the evidence for motion that is told. Of 264 clean records at 1 Hz two show more than 2: 3.6 and 4.4.
+#: ln of the evidence for motion that is told. Of 264 clean records at 1 Hz one shows more than 2: 4.4.
 MOTION_LEAST = 4.5
 
 
