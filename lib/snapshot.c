@@ -24,14 +24,14 @@ static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 
 /* Bytes of the bank that are in the image. */
 typedef struct {
-    void *from;
+    const void *from;
     size_t bytes;
 } part_t;
 
 enum { PARTS = 4 };
 
 /* Without `self`, their sizes alone. */
-static void parts_of(const selfcal_model_t *model, selfcal_t *self, part_t part[PARTS]) {
+static void parts_of(const selfcal_model_t *model, const selfcal_t *self, part_t part[PARTS]) {
     const size_t nodes = model->nodes, axes = model->axes, p = regressors_of(model), sums = sum_nodes(model);
     const size_t columns = SELFCAL_REGRESSORS_SIZE(nodes, axes, p), states = SELFCAL_TERMS_SIZE(sums, axes, p);
     memset(part, 0, PARTS * sizeof part[0]);
@@ -40,7 +40,7 @@ static void parts_of(const selfcal_model_t *model, selfcal_t *self, part_t part[
     part[2].bytes = p > 0U ? columns - 7U - sizeof(selfcal_columns_t) : 0U;
     part[3].bytes = sums > 0U ? states - 7U - sizeof(selfcal_terms_t) : 0U;
     if (self != NULL) {
-        part[0].from = (uint8_t *)self + offsetof(selfcal_t, n);
+        part[0].from = (const uint8_t *)self + offsetof(selfcal_t, n);
         part[1].from = self->b;
         part[2].from = p > 0U ? self->columns->column : NULL;
         part[3].from = sums > 0U ? self->terms->node : NULL;
@@ -152,7 +152,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     }
     const selfcal_model_t *model = self->model;
     part_t part[PARTS];
-    parts_of(model, (selfcal_t *)(uintptr_t)self, part); /* read alone */
+    parts_of(model, self, part);
     sink_t sink = {.write = write, .context = context, .good = true};
     put(&sink, magic, sizeof magic);
     put_number(&sink, 4, (uint32_t)size_of(model));
@@ -218,10 +218,16 @@ selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, 
     }
     bytes += HEADER;
     part_t part[PARTS];
-    parts_of(model, self, part);
+    parts_of(model, NULL, part);
+    void *const to[PARTS] = {
+        (uint8_t *)self + offsetof(selfcal_t, n),
+        self->b,
+        part[2].bytes > 0U ? self->columns->column : NULL,
+        part[3].bytes > 0U ? self->terms->node : NULL,
+    };
     for (size_t p = 0; p < PARTS; p++) {
         if (part[p].bytes > 0U) {
-            memcpy(part[p].from, bytes, part[p].bytes);
+            memcpy(to[p], bytes, part[p].bytes);
         }
         bytes += part[p].bytes;
     }
