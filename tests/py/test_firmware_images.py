@@ -41,7 +41,7 @@ CALLS = {"intake.c": ["selfcal_regressors_code?"]} | {
     "report_node.c": ["selfcal_regressors_code?"],
     "bank.c": ["selfcal_regressors_code?", "selfcal_states_code?", "selfcal_kernel_run"],
     "snapshot.c": [],
-    **dict.fromkeys(APP, ["board_time_ms", "board_sample", "board_send", "board_idle"]),
+    **{file: ["board_time_ms", "board_sample", "board_send", "board_idle"] for file in APP},
     "replay.c": ["board_read"],
 }
 
