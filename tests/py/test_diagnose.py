@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from selfcal.diagnosis.fit import Series, fit, ln_likelihood
 from selfcal.diagnosis.fit import run as run_filter
@@ -212,6 +213,21 @@ def test_a_jump_of_two_axes_is_no_motion_and_stands_where_it_is(tmp_path: Path) 
         assert time["q05"] - 0.5 < place - 0.5 < time["q95"] + 0.5
         assert time["sd"] >= 0.28  # no better than between two readings
         assert abs(amplitude["median"] - size) < 3.0 * amplitude["sd"]
+
+
+def test_a_wide_band_is_no_harmonic(tmp_path: Path) -> None:
+    """A square wave of 0.5 Hz, and a band at 9.55 Hz that is 0.2 Hz wide, about a multiple of it by chance."""
+    random = np.random.default_rng(4)
+    n, rate = 12000, 40.0
+    turn = np.exp((2j * np.pi * 9.55 - 2.0 * np.pi * 0.2) / rate)
+    band = lfilter([1.0], [1.0, -turn], random.standard_normal(n) + 1j * random.standard_normal(n)).real
+    line = np.sign(np.sin(2.0 * np.pi * 0.5 * np.arange(n) / rate + 0.1))
+    save(tmp_path / "log.npz", {"gx": ("deg/s", 0.1 * random.standard_normal(n) + 0.02 * band + 0.03 * line)}, rate)
+    findings = diagnose(tmp_path / "log.npz", axes=["gx"])["axes"]["gx"]["findings"]
+    found = [finding["estimate"] for finding in findings if finding["cause"] == "periodic"]
+    assert any(each["frequency_hz"]["median"] == pytest.approx(9.55, abs=0.1) for each in found)
+    (square,) = (each for each in found if each["frequency_hz"]["median"] == pytest.approx(0.5, abs=0.01))
+    assert set(square["harmonics"]) <= {3, 5, 7, 9, 11}
 
 
 @pytest.mark.parametrize("seed", [3, 20])

@@ -36,6 +36,8 @@ ROUNDS = 12
 BUSY = 3
 #: Times that one cause is named on an axis: more jumps or changes of the noise are none of single ones.
 MOST = {"step": 3, "variance_change": 3}
+#: A band wider than this share of a line's frequency lies at one of its multiples by chance.
+HARMONIC_MOST = 0.1
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
 #: Probability that the statistics together call an axis of a fitting record inadequate.
@@ -255,7 +257,8 @@ def _harmonics(one: Diagnosed) -> None:
             k = round(g["median"] / f["median"])
             if other is base or other not in one.findings or k < 2:
                 continue
-            if abs(g["median"] - k * f["median"]) < k * _breadth(base.look) + _breadth(other.look):
+            apart = k * _breadth(base.look) + _breadth(other.look)
+            if apart < HARMONIC_MOST * f["median"] and abs(g["median"] - k * f["median"]) < apart:
                 harmonics.append(k)
                 gain, worth = gain + other.look.gain, worth + other.look.net
                 one.findings.remove(other)
