@@ -215,6 +215,14 @@ def test_a_jump_of_two_axes_is_no_motion_and_stands_where_it_is(tmp_path: Path) 
         assert abs(amplitude["median"] - size) < 3.0 * amplitude["sd"]
 
 
+def test_repeats_of_a_coarse_lattice_are_not_held_readings(tmp_path: Path) -> None:
+    """One axis, whose lattice is as wide as its noise: a quarter of the readings repeat by chance."""
+    y = np.rint(np.random.default_rng(1).standard_normal(4000)) * 0.1
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 10.0)
+    findings = diagnose(tmp_path / "log.npz", axes=["gx"])["axes"]["gx"]["findings"]
+    assert [finding["cause"] for finding in findings] == ["quantization"]
+
+
 def test_a_wide_band_is_no_harmonic(tmp_path: Path) -> None:
     """A square wave of 0.5 Hz, and a band at 9.55 Hz that is 0.2 Hz wide, about a multiple of it by chance."""
     random = np.random.default_rng(4)

@@ -71,10 +71,18 @@ def _held(record: Record) -> Mask:
     if not repeats:
         return none
     held = np.all(repeats, axis=0)
-    shares = [(float(same.sum()) - float(held.sum())) / same.size for same in repeats]
+    shares = [
+        max((float(same.sum()) - float(held.sum())) / same.size, _repeats_by_chance(state))
+        for same, state in zip(repeats, record.axes.values(), strict=True)
+    ]
     expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
     # Chance repeats of coarse axes are not quite independent: three times the expectation.
     return held if poisson.logsf(int(held.sum()) - 1, 3.0 * expected + 0.05) < -NET_LEAST else none
+
+
+def _repeats_by_chance(state: State) -> float:
+    """Share of white noise's readings on the axis' lattice that repeat the one before."""
+    return 2.0 * float(ndtr(state.lsb / (2.0 * math.sqrt(2.0) * state.best.sigma))) - 1.0 if state.fits else 0.0
 
 
 def clock(record: Record) -> Look | None:
