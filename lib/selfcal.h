@@ -531,6 +531,73 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s,
                                  float *bias, float *sd);
 
+/* -------------------------------------------------------------------------------------------------------- adequacy
+ * Whether the model of the last report explains the readings after it. Optional: a program that does not name these
+ * functions pays nothing for them. Method: adequacy.c.
+ *
+ *     selfcal_adequacy_init(&adequacy, &bank);
+ *     each sample:  selfcal_push(...); selfcal_adequacy_push(&adequacy, &bank, channels, NULL);
+ *     each report:  selfcal_adequacy_report(&adequacy, &model, &report, NULL);
+ *     at any time:  selfcal_adequacy(&adequacy, axis)->state
+ */
+
+/* An epoch, bank samples. At its end each axis is judged. */
+#define SELFCAL_EPOCH_MIN 256U
+#define SELFCAL_EPOCH_MAX 4096U
+/* Scores beyond these make a model inadequate. One false flag in 1000 h over six axes at 1 Hz: tests/README.md. */
+#define SELFCAL_ADEQUACY_LIMIT 5.0F
+#define SELFCAL_ADEQUACY_LIMIT_VARIANCE 6.0F
+#define SELFCAL_ADEQUACY_LIMIT_KURTOSIS 10.0F
+
+typedef enum { SELFCAL_NOT_JUDGED = 0, SELFCAL_ADEQUATE = 1, SELFCAL_INADEQUATE = 2 } selfcal_adequacy_state_t;
+
+/* Causes, as `selfcal diagnose` names them. */
+typedef enum {
+    SELFCAL_SUSPECT_NONE = 0,
+    SELFCAL_SUSPECT_TEMPERATURE = 1,
+    SELFCAL_SUSPECT_SUPPLY = 2,
+    SELFCAL_SUSPECT_CROSS_AXIS = 3,
+    SELFCAL_SUSPECT_RAMP = 4,
+    SELFCAL_SUSPECT_COLORED_NOISE = 5,
+    SELFCAL_SUSPECT_FLICKER = 6, /* or another drift than the law's */
+    SELFCAL_SUSPECT_VARIANCE_CHANGE = 7,
+    SELFCAL_SUSPECT_OUTLIERS = 8
+} selfcal_suspect_t;
+
+/* Why an axis is not judged. */
+typedef enum {
+    SELFCAL_REASON_NONE = 0,
+    SELFCAL_REASON_FIRST_EPOCH = 1,     /* still under way */
+    SELFCAL_REASON_NO_REPORT = 2,       /* none yet, or the record lies outside the priors */
+    SELFCAL_REASON_LAW_NOT_WATCHED = 3, /* the likeliest law has coloured noise */
+    SELFCAL_REASON_RETIRED = 4
+} selfcal_reason_t;
+
+typedef struct {
+    selfcal_adequacy_state_t state;
+    selfcal_reason_t reason;
+    selfcal_suspect_t suspect; /* the strongest one, also of an adequate model */
+    float score;               /* of the suspect, in standard deviations of its null law */
+    uint32_t samples;          /* bank samples that it rests on */
+} selfcal_judgement_t;
+
+typedef struct selfcal_adequacy selfcal_adequacy_t;
+
+/* Begin; after selfcal_init() and selfcal_restore() of the bank. */
+selfcal_status_t selfcal_adequacy_init(selfcal_adequacy_t *self, const selfcal_t *bank);
+
+/* After each selfcal_push() or selfcal_push_with(). `channels`: temperature and supply; a value that is not finite is
+ * left out; NULL: neither is known. `values`: of the regressors; NULL without any. O(axes^2) at an interval's end. */
+void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, const float channels[],
+                           const float values[]);
+
+/* After each report. `coefficient`: of each regressor in use, 0 of the others; NULL: none is in use. */
+void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *model, const selfcal_report_t *report,
+                             const float coefficient[]);
+
+/* The judgement of the last epoch. */
+selfcal_judgement_t selfcal_adequacy(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis);
+
 /* ------------------------------------------------------------------------------------------------------------- gate
  * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both).
  * gate.c states the hypotheses, the statistics and their distributions. Independent of selfcal_t. */
@@ -691,6 +758,9 @@ void selfcal_mix_coefficients(const selfcal_report_t *report, const selfcal_mode
 /* Coefficients for the following reports, by column of the model, on their axis. They must stay as the report must.
  * NULL, as at the start: none. */
 void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[]);
+
+/* The adequacy that goes with the next report; it must stay until the report is out. NULL: none is sent. */
+void selfcal_telemetry_adequacy(selfcal_telemetry_t *self, const selfcal_judgement_t *judgement);
 
 /* Sends one axis's report next: 7 frames, and of each hypothesis 3 and 5 for each of its parameters. The paper's three
  * laws take 46. Each coefficient takes 3 more. `time_ms`: module time since its start, modulo 2^32, later than that of

@@ -437,12 +437,52 @@ struct selfcal_gate {
     selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
 };
 
+/* --------------------------------------------------------------------------------------------------------- adequacy */
+
+enum {
+    SELFCAL_ADEQUACY_CHANNELS = 2, /* temperature, supply */
+    SELFCAL_ADEQUACY_COLUMNS = 3,  /* time and the channels */
+    SELFCAL_ADEQUACY_INPUTS = SELFCAL_ADEQUACY_CHANNELS + SELFCAL_REGRESSORS_MAX,
+    SELFCAL_FILTER_STATES = 1 + SELFCAL_LAW_TERMS
+};
+
+typedef struct {
+    uint8_t states;
+    selfcal_real_t sigma; /* sigma_v, unit; the rest is relative to it */
+    selfcal_real_t pole[SELFCAL_FILTER_STATES], noise[SELFCAL_FILTER_STATES], variance[SELFCAL_FILTER_STATES];
+    selfcal_real_t coefficient[SELFCAL_REGRESSORS_MAX];
+} selfcal_filter_law_t;
+
+typedef struct {
+    selfcal_real_t n, lag, slow, along[SELFCAL_ADEQUACY_COLUMNS], weight[SELFCAL_ADEQUACY_COLUMNS];
+    selfcal_real_t product[SELFCAL_AXES_MAX]; /* with each other axis */
+} selfcal_sums_t;
+
+typedef struct {
+    bool known, running, begun;
+    selfcal_reason_t reason; /* if not known */
+    selfcal_filter_law_t next, law; /* of the last report; in use */
+    selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
+    selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
+    selfcal_real_t last, slow, fourth, square[2];
+    selfcal_sums_t epoch, all;
+} selfcal_watch_t;
+
+struct selfcal_adequacy {
+    uint32_t seen, before, length, count, elapsed, used;
+    bool any;
+    selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
+    selfcal_watch_t watch[SELFCAL_AXES_MAX];
+    selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
+};
+
 /* -------------------------------------------------------------------------------------------------------- telemetry */
 
 struct selfcal_telemetry {
     const selfcal_model_t *model;
     const selfcal_module_t *module;
     const selfcal_sent_coefficient_t *coefficient; /* [regressors of the model], or NULL */
+    const selfcal_judgement_t *judgement;          /* of the axis of the report, or NULL */
     uint16_t first_id;                 /* of the node */
     uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
     /* of the frames under way */

@@ -15,6 +15,10 @@ SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
                       SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
                       SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
+SELFCAL_STATIC_ASSERT(judgement_is_as_on_the_wire,
+                      (unsigned)SELFCAL_INADEQUATE == SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE &&
+                      (unsigned)SELFCAL_SUSPECT_OUTLIERS == SELFCAL_ADEQUACY_SUSPICION_OUTLIERS &&
+                      (unsigned)SELFCAL_REASON_RETIRED == SELFCAL_ADEQUACY_REASON_RETIRED);
 enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
 uint16_t selfcal_crc12(const uint8_t *data, size_t length)
@@ -101,6 +105,11 @@ void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sen
     self->coefficient = column;
 }
 
+void selfcal_telemetry_adequacy(selfcal_telemetry_t *self, const selfcal_judgement_t *judgement)
+{
+    self->judgement = judgement;
+}
+
 /* Frames of the message that node 0 sends as `id` next, its items `first` to `last`. */
 static void begin_message(selfcal_telemetry_t *self, uint32_t id, uint32_t first, uint32_t last)
 {
@@ -129,12 +138,12 @@ static uint8_t columns(const selfcal_telemetry_t *self)
     return self->coefficient != NULL && self->model->regressors != NULL ? self->model->regressors->count : 0U;
 }
 
-/* A report is its opening, a part for each hypothesis, the coefficients and the end. Goes to the next part; false after
- * the last, and in what is no report. */
+/* A report is its opening, a part for each hypothesis, the coefficients, the adequacy and the end. Goes to the next
+ * part. False after the last part, and in frames that are no report. */
 static bool next_part(selfcal_telemetry_t *self)
 {
     const uint32_t hypotheses = self->model->hypotheses;
-    if (self->source != REPORT || self->part > hypotheses + 1U) {
+    if (self->source != REPORT || self->part > hypotheses + 2U) {
         return false;
     }
     const uint32_t axis = self->message[self->report->axis], k = self->part++;
@@ -143,8 +152,11 @@ static bool next_part(selfcal_telemetry_t *self)
         begin_message(self, id, 0, SELFCAL_HYPOTHESIS_P2_Q95);
     } else if (k == hypotheses && columns(self) > 0U) {
         begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, COLUMN_ITEMS * columns(self) - 1U);
-    } else {
+    } else if (k <= hypotheses + 1U && self->judgement != NULL) {
         self->part = (uint8_t)(hypotheses + 2U);
+        begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0, SELFCAL_ADEQUACY_JUDGED);
+    } else {
+        self->part = (uint8_t)(hypotheses + 3U);
         begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
     }
     return true;
@@ -308,6 +320,17 @@ static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)
     }
 }
 
+static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item)
+{
+    switch (item) {
+    case SELFCAL_ADEQUACY_ADEQUACY: return (uint32_t)self->judgement->state;
+    case SELFCAL_ADEQUACY_SUSPICION: return (uint32_t)self->judgement->suspect;
+    case SELFCAL_ADEQUACY_SUSPICION_SCORE: return float_bits(self->judgement->score);
+    case SELFCAL_ADEQUACY_REASON: return (uint32_t)self->judgement->reason;
+    default: return self->judgement->samples;
+    }
+}
+
 /* The value of an item of the part of the report under way; false if it has none. */
 static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
 {
@@ -317,6 +340,10 @@ static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t
     }
     if (self->part == hypotheses + 1U) {
         return coefficient_value(self, item, value);
+    }
+    if (self->part == hypotheses + 2U) {
+        *value = adequacy_value(self, item);
+        return true;
     }
     *value = axis_value(self, item);
     return true;

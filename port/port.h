@@ -12,6 +12,10 @@
 /* Place of an axis among gx gy gz ax ay az: the order of the sensor's channels, and of the bits in commands and
  * telemetry. PORT_AXES: it is none of them. */
 enum { PORT_AXES = 6 };
+
+/* Beside the readings and the channels of the model every sample has these: the sensor's temperature, degC, and its
+ * supply, V. NaN: not known. */
+enum { PORT_TEMPERATURE = 0, PORT_SUPPLY = 1, PORT_SIDE = 2 };
 unsigned port_axis(const char *name);
 
 typedef enum {
@@ -27,8 +31,8 @@ typedef struct {
     uint32_t (*time_ms)(void *context);
 
     /* Takes the oldest waiting sample: one reading per axis in the model's order and units, then one per channel of the
-     * model (selfcal_model_channel_name). `missing`: how many samples are missing just before it. The port queues
-     * samples while a report is worked out. */
+     * model (selfcal_model_channel_name), then PORT_SIDE. `missing`: how many samples are missing just before it. The
+     * port queues samples while a report is worked out. */
     port_sample_t (*sample)(void *context, float reading[], uint32_t *missing);
 
     /* Takes a frame for the wire, in order. False: no room, the same frame is offered again later. With nobody

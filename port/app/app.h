@@ -30,6 +30,11 @@
 #error "APP_CORRECTED_MS: milliseconds, 0 for none"
 #endif
 
+/* 1: the module judges its own model (lib/adequacy.c) and tells it with each report; 0: no, and nothing of its cost. */
+#ifndef APP_ADEQUACY
+#define APP_ADEQUACY 1
+#endif
+
 /* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: the image takes
  * commands (command.h). Without a key it looks at nothing that comes by the wire but the opening and closing of an
  * SLCAN channel. */
@@ -104,7 +109,12 @@ typedef struct {
     selfcal_t bank;
     selfcal_work_t work;
     selfcal_report_t report;
+#if APP_ADEQUACY
+    selfcal_adequacy_t adequacy;
+    selfcal_judgement_t judged; /* of the axis of the report that is sent */
+#endif
 #if SELFCAL_MODEL_REGRESSORS > 0
+    float used[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS]; /* coefficients of each axis's last report; 0: unused */
     selfcal_former_t former;
     bool with;                 /* the report under way has all regressors of the axis in use */
     selfcal_wide_t ln_without; /* ln evidence of the report without, over the laws */
@@ -113,7 +123,6 @@ typedef struct {
     selfcal_sent_coefficient_t sent[SELFCAL_MODEL_REGRESSORS];
 #if APP_CORRECTED_MS
     float values[SELFCAL_MODEL_REGRESSORS];                     /* at the newest sample */
-    float used[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS];   /* coefficients of each axis's last report; 0: unused */
     float rested[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS]; /* the values for which its bias holds */
 #endif
 #endif

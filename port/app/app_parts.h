@@ -22,7 +22,7 @@ void app_pass(app_t *app, uint32_t count);
 /* Samples from the start, or the last call, to now. */
 uint32_t app_absent(app_t *app);
 
-/* The regressors' values go on from the samples that the bank has seen. */
+/* The regressors' values go on from the samples that the bank has seen, and the judgement of the model begins. */
 void app_begin_columns(app_t *app);
 
 /* app_state.c: saved state */

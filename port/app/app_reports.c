@@ -47,14 +47,30 @@ static bool weigh(app_t *app)
     if (probability > 0.5F) {
         app->report = app->report_with;
     }
-#if APP_CORRECTED_MS
     for (uint8_t k = 0; k < SELFCAL_MODEL_REGRESSORS; k++) {
         const bool used = probability > 0.5F && (mask >> k & 1U) != 0U && isfinite(app->sent[k].mean);
         app->used[axis][k] = used ? app->sent[k].mean : 0.0F;
+#if APP_CORRECTED_MS
         app->rested[axis][k] = selfcal_regressor_last(&app->bank, k);
-    }
 #endif
+    }
     return false;
+}
+#endif
+
+#if APP_ADEQUACY
+/* The judgement goes out with the report, which the next epoch goes by. */
+static void judge(app_t *app)
+{
+    const uint8_t axis = app->report.axis;
+#if SELFCAL_MODEL_REGRESSORS > 0
+    const float *used = app->used[axis];
+#else
+    const float *used = NULL;
+#endif
+    selfcal_adequacy_report(&app->adequacy, &selfcal_model, &app->report, used);
+    app->judged = selfcal_adequacy(&app->adequacy, &app->bank, axis);
+    selfcal_telemetry_adequacy(&app->telemetry, &app->judged);
 }
 #endif
 
@@ -81,6 +97,11 @@ bool app_compute(app_t *app)
 #endif
     app->computing = false;
     app->worked_out = status == SELFCAL_OK;
+#if APP_ADEQUACY
+    if (app->worked_out) {
+        judge(app);
+    }
+#endif
 #if APP_CORRECTED_MS
     if (app->worked_out) {
         app_keep_report(app);

@@ -10,12 +10,12 @@ void app_begin_columns(app_t *app)
     const selfcal_counters_t *seen = selfcal_counters(&app->bank);
     (void)selfcal_former_init(&app->former, &selfcal_model);
     selfcal_former_pass(&app->former, seen->samples + seen->missing);
-#if APP_CORRECTED_MS
     memset(app->used, 0, sizeof app->used);
 #endif
-#else
-    (void)app;
+#if APP_ADEQUACY
+    (void)selfcal_adequacy_init(&app->adequacy, &app->bank);
 #endif
+    (void)app;
 }
 
 void app_pass(app_t *app, uint32_t count)
@@ -91,7 +91,7 @@ static void give(app_t *app, const float reading[], const float values[])
 
 bool app_take_sample(app_t *app)
 {
-    float reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS];
+    float reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + PORT_SIDE];
     const float *values = NULL;
     uint32_t missing = 0;
     switch (app->port->sample(app->port->context, reading, &missing)) {
@@ -105,14 +105,17 @@ bool app_take_sample(app_t *app)
         }
 #if SELFCAL_MODEL_REGRESSORS > 0
         float formed[SELFCAL_MODEL_REGRESSORS];
-        const float *channels = SELFCAL_MODEL_CHANNELS > 0U ? reading + SELFCAL_MODEL_AXES : NULL;
-        selfcal_form(&app->former, missing, reading, channels, formed);
+        selfcal_form(&app->former, missing, reading, reading + SELFCAL_MODEL_AXES, formed);
         values = formed;
 #if APP_CORRECTED_MS
         memcpy(app->values, formed, sizeof formed);
 #endif
 #endif
         give(app, reading, values);
+#if APP_ADEQUACY
+        const float *side = reading + SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS;
+        selfcal_adequacy_push(&app->adequacy, &app->bank, side, values);
+#endif
         app->fresh = true;
 #if APP_CORRECTED_MS
         app_keep_sample(app, reading, missing);

@@ -66,9 +66,12 @@ port_sample_t sensor_sample(void *context, float reading[], uint32_t *missing)
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         reading[axis] = all[channel[axis]];
     }
+    float *side = reading + SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS;
+    side[PORT_TEMPERATURE] = adis16405_temperature(&sensor);
+    side[PORT_SUPPLY] = adis16405_supply(&sensor);
 #if SELFCAL_MODEL_CHANNELS > 0
     for (size_t i = 0; i < SELFCAL_MODEL_CHANNELS; i++) {
-        reading[SELFCAL_MODEL_AXES + i] = is_supply[i] ? adis16405_supply(&sensor) : adis16405_temperature(&sensor);
+        reading[SELFCAL_MODEL_AXES + i] = side[is_supply[i] ? PORT_SUPPLY : PORT_TEMPERATURE];
     }
 #endif
     return PORT_SAMPLE;

@@ -8,6 +8,8 @@ QEMU_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/replay/*.h port
                 $(MODEL_DIR)/selfcal_model.h $(MODEL_DIR)/selfcal_config.h
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
+# Its RAM has no room for the judgement of the model beside six axes.
+QEMU_APP_cortex-m0 := -DAPP_ADEQUACY=0
 QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part's 32: the recording's buffers and a stack twice as large, which an image does not have.
 QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
@@ -20,7 +22,8 @@ $(OUT)/selfcal-qemu.elf: $(QEMU_SOURCES) $(QEMU_HEADERS) port/qemu/link.ld port/
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) MODEL_DIR=$(MODEL_DIR) OUT=$(OUT)/objects \
 	    'PROGRAM_FLAGS=$(subst ','\'',$(QEMU_CFLAGS))'
 	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g $(NODE_FLAGS) \
-	    $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) -Ilib -Iport -Iport/app -Iport/replay \
+	    $(filter-out %.c,$(QEMU_CFLAGS)) -D$(QEMU_BOARD_$(CORE)) $(QEMU_APP_$(CORE)) \
+	    -Ilib -Iport -Iport/app -Iport/replay \
 	    -I$(MODEL_DIR),$(QEMU_SOURCES) $(filter %.c,$(QEMU_CFLAGS)),$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/qemu/link.ld -Wl,--gc-sections,--defsym=$(QEMU_MAP_$(CORE)) \
 	    $(OUT)/objects/*.o -lm -o $@

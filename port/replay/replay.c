@@ -23,7 +23,7 @@ const char *replay_open(replay_t *replay)
     if (little32(header + 8) != SELFCAL_MODEL_AXES) {
         return "its axes are not those of the model built in";
     }
-    if (little32(header + 12) != SELFCAL_MODEL_CHANNELS) {
+    if (little32(header + 12) != SELFCAL_MODEL_CHANNELS + PORT_SIDE) {
         return "its channels are not those of the model built in";
     }
     const uint64_t rate = little64(header + 16);
@@ -58,7 +58,7 @@ port_sample_t replay_sample(replay_t *replay, float reading[], uint32_t *missing
     }
     replay->waiting = false;
     *missing = little32(replay->row);
-    for (size_t i = 0; i < SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS; i++) {
+    for (size_t i = 0; i < REPLAY_VALUES; i++) {
         const uint32_t bits = little32(replay->row + 4 + 4 * i);
         memcpy(&reading[i], &bits, sizeof bits);
     }

@@ -2,7 +2,7 @@
  *
  * Little-endian: "SELFCAL1", uint32 axes, uint32 channels, float64 rate (Hz), uint64 rows. Then each row: uint32
  * samples missing just before it, float32 reading of each axis and of each channel. Axes, channels and units are the
- * model's. Time is that of the recording: samples passed over the rate. */
+ * model's; PORT_SIDE are the last channels. Time is that of the recording: samples passed over the rate. */
 #ifndef REPLAY_H
 #define REPLAY_H
 
@@ -13,7 +13,10 @@
 #include "port.h"
 #include "selfcal_model.h"
 
-enum { REPLAY_ROW_BYTES = 4 + 4 * (SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS) };
+enum {
+    REPLAY_VALUES = SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + PORT_SIDE,
+    REPLAY_ROW_BYTES = 4 + 4 * REPLAY_VALUES
+};
 
 typedef struct {
     bool (*read)(void *context, void *bytes, size_t count); /* exactly `count` bytes; false: there are not so many */

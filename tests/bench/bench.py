@@ -281,6 +281,8 @@ def table(bench: Bench) -> str:
     for law in ("flicker", "moving_average", "walk_and_markov"):
         per(f"{law} alone, per (node, sample, axis): settled", f"sums.{law}.steady", ".1f")
         per("… varying", f"sums.{law}.varying", ".1f")
+    per("judgement of the model, per (bank sample, axis): random walk", "adequacy.random_walk", ".0f")
+    per("… Gauss-Markov", "adequacy.gauss_markov", ".0f")
     shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}
     for target, figures in targets.items():
         seconds = RATE_HZ / MACHINES[target].systick_hz

@@ -2,6 +2,8 @@
  * costs at the sensor's full rate, between reports and while one is worked out, and how long samples wait then; the
  * gate by itself. Time is the instructions' own, at MHZ of them a second. Prints as bench.c does. Reading the sensor
  * and writing the wire are not in it. */
+#include <math.h>
+
 #include "app.h"
 #include "count.h"
 #include "record.h"
@@ -44,6 +46,9 @@ static port_sample_t board_sample(void *context, float reading[], uint32_t *miss
     }
     for (unsigned axis = 0; axis < AXES; axis++) {
         reading[axis] = ring[samples % RING][axis];
+    }
+    for (unsigned side = 0; side < PORT_SIDE; side++) {
+        reading[AXES + SELFCAL_MODEL_CHANNELS + side] = NAN;
     }
     *missing = samples == GAP_AT ? 1U : 0U;
     samples++;

@@ -110,7 +110,44 @@ static void measure_all(void) {
 
 #elif defined(BENCH_PLAIN)
 
+/* The judgement of the model, per (bank sample, axis), under a law of the default model. */
+static void measure_adequacy(const char *name, unsigned law) {
+    static selfcal_adequacy_t adequacy;
+    static selfcal_report_t report;
+    selfcal_model_t model = record_narrow_model(false, axis);
+    record_init(&record);
+    count_require(selfcal_init(&bank, &model, memory, sizeof memory) == SELFCAL_OK, "init");
+    while (selfcal_count(&bank) < SELFCAL_EPOCH_MIN + WINDOW) { /* whole batches are known */
+        (void)push_window();
+    }
+    (void)selfcal_adequacy_init(&adequacy, &bank);
+    for (unsigned h = 0; h < model.hypotheses; h++) {
+        report.hypothesis[h].probability = h == law ? 1.0F : 0.0F;
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            report.hypothesis[h].parameter[p].median = 0.01F;
+            report.hypothesis[h].parameter[p].q95 = 0.01F;
+        }
+    }
+    for (report.axis = 0; report.axis < AXES; report.axis++) {
+        selfcal_adequacy_report(&adequacy, &model, &report, NULL);
+    }
+    report.axis = 0;
+    taken_t taken = {0, 0, 0};
+    for (unsigned i = 0; i < WINDOW; i++) {
+        static const float side[] = {25.0F, 5.0F};
+        record_next(&record, window[0]);
+        (void)selfcal_push(&bank, window[0]);
+        const image_time_t start = image_now();
+        selfcal_adequacy_push(&adequacy, &bank, side, NULL);
+        count_add(&taken, count_since(start));
+    }
+    count_require(adequacy.count == WINDOW, "every bank sample is judged");
+    count_print(name, taken, (uint64_t)WINDOW * AXES);
+}
+
 static void measure_all(void) {
+    measure_adequacy("adequacy.random_walk", 1U);
+    measure_adequacy("adequacy.gauss_markov", 2U);
 }
 
 #else

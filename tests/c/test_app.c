@@ -4,6 +4,7 @@
 #include "selfcal_frames.h"
 #include "unity.h"
 
+#include <math.h>
 #include <string.h>
 
 /* A sensor that always has a sample, a clock of the samples, and a wire that takes every frame. */
@@ -23,6 +24,9 @@ static port_sample_t sample(void *context, float reading[], uint32_t *missing)
     (void)context;
     for (unsigned axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         reading[axis] = 0.1F * noise();
+    }
+    for (unsigned side = 0; side < PORT_SIDE; side++) {
+        reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + side] = NAN;
     }
     *missing = gaps && app.computing && draw() % 300U == 0U ? app.bank.block : 0U;
     time_samples += 1U + *missing;

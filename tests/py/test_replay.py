@@ -178,8 +178,8 @@ def test_replay_is_the_library_over_the_wire(
         assert len(checks) - ("lattice" in checks) == 4 + 6
         assert {check: outcome["value"] for check, outcome in axis["checks"].items()} == pytest.approx(checks, abs=0.02)
     said = capfd.readouterr().err
-    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 46 frames, and the last status
-    assert f"frames: {6 * (46 + 6 * 46) + 46} received, 0 lost" in said
+    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 51 frames, and the last status
+    assert f"frames: {6 * (46 + 6 * 51) + 46} received, 0 lost" in said
     image = (tmp_path / "report.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert struct.unpack(">II", image[16:24]) >= (1000, 500)
@@ -337,9 +337,9 @@ class Module:
 
 def rows(count: int = 600, axes: int = 1, rate_hz: float = 10.0, magic: bytes = b"SELFCAL1") -> bytes:
     noise = np.random.default_rng(1).normal(0.0, 0.1, count).astype("<f4")
-    body = np.zeros(count, dtype=[("missing", "<u4"), ("reading", "<f4")])
-    body["reading"] = noise
-    return magic + struct.pack("<IIdQ", axes, 0, rate_hz, count) + body.tobytes()
+    body = np.zeros(count, dtype=[("missing", "<u4"), ("reading", "<f4"), ("side", "<f4", (2,))])
+    body["reading"], body["side"] = noise, np.nan
+    return magic + struct.pack("<IIdQ", axes, 2, rate_hz, count) + body.tobytes()
 
 
 def read_until(line: int, end: bytes, seconds: float = 20.0) -> bytes:
@@ -357,8 +357,10 @@ def test_rows_written_are_rows_expected(tmp_path: Path) -> None:
     path.write_text("t[s],gx[rad/s]\n0,1.0\n0.1,2.0\n0.2,2.0\n0.5,3.0\n")
     write_rows(load(path, rate=10.0), Model.load(), ("gx",), tmp_path / "rows.bin")
     degrees = 180.0 / np.pi
-    want = b"SELFCAL1" + struct.pack("<IIdQ", 1, 0, 10.0, 4)
-    want += b"".join(struct.pack("<If", gap, x * degrees) for gap, x in ((0, 1), (0, 2), (0, 2), (2, 3)))
+    want = b"SELFCAL1" + struct.pack("<IIdQ", 1, 2, 10.0, 4)
+    unknown = b"\0\0\xc0\x7f"  # not a number: this recording has no temperature and no supply
+    rows = ((0, 1), (0, 2), (0, 2), (2, 3))
+    want += b"".join(struct.pack("<If4s4s", gap, x * degrees, unknown, unknown) for gap, x in rows)
     assert (tmp_path / "rows.bin").read_bytes() == want
 
 
@@ -398,7 +400,7 @@ def test_firmware_waits_for_open_and_for_close(tmp_path: Path) -> None:
     assert read_until(line, b"\r") == b"NSCAL\r"
     os.write(line, b"O\r")
     # the last frame is the number of frames sent: one report of status and axis, and the last status, less itself
-    frames = read_until(line, b"t2008" + struct.pack("<I", 46 + 46 + 45).hex().upper().encode())
+    frames = read_until(line, b"t2008" + struct.pack("<I", 46 + 51 + 45).hex().upper().encode())
     assert frames.startswith(b"\rt200860EA0000")  # its time: 60 000 ms
     time.sleep(0.3)
     assert module.process.poll() is None  # what it sent could still be unread
@@ -440,7 +442,7 @@ def test_firmware_keeps_to_the_wall_clock(tmp_path: Path) -> None:
     line = module.open()
     begun = time.monotonic()
     os.write(line, b"O\r")
-    read_until(line, b"t2008" + struct.pack("<I", 6 * (46 + 46) + 45).hex().upper().encode())
+    read_until(line, b"t2008" + struct.pack("<I", 6 * (46 + 51) + 45).hex().upper().encode())
     took = time.monotonic() - begun
     os.write(line, b"C\r")
     assert module.end()[0] == 0

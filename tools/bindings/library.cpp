@@ -115,6 +115,40 @@ public:
         }
     }
 
+    // Judgements (axis, sample, state, suspect, score, samples) of a record, with a report on every axis just before
+    // each epoch: a module reports every few seconds. `channels` [n, 2]: temperature and supply.
+    std::vector<std::tuple<int, size_t, int, int, float, uint32_t>>
+    watch(const Rows &samples,
+          const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before,
+          const std::optional<Rows> &channels) {
+        if (samples.shape(1) != axes_.size() || missing_before.shape(0) != samples.shape(0) ||
+            (channels && (channels->shape(0) != samples.shape(0) || channels->shape(1) != SELFCAL_ADEQUACY_CHANNELS)))
+            throw std::invalid_argument("samples must be [n, axes], missing_before [n], channels [n, 2]");
+        std::vector<std::tuple<int, size_t, int, int, float, uint32_t>> told;
+        nb::gil_scoped_release release;
+        auto adequacy = std::make_unique<selfcal_adequacy_t>();
+        check(selfcal_adequacy_init(adequacy.get(), &bank_));
+        selfcal_report_t report{};
+        for (size_t i = 0; i < samples.shape(0); i++) {
+            if (missing_before.data()[i] > 0)
+                check(selfcal_skip(&bank_, missing_before.data()[i]));
+            check(selfcal_push(&bank_, samples.data() + i * axes_.size()));
+            const uint32_t before = adequacy->count;
+            const float *beside = channels ? channels->data() + i * SELFCAL_ADEQUACY_CHANNELS : nullptr;
+            selfcal_adequacy_push(adequacy.get(), &bank_, beside, nullptr);
+            const bool ended = adequacy->count != before && adequacy->count == adequacy->length;
+            for (uint8_t axis = 0; ended && axis < axes_.size(); axis++) {
+                const selfcal_judgement_t j = selfcal_adequacy(adequacy.get(), &bank_, axis);
+                told.emplace_back(axis, i, j.state, j.suspect, j.score, j.samples);
+            }
+            const bool due = ended || (adequacy->length == 0 && (i + 1) % SELFCAL_EPOCH_MIN == 0);
+            for (uint8_t axis = 0; due && axis < axes_.size(); axis++)
+                if (selfcal_report(work_.get(), &bank_, axis, &report) == SELFCAL_OK)
+                    selfcal_adequacy_report(adequacy.get(), &model_, &report, nullptr);
+        }
+        return told;
+    }
+
     void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
     void moving() { check(selfcal_moving(&bank_)); }
     void push_moving(const Rows &samples) {
@@ -468,6 +502,7 @@ NB_MODULE(MODULE_NAME, m) {
              nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(),
                  nb::arg("half_life_s") = 0.0)
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
+        .def("watch", &Bank::watch)
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
         .def("push_moving", &Bank::push_moving)

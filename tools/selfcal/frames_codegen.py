@@ -24,7 +24,7 @@ COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
 #: Those that modules send.
-SENT = ("", "_H0", "_COEFFICIENTS")
+SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
 HEADINGS = {
     "": "Axis",

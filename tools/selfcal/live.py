@@ -35,6 +35,8 @@ SILENT_S, INTERVALS = 3.0, 3.0
 #: (STATUS_MS in port/app/app_frames.c), and a save takes up to 2 s.
 FIRST_S = 12.0
 BLOCKS = "▁▂▃▄▅▆▇█"
+#: Colours of a module's judgement of its model.
+ADEQUACY = {"inadequate": "red", "adequate": "green"}
 
 
 class Source(Protocol):
@@ -276,6 +278,8 @@ class View:
             chunks = [Text.assemble(bias[axis].ljust(bias_width), " ", course, " ", parameters[axis][0])]
             chunks += [Text(text) for text in parameters[axis][1:]]
             chunks += [Text(text) for text in _coefficients(report, names)]
+            if report.adequacy is not None:
+                chunks.append(Text(str(report.adequacy), ADEQUACY.get(report.adequacy.state, "dim")))
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks

@@ -181,6 +181,21 @@ class AxisReport:
             bias_sd=v["bias_sd"],
         )
 
+    @property
+    def adequacy(self) -> Adequacy | None:
+        """What the module says of its model on this axis; None if it does not judge, or not all of it arrived."""
+        if not {"adequacy", "reason", "suspicion", "suspicion_score", "judged"} <= self.values.keys():
+            return None
+        message = load_dbc().get_message_by_name(f"{AXES[0].upper()}_ADEQUACY")
+
+        def word(signal: str) -> str:
+            number = self.values[signal]
+            choices = {key: str(name) for key, name in (message.get_signal_by_name(signal).choices or {}).items()}
+            return choices.get(int(number), f"{number:g}")
+
+        score, samples = self.values["suspicion_score"], int(self.values["judged"])
+        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples)
+
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
         """Mean, sd and probability of use of each regressor column that was told."""
         return {
@@ -188,6 +203,26 @@ class AxisReport:
             for c, (name, _) in enumerate(names.columns)
             if f"c{c}_mean" in self.values
         }
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What a module says of its model on an axis (lib/adequacy.c): words as in the DBC.
+
+    `state` is adequate, inadequate or not_judged, the last with a `reason`. `suspicion` is the strongest, `score` in
+    standard deviations of its null law, over `samples` bank samples.
+    """
+
+    state: str
+    reason: str
+    suspicion: str
+    score: float
+    samples: int
+
+    def __str__(self) -> str:
+        if self.state == "inadequate":
+            return f"not adequate: {self.suspicion} ({self.score:+.1f} sd)"
+        return "adequate" if self.state == "adequate" else f"not judged: {self.reason.replace('_', ' ')}"
 
 
 @dataclass

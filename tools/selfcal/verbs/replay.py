@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,14 @@ from selfcal.regressors import (
 from selfcal.result import AxisResult, in_unit
 from selfcal.tables import bank_block, gate_table, make_tables
 from selfcal.units import factor as factor_of
+from selfcal.units import same_kind
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus
 
 MAGIC = b"SELFCAL1"
+#: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
+SIDE = (("temp", "degC"), ("supply", "V"))
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
@@ -220,12 +223,15 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
     units = [(name, model.group_of(name).unit) for name in axes]
     channels = make_tables(model, recording.rate_hz, tuple(axes)).channels
     check_channels(model.regressors, recording)
-    rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("value", "<f4", (len(axes) + len(channels),))])
+    wanted = (*units, *channels, *SIDE)
+    rows = np.zeros(recording.samples, dtype=[("missing", "<u4"), ("value", "<f4", (len(wanted),))])
     rows["missing"] = recording.missing_before
-    for index, (name, unit) in enumerate((*units, *channels)):
-        rows["value"][:, index] = as_float(recording.in_unit(name, unit))
+    for index, (name, unit) in enumerate(wanted):
+        there = name in recording.columns and same_kind(recording.columns[name].unit, unit)
+        known = there or (name, unit) not in SIDE
+        rows["value"][:, index] = as_float(recording.in_unit(name, unit)) if known else np.nan
     header = np.array(
-        [(MAGIC, len(axes), len(channels), recording.rate_hz, recording.samples)],
+        [(MAGIC, len(axes), len(channels) + len(SIDE), recording.rate_hz, recording.samples)],
         dtype=[("magic", "S8"), ("axes", "<u4"), ("channels", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
     )
     with path.open("wb") as file:
@@ -419,6 +425,12 @@ def _document(
         except UserError as error:
             found[name] = error
     document = to_document(recording, found)
+    for name, axis in document["axes"].items():
+        if "error" not in axis:
+            told = history[name][-1].adequacy
+            axis["module_says"] = asdict(told) if told is not None else None
+            if told is not None and told.state == "inadequate":
+                note(f"{name}: the module says {told}; why, and what mends it: selfcal diagnose {recording.path}")
     if gate:
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry

@@ -1,0 +1,159 @@
+"""How often the module's adequacy (lib/adequacy.c) flags records, clean ones and ones with an effect.
+
+    python tests/adequacy_rates.py --records 50 --hours 10 --seed 1 [--effect NAME --size S] [--out FILE]
+
+Each record has six axes at 1 Hz, each with a law drawn from those of the default model and parameters from its priors.
+An effect is on gx alone, whose drift is small. Clean ones have a temperature that warms up and wanders, a supply that
+steps, and gaps: none of them moves the bias. The library in float runs as on a module, with a report before each epoch.
+Prints the flags by suspicion; `--out` takes every judgement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.engines.library import Bank
+from selfcal.model import Model
+from selfcal.tables import Tables, make_tables
+from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+
+AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+LAWS = ("constant", "random_walk", "gauss_markov")
+SUSPECTS = (
+    "none",
+    "temperature",
+    "supply",
+    "cross_axis",
+    "ramp",
+    "colored_noise",
+    "flicker",
+    "variance_change",
+    "outliers",
+)
+
+
+def channels_of(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """[n, 2]: temperature in degC and supply in V."""
+    t = np.arange(n)
+    warm = 25.0 + rng.uniform(0, 15) * (1.0 - np.exp(-t / rng.uniform(300, 3000)))
+    day = rng.uniform(0, 5) * np.sin(2 * np.pi * (t / rng.uniform(5000, 90000) + rng.uniform()))
+    temp = np.round((warm + day + 0.02 * rng.standard_normal(n)) / 0.005) * 0.005
+    supply = 5.0 + 0.002 * rng.standard_normal(n) + 0.1 * (t > rng.uniform(0, n))
+    return np.column_stack([temp, supply])
+
+
+def with_effect(
+    y: NDArray[np.float64],
+    name: str,
+    size: float,
+    sigma: float,
+    channels: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """One axis with an effect of `size` times the white noise of a bank sample, from the middle on where it begins."""
+    n, t = y.size, np.arange(y.size)
+    late = t >= n // 2
+    if name == "temperature":
+        return y + size * sigma * (channels[:, 0] - 25.0)
+    if name == "supply":
+        return y + size * sigma * (channels[:, 1] - 5.0) / 0.1
+    if name == "ramp":
+        return y + size * sigma * t / 3600.0
+    if name == "step":
+        return y + size * sigma * late
+    if name == "periodic":
+        return y + size * sigma * np.sin(2 * np.pi * t / 37.0)
+    if name == "variance_change":
+        return np.where(late, y + math.sqrt(size**2 - 1.0) * sigma * rng.standard_normal(n), y)
+    if name == "outliers":
+        return y + size * sigma * (rng.uniform(size=n) < 0.002) * rng.choice([-1.0, 1.0], n)
+    if name == "flicker":
+        parts = [(1.0 / 20.0, 1.0), (1.0 / 200.0, 1.0), (1.0 / 2000.0, 1.0)]
+        for rate, deviation in parts:
+            z, drift = rng.standard_normal(n), np.zeros(n)
+            phi = math.exp(-rate)
+            for i in range(1, n):
+                drift[i] = phi * drift[i - 1] + deviation * math.sqrt(1.0 - phi * phi) * z[i]
+            y = y + size * sigma * drift
+        return y
+    if name == "cross_axis":
+        return y
+    if name == "colored_noise":
+        noise = sigma * rng.standard_normal(n)
+        memory = np.zeros(n)
+        for i in range(1, n):
+            memory[i] = 0.5 * memory[i - 1] + noise[i]
+        return y + size * memory
+    raise SystemExit(f"there is no effect {name}")
+
+
+def record(tables: Tables, model: Model, hours: float, seed: int, effect: str, size: float) -> list[tuple[int, ...]]:
+    """Judgements of one record; an effect is on gx alone."""
+    rng = np.random.default_rng(seed)
+    n = round(hours * 3600)
+    channels = channels_of(rng, n)
+    columns = []
+    for axis in AXES:
+        law = LAWS[rng.integers(3)]
+        truth = draw(model.group_of(axis), law, rng)
+        if effect and axis == "gx":  # one whose drift hides little
+            law, truth = "random_walk", {"N": 0.04, "K": 2e-4, "bias": 0.1}
+        y = simulate_bank_samples(law, truth, 1.0, n, int(rng.integers(2**31)))[0]
+        if effect and axis == "gx":
+            y = with_effect(y, effect, size, truth["N"], channels, rng)
+        columns.append(y)
+    if effect == "cross_axis":
+        columns[0] = columns[0] + size * np.std(np.diff(columns[0])) / np.std(np.diff(columns[1])) * columns[1]
+    missing = np.where(rng.uniform(size=n) < 1e-3, rng.integers(1, 30, n), 0).astype(np.uint64)
+    told = Bank(tables).raw.watch(np.column_stack(columns).astype(np.float32), missing, channels.astype(np.float32))
+    return list(told)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--records", type=int, default=20)
+    parser.add_argument("--hours", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--effect", default="")
+    parser.add_argument("--size", type=float, default=1.0)
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    model = Model.load(None)
+    tables = make_tables(model, 1.0, AXES)
+    flags: Counter[str] = Counter()
+    judged = 0
+    rows = []
+    first: list[float] = []
+    for k in range(given.records):
+        told = record(tables, model, given.hours, given.seed + k, given.effect, given.size)
+        for axis, at, state, suspect, score, samples in told:
+            if state:
+                judged += 1
+                rows.append((k, axis, at, state, suspect, score, samples))
+                if state == 2 and not (given.effect and axis != 0):
+                    flags[SUSPECTS[suspect]] += 1
+        if given.effect:
+            hit = [at for axis, at, state, suspect, *_ in told if axis == 0 and state == 2]
+            first.append(hit[0] / 3600 if hit else math.nan)
+    hours = given.records * given.hours
+    print(
+        f"{hours:g} h of {given.effect or 'clean'} records, {judged} judgements: {sum(flags.values())} flags",
+        dict(flags),
+    )
+    if given.effect:
+        found = np.array(first)
+        after = f", after {np.nanmedian(found):.2f} h in the median" if np.isfinite(found).any() else ""
+        print(f"flagged {np.isfinite(found).mean():.0%} of records{after}")
+    if given.out:
+        given.out.write_text(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main()

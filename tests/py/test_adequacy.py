@@ -1,0 +1,202 @@
+"""The module's adequacy (lib/adequacy.c): its statistics against a filter in numpy, what it flags and what it does not.
+
+Truth: the textbook Kalman filter of the model stated, and records whose effect is known. The rate of false flags over
+5000 h and the shares found are campaigns: tests/adequacy_rates.py, figures in tests/README.md.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from selfcal.engines.library import Bank
+from selfcal.model import Model
+from selfcal.tables import Tables, make_tables
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.montecarlo import simulate_bank_samples
+from selfcal.verbs.replay import replay
+from selfcal.verbs.simulate import simulate
+
+MODEL = Model.load(None)
+SUSPECTS = (
+    "none",
+    "temperature",
+    "supply",
+    "cross_axis",
+    "ramp",
+    "colored_noise",
+    "flicker",
+    "variance_change",
+    "outliers",
+)
+LIMITS = {"variance_change": 6.0, "outliers": 10.0}  # SELFCAL_ADEQUACY_LIMIT_*; of the others 5
+EPOCH = 256
+
+
+def tables_of(*names: str, laws: tuple[str, ...] = ("constant", "random_walk", "gauss_markov")) -> Tables:
+    return make_tables(replace(MODEL, hypotheses=dict.fromkeys(laws, 1.0 / len(laws))), 1.0, names)
+
+
+def watch(
+    y: NDArray[np.float64],
+    channels: NDArray[np.float64] | None = None,
+    tables: Tables | None = None,
+    missing: bool = False,
+) -> list[tuple[int, int, int, str, float, int]]:
+    """Axis, sample, state, suspect, score and length of each judgement of y [n, axes]."""
+    before = np.zeros(len(y), np.uint64)
+    before[::97] = 5 if missing else 0
+    tables = tables or tables_of(*("gx", "gy", "gz")[: y.shape[1]])
+    beside = None if channels is None else channels.astype(np.float32)
+    told = Bank(tables).raw.watch(np.ascontiguousarray(y, np.float32), before, beside)
+    return [(axis, at, state, SUSPECTS[suspect], score, n) for axis, at, state, suspect, score, n in told]
+
+
+def walk(n: int, seed: int, K: float = 2e-4) -> NDArray[np.float64]:
+    return simulate_bank_samples("random_walk", {"N": 0.04, "K": K, "bias": 0.1}, 1.0, n, seed)[0]
+
+
+def flags(told: list[tuple[int, int, int, str, float, int]], axis: int = 0) -> list[str]:
+    return [suspect for at, _, state, suspect, _, _ in told if at == axis and state == 2]
+
+
+@pytest.mark.parametrize("law", ["constant", "random_walk", "gauss_markov"])
+def test_the_scores_are_those_of_the_textbook_filter(law: str) -> None:
+    """The first epoch of a record of one law, with a temperature and gaps. The parameters are those of the report after
+    256 samples: the median of N and alpha, the 95 % quantile of the drift. Float32 against double: 1e-3 of a score."""
+    n = 2 * EPOCH
+    truth = {"N": 0.04, "K": 4e-3, "sigma_m": 0.05, "alpha": 0.03, "bias": 0.1}
+    y = simulate_bank_samples(law, truth, 1.0, n, 3)[0].astype(np.float32).astype(float)
+    rng = np.random.default_rng(1)
+    channels = np.column_stack([25.0 + 0.05 * np.arange(n) ** 0.5 + 0.02 * rng.standard_normal(n), np.full(n, 5.0)])
+    channels = channels.astype(np.float32).astype(float)
+    tables = tables_of("gx", laws=(law,))
+    (_, _, state, suspect, score, length), *_ = watch(y[:, None], channels, tables)
+    assert (state, length) == (1, EPOCH)
+
+    bank = Bank(tables)
+    bank.push(y[:EPOCH, None])
+    estimates = bank.report(0).parameters[law]
+    found = {name: one.q95 if name in ("K", "sigma_m") else one.median for name, one in estimates.items()}
+    z, (w_time, w_temp) = innovations(y[EPOCH:], found, [np.arange(EPOCH, dtype=float), channels[EPOCH:, 0]])
+    known = 1.0 / math.sqrt(1.0 + (EPOCH - 1) / EPOCH)
+    root = 1.0 / math.sqrt(EPOCH - 1)
+    slow = np.zeros(EPOCH)
+    for i in range(1, EPOCH):
+        slow[i] = slow[i - 1] + (z[i] - slow[i - 1]) / 16.0
+    half = EPOCH // 2
+    lag, mean = z[1:] @ z[:-1], z[1:] @ slow[:-1] / math.sqrt((1 / 16) / (2 - 1 / 16))
+    scores = [
+        ("ramp", z @ w_time / math.sqrt(w_time @ w_time)),
+        ("temperature", z @ w_temp / math.sqrt(w_temp @ w_temp)),
+        ("colored_noise", max(known * root * lag, 0.0)),
+        ("colored_noise", max(math.sqrt(0.5) * root * lag, 0.0)),
+        ("flicker", max(known * root * mean, 0.0)),
+        ("flicker", max(math.sqrt(0.5) * root * mean, 0.0)),
+        ("variance_change", max(known * root * (z[1:] @ z[1:] - (EPOCH - 1)) / math.sqrt(2.0), 0.0)),
+        ("variance_change", root * (np.sum(z[half:] ** 2 - 1) - np.sum(z[1:half] ** 2 - 1)) / math.sqrt(2.0)),
+        ("outliers", np.sum(z[1:] ** 4 - 6.0 * z[1:] ** 2 + 3.0) * root / math.sqrt(24.0)),
+    ]
+    expected = max(scores, key=lambda one: abs(one[1]) / LIMITS.get(one[0], 5.0))
+    assert suspect == expected[0]
+    assert score == pytest.approx(expected[1], abs=1e-3)
+
+
+def innovations(
+    y: NDArray[np.float64], parameters: dict[str, float], columns: list[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+    """z of y and w of each column, at an interval of 1 s. The first is 0: it tells the level, which has no prior."""
+    variance = parameters["N"] ** 2
+    F, Q, P = np.eye(1), np.zeros((1, 1)), np.array([[1e8]])
+    if "K" in parameters:
+        Q[0, 0] = parameters["K"] ** 2 / variance
+    if "sigma_m" in parameters:
+        pole, stationary = math.exp(-parameters["alpha"]), parameters["sigma_m"] ** 2 / variance
+        F, Q = np.diag([1.0, pole]), np.diag([0.0, stationary * (1.0 - pole**2)])
+        P = np.diag([1e8, stationary])
+    series = [y / math.sqrt(variance), *(column - column[0] for column in columns)]
+    states = [np.zeros(len(F)) for _ in series]
+    H = np.ones(len(F))
+    out: list[list[float]] = [[] for _ in series]
+    for t in range(y.size):
+        if t:
+            P = F @ P @ F.T + Q
+        S = H @ P @ H + 1.0
+        gain = P @ H / S
+        P = P - np.outer(gain, P @ H)
+        for k, one in enumerate(series):
+            states[k] = F @ states[k] if t else states[k]
+            nu = one[t] - H @ states[k]
+            states[k] = states[k] + gain * nu
+            out[k].append(float(nu / math.sqrt(S)) if t else 0.0)
+    z, *w = (np.array(one) for one in out)
+    return z, w
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_clean_record_is_adequate(missing: bool) -> None:
+    """Six hours of three axes with a warm-up and a supply step that move nothing. At one false flag in 1000 h of six
+    axes the chance of one here is 0.3 %."""
+    n = 6 * 3600
+    t = np.arange(n)
+    channels = np.column_stack([25.0 + 10.0 * (1.0 - np.exp(-t / 900.0)), 5.0 + 0.1 * (t > n // 2)])
+    told = watch(np.column_stack([walk(n, seed) for seed in (1, 2, 3)]), channels, missing=missing)
+    assert {state for _, _, state, *_ in told} == {1}
+    assert [length for axis, *_, length in told if axis == 0][:4] == [256, 256, 384, 576]
+
+
+def test_the_cause_is_named() -> None:
+    """One effect at a time on the first of two axes, from the start; sizes well above the noise."""
+    n = 4 * 3600
+    t = np.arange(n)
+    rng = np.random.default_rng(5)
+    temp = 25.0 + 4.0 * np.sin(t / 400.0)
+    channels = np.column_stack([temp, 5.0 + 0.05 * np.sign(np.sin(t / 500.0))])
+    clean, other = walk(n, 11), walk(n, 12)
+    memory = np.convolve(rng.standard_normal(n + 1), [0.6, 0.6], "valid") * 0.04
+    effects = {
+        "temperature": clean + 0.01 * (temp - 25.0),
+        "supply": clean + 0.5 * (channels[:, 1] - 5.0),
+        "cross_axis": clean + 0.4 * other,
+        "outliers": clean + 0.4 * (rng.uniform(size=n) < 0.003) * rng.choice([-1.0, 1.0], n),
+        "variance_change": np.where(t > n // 2, clean + 0.04 * rng.standard_normal(n), clean),
+        "colored_noise": clean + memory,
+    }
+    for cause, y in effects.items():
+        found = flags(watch(np.column_stack([y, other]), channels))
+        assert cause in found, f"{cause}: {found}"
+        assert found.count(cause) > len(found) / 2, f"{cause}: {found}"
+        if cause != "cross_axis":  # correlation has no direction
+            assert not flags(watch(np.column_stack([y, other]), channels), axis=1)
+
+
+@pytest.mark.parametrize("target", ["host", "cortex-m4f"])
+def test_the_module_says_it_and_the_better_model_ends_it(target: str, tmp_path: Path) -> None:
+    """Another axis in the readings: the firmware names it under the default laws. Under the model file that `diagnose`
+    writes the same record is adequate."""
+    if target != "host" and shutil.which("qemu-system-arm") is None:
+        pytest.skip("qemu-system-arm is missing: make setup")
+    base, log, better = tmp_path / "base.yaml", tmp_path / "log.npz", tmp_path / "better.yaml"
+    tree: dict[str, Any] = yaml.safe_load(MODEL.path.read_text(encoding="utf-8"))
+    tree["groups"]["gyro"]["lsb"] = 0.001
+    axis = {"hypothesis": "random_walk", "bias": 0.1, "N": 0.04, "K": 2.0e-4}
+    tree["simulate"] = {"rate_hz": 1.0, "duration_s": 4800.0, "axes": {"gx": axis, "gy": axis}}
+    base.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    simulate(base, log, seed=4, effects=["cross_axis:other=gy,coefficient=0.4,axis=gx"])
+    told = {}
+    diagnose(log, axes=["gx"], model=base, write_model=better)
+    for name, model in (("before", base), ("after", better)):
+        said = replay(log, axes=["gx", "gy"], model=model, target=target, report_every=60.0)["axes"]["gx"][
+            "module_says"
+        ]
+        told[name] = said["state"], said["suspicion"]
+    assert told["before"] == ("inadequate", "cross_axis")
+    assert told["after"][0] == "adequate"
