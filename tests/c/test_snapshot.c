@@ -18,7 +18,7 @@
 
 enum { AXES = 2, BLOCK = 3, SAMPLES = 420 };
 #define MEMORY_BYTES SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
-#define BYTES_MAX SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
+#define BYTES_MAX SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES)
 enum { OFFSET_LENGTH = 4, OFFSET_VERSION = 8, OFFSET_REAL = 10, OFFSET_AXES = 11, OFFSET_NODES = 12, OFFSET_ID = 16,
     OFFSET_N = 24 };
 
@@ -261,7 +261,7 @@ static void the_format_is_the_one_described(void) {
                             number_at(&saved, saved.length - 4U, 4));
     /* the usual check value */
     TEST_ASSERT_EQUAL_HEX32(0xCBF43926U, crc32_by_definition((const uint8_t *)"123456789", 9));
-    TEST_ASSERT_TRUE(saved.length <= SELFCAL_SNAPSHOT_MAX(model.nodes, model.axes));
+    TEST_ASSERT_TRUE(saved.length <= SELFCAL_SNAPSHOT_MAX(SELFCAL_SIZE(model.nodes, model.axes)));
 #ifndef SELFCAL_FIXED
     /* the last real before the checksum is x of the last node and axis: four bytes of an IEEE single, lowest first */
     const uint32_t bits = number_at(&saved, saved.length - 8U, 4);
