@@ -84,6 +84,9 @@ extern "C" {
 
 /* State and per-sample arithmetic. -DSELFCAL_REAL_DOUBLE builds the same code in double. So the rounding of the float
  * build is told from an error of method. */
+#if defined(SELFCAL_REAL_DOUBLE) && defined(SELFCAL_FIXED)
+#error "SELFCAL_FIXED and SELFCAL_REAL_DOUBLE exclude each other"
+#endif
 #ifdef SELFCAL_REAL_DOUBLE
 typedef double selfcal_real_t;
 #else
@@ -429,7 +432,7 @@ typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 #define SELFCAL_SNAPSHOT_CHUNK 64U
 
 /* Bytes selfcal_save() writes; the same at any time of a bank's life. 0 on NULL. For a slot or buffer that the compiler
- * lays out, SELFCAL_SNAPSHOT_MAX of selfcal_layout.h is a bound. */
+ * lays out, SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES) is a bound. */
 size_t selfcal_snapshot_size(const selfcal_t *self);
 
 /* Write the bank. It is not changed, and not flushed. SELFCAL_WRITE_FAILED. SELFCAL_CORRUPT if selfcal_check() fails:

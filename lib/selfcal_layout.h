@@ -227,9 +227,9 @@ struct selfcal {
     selfcal_counters_t counters;
 };
 
-/* No snapshot of a model without regressors and sums is longer. With them it is longer by no more than
- * SELFCAL_REGRESSORS_SIZE and SELFCAL_TERMS_SIZE. For a flash slot or a buffer laid out by the compiler. */
-#define SELFCAL_SNAPSHOT_MAX(nodes, axes) (32U + sizeof(selfcal_t) + SELFCAL_SIZE(nodes, axes))
+/* No snapshot of a bank over `bytes` of memory (SELFCAL_MODEL_BYTES) is longer. For a flash slot or a buffer that the
+ * compiler lays out. */
+#define SELFCAL_SNAPSHOT_MAX(bytes) (32U + sizeof(selfcal_t) + (bytes))
 
 /* ------------------------------------------------------------------------------------------ values of regressors */
 

@@ -6,10 +6,16 @@ Truths: the samples that the sensor's model made; the sensor's registers; the ho
 
 from __future__ import annotations
 
+import subprocess
+from pathlib import Path
+
 import pytest
+import yaml
 from firmware import (
     MANY,
+    QUIET_BANK_HZ,
     QUIET_RATE_HZ,
+    ROOT,
     SLOW_RATE_HZ,
     NrfBoard,
     Tap,
@@ -23,7 +29,9 @@ from firmware import (
 )
 from unicorn import UC_HOOK_CODE, Uc
 
+from selfcal.model import Model
 from selfcal.verbs import command as verb
+from selfcal.verbs.codegen import codegen
 from selfcal.wire import Decoder
 
 KEY = bytes(range(16))
@@ -274,3 +282,35 @@ def test_without_its_crystal() -> None:
     made.run(1.5)
     assert status(made)["clock"] == 2
     assert well(made)
+
+
+@pytest.mark.parametrize("kind", ["regressor", "two terms"])
+def test_an_extended_model_is_saved_again_and_again(kind: str, tmp_path: Path) -> None:
+    """Its state is longer than the default model's, and so is the part of a slot that a save erases. After the third
+    save both slots have been written before."""
+    tree = yaml.safe_load(Model.load().path.read_text())
+    tree["bank_rate_hz"] = QUIET_BANK_HZ
+    tree["groups"] = {"gyro": {**tree["groups"]["gyro"], "axes": ["gx"]}}
+    tree["gate"]["N"] = {"gyro": 0.1}
+    if kind == "regressor":
+        tree["regressors"] = [
+            {"name": "temperature", "kind": "column", "column": "temp", "unit": "degC", "sd": {"gyro": 0.02}}
+        ]
+    else:
+        terms = {"probability": 1, "terms": ["markov", {"kind": "markov", "bandwidth": 17.5}]}
+        tree["hypotheses"] = {"random_walk": 1, "two_markov": terms}
+        tree["nodes"] = {core: {"random_walk": 8, "two_markov": [8, 6]} for core in ("host", "cortex-m0")}
+    (tmp_path / "model.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+    codegen(tmp_path / "model.yaml", tmp_path, target="cortex-m0", rate=QUIET_RATE_HZ)
+    flags = "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0 -DBOARD_SAVE_PERIOD_S=2U"
+    settings = [f"MODEL_DIR={tmp_path}", f"OUT={tmp_path}", f"CFLAGS={flags}"]
+    subprocess.run(["make", "-s", "-f", "port/cortex-m0/cortex-m0.mk", "cortex-m0", *settings], cwd=ROOT, check=True)
+    board = NrfBoard(tmp_path / "selfcal.elf", seed=21)
+    board.run(10.0)
+    assert board.value("app.told.state_saves") >= 3
+    assert board.value("app.told.state_save_failures") == 0
+    samples = board.value("app.bank.counters.samples")
+    board.power_cycle(board.retained())
+    board.run(0.4)
+    assert board.value("app.told.state_found") == 1  # the newest
+    assert board.value("app.bank.counters.samples") > samples - 3 * QUIET_RATE_HZ

@@ -93,13 +93,18 @@ def sizes(tables: Tables, target: str) -> dict[str, int]:
         "BATCH": 16,
         "PUSH_NODES": 1,
         "RETIRE_BLOCKS": 60,
-        **CORES.get(target, CORES["host"]),
+        **CORES[core_of(target)],
     }
+
+
+def core_of(target: str) -> str:
+    """The core that a target of the model file is of: its name is the core's, or begins with it, as cortex-m0-small."""
+    return next((core for core in CORES if target == core or target.startswith(f"{core}-")), "host")
 
 
 def _config(model: Model, tables: Tables, target: str) -> str:
     defined = [f"{name} {size}" for name, size in sizes(tables, target).items()]
-    defined += ["FIXED"] if target in WITHOUT_FPU else []
+    defined += ["FIXED"] if core_of(target) in WITHOUT_FPU else []
     macros = "".join(f"#ifndef SELFCAL_{one.split()[0]}\n#define SELFCAL_{one}\n#endif\n" for one in defined)
     return f"""/* Made by `selfcal codegen` from the model '{model.name}' for {target}. Do not edit.
  * The compiler's command line may set any of these. lib/selfcal.h says what each is. */
@@ -119,6 +124,7 @@ def _header(model: Model, tables: Tables) -> str:
 
 #include "selfcal.h"
 
+#define SELFCAL_MODEL_ID 0x{tables.id:08X}UL
 #define SELFCAL_MODEL_NODES {tables.nodes}U
 #define SELFCAL_MODEL_AXES {axes}U
 #define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
@@ -180,6 +186,8 @@ def _source(model: Model, tables: Tables) -> str:
     grids = {grid.nodes: grid for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid}
     parts = [f"/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */"]
     parts += ["#include <math.h>", "", '#include "selfcal_model.h"', ""]
+    same = '#error "selfcal_model.h is of another run of codegen than this file"'
+    parts += [f"#if SELFCAL_MODEL_ID != 0x{tables.id:08X}UL", same, "#endif", ""]
     parts += [_grid(grids[nodes]) for nodes in sizes]
     parts += ["static const selfcal_axis_t axes[] = {", *(_axis(axis) for axis in tables.axes), "};", ""]
     for h in tables.hypotheses:

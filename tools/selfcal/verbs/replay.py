@@ -209,7 +209,9 @@ def _make(name: str, target: str, folder: Path) -> None:
     except OSError as error:
         raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
     if done.returncode != 0:
-        raise UserError(f"cannot build the firmware: {_complaint(done.stderr)}")
+        complaint = _complaint(done.stderr)
+        remedy = ": take fewer axes (--axis), laws or nodes" if "does not fit the RAM" in complaint else ""
+        raise UserError(f"cannot build the firmware: {complaint}{remedy}")
 
 
 def _complaint(said: str) -> str:
