@@ -20,7 +20,8 @@ void tearDown(void) {}
 
 /* A node of pole distance p sees a line at distance d through p^2 / (p^2 + d): the shape that add_row() has. */
 static selfcal_real_t seen(unsigned row, unsigned line) {
-    const selfcal_real_t p = r_exp(R(-3.0) + R(0.1) * (selfcal_real_t)row), d = r_exp(R(-5.0) + R(2.0) * (selfcal_real_t)line);
+    const selfcal_real_t p = r_exp(R(-3.0) + R(0.1) * (selfcal_real_t)row);
+    const selfcal_real_t d = r_exp(R(-5.0) + R(2.0) * (selfcal_real_t)line);
     return p * p / (p * p + d);
 }
 
