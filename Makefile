@@ -369,7 +369,8 @@ check-c++:
 # The compiler's own headers do not know newlib's; integers stand for addresses in firmware.
 TIDY := clang-tidy --quiet
 TIDY_ARM := --checks=-performance-no-int-to-ptr
-STRING_H := $(shell echo "\#include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h")
+HASH := \#
+STRING_H := $(shell echo "$(HASH)include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h")
 TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(STRING_H))
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 TIDY_CPU_cortex-m4f := -mcpu=cortex-m4

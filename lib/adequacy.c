@@ -398,7 +398,7 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
     }
 }
 
-selfcal_judgement_t selfcal_adequacy(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis) {
+selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis) {
     const selfcal_watch_t *watch = &self->watch[axis];
     selfcal_judgement_t told = self->judgement[axis];
     if (selfcal_retired(bank, axis)) {

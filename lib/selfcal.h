@@ -541,7 +541,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
  *     selfcal_adequacy_init(&adequacy, &bank);
  *     each sample:  selfcal_push(...); selfcal_adequacy_push(&adequacy, &bank, channels, NULL);
  *     each report:  selfcal_adequacy_report(&adequacy, &model, &report, NULL);
- *     at any time:  selfcal_adequacy(&adequacy, axis)->state
+ *     at any time:  selfcal_judgement(&adequacy, &bank, axis).state
  */
 
 /* An epoch, bank samples. At its end each axis is judged. */
@@ -599,7 +599,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
                              const float coefficient[]);
 
 /* The judgement of the last epoch. */
-selfcal_judgement_t selfcal_adequacy(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis);
+selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis);
 
 /* ------------------------------------------------------------------------------------------------------------- gate
  * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both).

@@ -69,7 +69,7 @@ static void judge(app_t *app)
     const float *used = NULL;
 #endif
     selfcal_adequacy_report(&app->adequacy, &selfcal_model, &app->report, used);
-    app->judged = selfcal_adequacy(&app->adequacy, &app->bank, axis);
+    app->judged = selfcal_judgement(&app->adequacy, &app->bank, axis);
     selfcal_telemetry_adequacy(&app->telemetry, &app->judged);
 }
 #endif

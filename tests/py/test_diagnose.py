@@ -467,3 +467,29 @@ def test_ctrl_c_leaves_what_was_found(tmp_path: Path) -> None:
     assert found["gy"]["verdict"] == "adequate" and "interrupted" in found["gz"]["error"]
     assert "Not diagnosed: " in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert Model.load(tmp_path / "extended.yaml").regressors[0].kind == "step"
+
+
+def test_no_output_takes_the_place_of_an_input(tmp_path: Path) -> None:
+    log, once = tmp_path / "log.csv", tmp_path / "once"
+    log.write_text("t[s],gx[deg/s]\n0,1.0\n0.1,2.0\n")
+    before = log.read_bytes()
+    for outputs in ({"write_model": log}, {"json": log}, {"report": log}, {"report": once, "write_model": once}):
+        with pytest.raises(UserError, match="give it a name of its own"):
+            diagnose(log, **outputs)
+    assert log.read_bytes() == before
+    assert not once.exists()
+
+
+def test_what_cannot_be_judged_is_told_in_one_line(tmp_path: Path) -> None:
+    """A gap of three years at 10 Hz, which no memory holds; and readings in another unit than their heading's."""
+    y = np.random.default_rng(1).normal(size=400)
+    t = np.arange(400) / 10.0 + np.where(np.arange(400) > 200, 1e8, 0.0)
+    far = tmp_path / "far.csv"
+    far.write_text("t[s],gx[deg/s]\n" + "".join(f"{a!r},{b!r}\n" for a, b in zip(t.tolist(), y.tolist(), strict=True)))
+    with pytest.raises(UserError, match="cut it at its gaps"):
+        diagnose(far)
+    huge = tmp_path / "huge.npz"
+    save(huge, {"gx": ("deg/s", 1e6 * y), "gy": ("deg/s", y)}, 10.0)
+    axes = diagnose(huge)["axes"]
+    assert "is the unit right?" in axes["gx"]["error"]
+    assert "error" not in axes["gy"]

@@ -138,7 +138,7 @@ public:
             selfcal_adequacy_push(adequacy.get(), &bank_, beside, nullptr);
             const bool ended = adequacy->count != before && adequacy->count == adequacy->length;
             for (uint8_t axis = 0; ended && axis < axes_.size(); axis++) {
-                const selfcal_judgement_t j = selfcal_adequacy(adequacy.get(), &bank_, axis);
+                const selfcal_judgement_t j = selfcal_judgement(adequacy.get(), &bank_, axis);
                 told.emplace_back(axis, i, j.state, j.suspect, j.score, j.samples);
             }
             const bool due = ended || (adequacy->length == 0 && (i + 1) % SELFCAL_EPOCH_MIN == 0);

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,11 +156,16 @@ def _regressors(scored: Scored | None) -> dict[str, Any]:
     }
 
 
-def check_writable(*files: Path | str | None) -> None:
-    """Raise UserError now, before the work, for a file that could not be written after it. None and '-' are none."""
+def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
+    """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
+    or that is there twice. None and '-' are none."""
+    taken = {Path(one).resolve() for one in inputs if one is not None}
     for file in files:
         if file is not None and str(file) != "-":
             check_place(file)
+            if Path(file).resolve() in taken:
+                raise UserError(f"{file}: is read, or written as another output: give it a name of its own")
+            taken.add(Path(file).resolve())
 
 
 def write_json(document: Mapping[str, Any], path: Path | str) -> None:

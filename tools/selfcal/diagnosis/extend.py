@@ -46,7 +46,10 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
             elif finding.look.cause == "quantization":
                 group["lsb"] = _digits(estimate["lsb"]["median"])
             elif finding.look.cause == "saturation":
-                group["range"] = _digits(abs(estimate["limit"]["median"]))
+                limit = abs(estimate["limit"]["median"])
+                # A model file states one range for a group: not one that keeps another axis out that was looked at.
+                if all(_within(record, other, limit) for other in group["axes"] if other != name and other in found):
+                    group["range"] = _digits(limit)
     _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
     colored = any(one.state.extras.color for one in found.values())
@@ -57,6 +60,12 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
+
+
+def _within(record: Record, axis: str, limit: float) -> bool:
+    """Whether all readings of an axis are within the limit; one that was not recorded is."""
+    state = record.axes.get(axis)
+    return state is None or bool(np.nanmax(np.abs(state.y + state.level)) < limit)
 
 
 def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:

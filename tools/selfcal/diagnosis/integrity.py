@@ -68,8 +68,8 @@ def _held(record: Record) -> Mask:
         same = np.zeros(record.present.size, bool)
         same[1:] = np.diff(state.y) == 0.0
         repeats.append(same)
-    if not repeats:
-        return none
+    if not repeats or any(state.redrawn for state in record.axes.values()):
+        return none  # means of blocks repeat by chance: a held reading shows at the recording's own rate
     held = np.all(repeats, axis=0)
     shares = [
         max((float(same.sum()) - float(held.sum())) / same.size, _repeats_by_chance(state))

@@ -9,19 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from selfcal import _library32
 from selfcal.diagnosis.state import Regressor, State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
 from selfcal.lattice import lattice_of
-from selfcal.model import Model
+from selfcal.model import Group, Model
 from selfcal.model import Regressor as Stated
 from selfcal.recording import Recording
 from selfcal.regressors import columns_of, offered
 
 #: Columns that are no axis but may explain one, by cause: name and unit.
 CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
-#: Samples that a diagnosis needs at least.
-LEAST = 200
+#: Samples that a diagnosis needs at least, and takes at most, gaps included.
+LEAST, MOST = 200, 10_000_000
+#: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
+BEYOND = 100.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,11 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     n = (int(at[-1]) + 1) // block
     if n < LEAST:
         raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
+    if n > MOST:
+        raise UserError(
+            f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST:,}: cut it at its gaps, or "
+            "take a lower --decimate"
+        )
     index = at // block
     kept = index < n
     used = np.bincount(index[kept], minlength=n)
@@ -89,7 +97,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             continue
         group = model.group_of(name)
         values = recording.in_unit(name, group.unit)
-        if not np.ptp(values) > 0.0:
+        if not np.ptp(values) > 0.0 or _beyond(values, group):
             continue
         y = on_grid(values)
         found = lattice_of(values, recording.rate_hz)
@@ -125,6 +133,19 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         recording.off_grid_s,
         recording.rate_hz,
     )
+
+
+def why_left_out(recording: Recording, model: Model, name: str) -> str:
+    """Why an axis that was asked for is not in the record."""
+    group = model.group_of(name)
+    if _beyond(recording.in_unit(name, group.unit), group):
+        return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
+    return "every reading is the same"
+
+
+def _beyond(values: Array, group: Group) -> bool:
+    most = BEYOND * group.range if group.range > 0.0 else math.inf
+    return bool(np.max(np.abs(values)) >= min(most, _library32.SAMPLE_MAX))
 
 
 def _cause(one: Stated, model: Model) -> str:

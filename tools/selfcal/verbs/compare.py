@@ -42,7 +42,7 @@ def compare(
     """
     if len(logs) < 2:
         raise UserError("compare takes two recordings or more of one part: selfcal compare A B")
-    check_writable(json)
+    check_writable(json, inputs=(*logs, model))
     seen = []
     for log in logs:
         identified = identify(log, axes=axes, model=model)["axes"]

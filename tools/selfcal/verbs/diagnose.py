@@ -12,7 +12,7 @@ from rich.progress import Progress
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.extend import as_text, extended
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import of_recording, why_left_out
 from selfcal.diagnosis.words import WORDS
 from selfcal.document import check_writable, write_json
 from selfcal.ending import Stopped, held
@@ -53,14 +53,14 @@ def diagnose(
     """
     if fail_on is not None and fail_on not in ("inadequate", *WORDS):
         raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
-    check_writable(json, report, write_model)
+    check_writable(json, report, write_model, inputs=(log, model))
     loaded = Model.load(model)
     recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     record = of_recording(recording, loaded, decimate)
     judged = [name for name in names if name in record.axes]
-    errors = {name: "every reading is the same" for name in names if name not in judged}
+    errors = {name: why_left_out(recording, loaded, name) for name in names if name not in judged}
     console = Console(stderr=True)
     with held() as ending, Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("diagnose", total=None)

@@ -61,7 +61,7 @@ def identify(
     Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
     UserError for what the user can put right, and if no axis has a result.
     """
-    check_writable(json, plot, None if export is None else export[1])
+    check_writable(json, plot, None if export is None else export[1], inputs=(log, model))
     if plot is not None:
         check_picture(plot)
     if export is not None and export[0] not in FORMS:

@@ -123,7 +123,7 @@ def replay(
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
     if plot is not None:
         check_picture(plot)
-    check_writable(json, plot)
+    check_writable(json, plot, inputs=(log, model))
     loaded_model = Model.load(model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(

@@ -397,6 +397,8 @@ def _shown(value: Mapping[str, Any] | None, *, inverse: bool = False, brief: boo
     middle, low, high = value["value"], value["q05"], value["q95"]
     if not math.isfinite(middle):
         return "none"
+    if inverse and not (low > 0.0 and middle > 0.0):
+        return "none"
     if inverse:
         middle, low, high = 1.0 / middle, 1.0 / high, 1.0 / low
     if brief or not (math.isfinite(low) and math.isfinite(high)):

@@ -106,6 +106,10 @@ def simulate(
     truth = _truth(model, seed)
     axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
     applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
+    asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
+    for name, axis in asked:
+        if asked.count((name, axis)) > 1:
+            raise UserError(f"--effect {name}: twice on {axis}, which has room for one effect of a kind")
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
