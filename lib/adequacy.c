@@ -156,14 +156,14 @@ static void predict(selfcal_watch_t *watch, uint32_t intervals) {
 }
 
 /* Its own prediction taken off `value`, and the state of that series moved by the gain. */
-static selfcal_real_t innovate(selfcal_watch_t *watch, size_t series, selfcal_real_t value,
+static selfcal_real_t innovate(selfcal_real_t state[], size_t states, selfcal_real_t value,
                                const selfcal_real_t gain[]) {
     selfcal_real_t innovation = value;
-    for (size_t a = 0; a < watch->law.states; a++) {
-        innovation -= watch->state[series][a];
+    for (size_t a = 0; a < states; a++) {
+        innovation -= state[a];
     }
-    for (size_t a = 0; a < watch->law.states; a++) {
-        watch->state[series][a] = r_fma(gain[a], innovation, watch->state[series][a]);
+    for (size_t a = 0; a < states; a++) {
+        state[a] = r_fma(gain[a], innovation, state[a]);
     }
     return innovation;
 }
@@ -175,6 +175,7 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
     const selfcal_real_t reading = y / watch->law.sigma;
     if (!watch->begun) {
         first_sample(watch, reading, r, channel);
+        memset(w, 0, SELFCAL_ADEQUACY_COLUMNS * sizeof w[0]);
         return R(0.0);
     }
     predict(watch, gap + 1U);
@@ -193,9 +194,9 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
         }
     }
     const selfcal_real_t root = R(1.0) / r_sqrt(s);
-    const selfcal_real_t z = innovate(watch, 0, reading, gain) * root;
+    const selfcal_real_t z = innovate(watch->state[0], states, reading, gain) * root;
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
-        w[k] = innovate(watch, 1U + k, channel[k], gain) * root;
+        w[k] = innovate(watch->state[1U + k], states, channel[k], gain) * root;
     }
     return r_fmin(r_fmax(z, -LARGEST), LARGEST);
 }

@@ -167,9 +167,8 @@ static void settle_node(selfcal_t *self, size_t j) {
 }
 
 static void fade_states(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c) {
-    const term_t term = term_of(self, j);
     for (size_t axis = 0; SELFCAL_STATE_SUMS > 0U && axis < self->model->axes; axis++) {
-        const reading_sums_t sums = selfcal_kernel_state_sums(self, j, term.index, axis);
+        const reading_sums_t sums = selfcal_kernel_state_sums(self, j, term_of(self, j).index, axis);
         sum_fade(sums.b, keep_b);
         sum_fade(sums.c, keep_c);
     }
