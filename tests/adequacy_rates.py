@@ -23,20 +23,11 @@ from selfcal.engines.library import Bank
 from selfcal.model import Model
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.wire import choices
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 LAWS = ("constant", "random_walk", "gauss_markov")
-SUSPECTS = (
-    "none",
-    "temperature",
-    "supply",
-    "cross_axis",
-    "ramp",
-    "colored_noise",
-    "flicker",
-    "variance_change",
-    "outliers",
-)
+SUSPECTS = choices("GX_ADEQUACY", "suspicion")
 
 
 def channels_of(rng: np.random.Generator, n: int) -> NDArray[np.float64]:

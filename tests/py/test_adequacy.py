@@ -24,19 +24,10 @@ from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
+from selfcal.wire import choices
 
 MODEL = Model.load(None)
-SUSPECTS = (
-    "none",
-    "temperature",
-    "supply",
-    "cross_axis",
-    "ramp",
-    "colored_noise",
-    "flicker",
-    "variance_change",
-    "outliers",
-)
+SUSPECTS = choices("GX_ADEQUACY", "suspicion")
 LIMITS = {"variance_change": 6.0, "outliers": 10.0}  # SELFCAL_ADEQUACY_LIMIT_*; of the others 5
 EPOCH = 256
 

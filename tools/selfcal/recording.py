@@ -40,6 +40,8 @@ from selfcal.text_table import TextTable
 
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
+#: Columns that are no axis but may explain one, by cause: name and unit.
+SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Unit of a scaled LSB column where the scale states none, by the column's first letter.
 _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
@@ -326,7 +328,7 @@ class _Header:
         if unit is None:
             if left_out:
                 return []
-            known = {"t": "s", "temp": "degC", "supply": "V", **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
+            known = {"t": "s", **dict(SIDE_CHANNELS.values()), **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
             example = known.get(name, _LSB_UNITS.get(name[0]) if name in self.sensors else None)
             hint = f"write {name}[{example or 'UNIT'}] in the header or give --unit {name}={example or 'UNIT'}"
             leave = "" if example else ", or leave it out by naming what to read with --column NAME=HEADER"

@@ -15,12 +15,11 @@ from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.model import Model, Regressor
 from selfcal.recording import Recording, as_float
-from selfcal.result import AxisResult
+from selfcal.result import HALF_90, AxisResult, of_mixture
 
-#: `selfcal_column_kind_t`.
-_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP = range(6)
-#: Standard deviations from the mean to the 95 % quantile of a normal.
-HALF_90 = 1.6448536269514722
+#: `selfcal_column_kind_t`: names in C, by number.
+COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP")
+_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP = range(len(COLUMN_KINDS))
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -198,19 +197,5 @@ def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coeffi
 
 def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
-    from scipy.optimize import brentq  # half a second to import: for who has regressors alone
-    from scipy.special import ndtr
-
-    if parts.size == 0:
-        return Coefficient(column, unit, *([math.nan] * 5))
-    weight, mean, sd = parts[:, 0] / parts[:, 0].sum(), parts[:, 1], parts[:, 2]
-    middle = float(weight @ mean)
-    spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
-    low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
-
-    def beyond(x: float, share: float) -> float:
-        return float(weight @ ndtr((x - mean) / sd)) - share
-
-    xtol = 1e-6 * (high - low)
-    q05, median, q95 = (brentq(beyond, low, high, args=(share,), xtol=xtol) for share in (0.05, 0.5, 0.95))
-    return Coefficient(column, unit, middle, spread, q05, median, q95)
+    found = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
+    return Coefficient(column, unit, *found)

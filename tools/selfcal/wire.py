@@ -79,11 +79,17 @@ def carries(axis: str, unit: str) -> bool:
     return axis in AXES and axis_unit(axis) == unit
 
 
+def choices(message: str, signal: str) -> dict[int, str]:
+    """The words that the DBC has for the values of a signal; none if it has no words."""
+    named: Mapping[int, Any] = load_dbc().get_message_by_name(message).get_signal_by_name(signal).choices or {}
+    return {number: str(name) for number, name in named.items()}
+
+
 def status_text(signal: str, value: float) -> str:
     """A value of the status as the DBC names it, else the number with its unit; axes for a mask of them."""
     entry = load_dbc().get_message_by_name("STATUS").get_signal_by_name(signal)
     if entry.choices:
-        return str(entry.choices.get(int(value), f"{value:g}"))
+        return choices("STATUS", signal).get(int(value), f"{value:g}")
     if signal == "axes_retired":
         return ",".join(axis for index, axis in enumerate(AXES) if int(value) >> index & 1)
     return f"{int(value)}" if value == int(value) and not entry.unit else f"{value:g} {entry.unit or ''}".strip()
@@ -186,12 +192,10 @@ class AxisReport:
         """What the module says of its model on this axis; None if it does not judge, or not all of it arrived."""
         if not {"adequacy", "reason", "suspicion", "suspicion_score", "judged"} <= self.values.keys():
             return None
-        message = load_dbc().get_message_by_name(f"{AXES[0].upper()}_ADEQUACY")
 
         def word(signal: str) -> str:
             number = self.values[signal]
-            choices = {key: str(name) for key, name in (message.get_signal_by_name(signal).choices or {}).items()}
-            return choices.get(int(number), f"{number:g}")
+            return choices(f"{AXES[0].upper()}_ADEQUACY", signal).get(int(number), f"{number:g}")
 
         score, samples = self.values["suspicion_score"], int(self.values["judged"])
         return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples)

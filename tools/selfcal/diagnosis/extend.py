@@ -68,9 +68,14 @@ def _within(record: Record, axis: str, limit: float) -> bool:
     return state is None or bool(np.nanmax(np.abs(state.y + state.level)) < limit)
 
 
+def _columns_of(entry: Mapping[str, Any]) -> int:
+    """How many a regressor has: a sine and a cosine of a line."""
+    return 2 if entry["kind"] == "periodic" else 1
+
+
 def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
     """Fewer nodes on the Cortex-M0 where its RAM needs them: beside a second column, or a law that is a sum."""
-    columns = sum(2 if entry["kind"] == "periodic" else 1 for entry in regressors)
+    columns = sum(map(_columns_of, regressors))
     nodes = tree["nodes"]
     if "cortex-m0" in nodes and "cortex-m0-small" in nodes:
         plain = ("random_walk", "gauss_markov")
@@ -99,7 +104,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
     used = len(stated)
     for key in sorted(entries, key=lambda key: -strength[key]):
         entry = entries[key]
-        columns = 2 if entry["kind"] == "periodic" else 1
+        columns = _columns_of(entry)
         if used + columns <= MOST_COLUMNS:
             if key in record.channels:
                 _smooth(entry, key, record, found)

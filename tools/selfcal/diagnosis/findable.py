@@ -14,6 +14,7 @@ from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import NET_LEAST, State, net
 from selfcal.diagnosis.statemodel import Array
+from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import coefficient_unit
 
 
@@ -55,7 +56,7 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         ),
         frequency_hz=(frequency, "Hz"),
     )
-    for cause, unit in (("temperature", "degC"), ("supply", "V")):
+    for cause, (_, unit) in SIDE_CHANNELS.items():
         if cause in least and math.isfinite(least[cause]):
             add(cause, coefficient=(least[cause], coefficient_unit(state.unit, unit)))
     others = {key: value for key, value in least.items() if key.startswith("axis_") and math.isfinite(value)}

@@ -16,11 +16,9 @@ from selfcal.errors import UserError
 from selfcal.lattice import lattice_of
 from selfcal.model import Group, Model
 from selfcal.model import Regressor as Stated
-from selfcal.recording import Recording
+from selfcal.recording import SIDE_CHANNELS, Recording
 from selfcal.regressors import columns_of, offered
 
-#: Columns that are no axis but may explain one, by cause: name and unit.
-CHANNELS = {"temperature": ("temp", "degC"), "supply": ("supply", "V")}
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000
 #: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
@@ -117,7 +115,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         )
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
-    for cause, (column, unit) in CHANNELS.items():
+    for cause, (column, unit) in SIDE_CHANNELS.items():
         if column in recording.columns:
             values = recording.in_unit(column, unit)
             if np.ptp(values) > 0.0:
@@ -156,7 +154,7 @@ def _cause(one: Stated, model: Model) -> str:
 
 
 def _channel(column: str) -> str:
-    return next((cause for cause, (name, _) in CHANNELS.items() if name == column), "")
+    return next((cause for cause, (name, _) in SIDE_CHANNELS.items() if name == column), "")
 
 
 def bridged(values: Array) -> Array:

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from selfcal.diagnosis.fit import Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.result import HALF_90, of_mixture
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
 P_LOOK = 5e-4
@@ -209,26 +210,13 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
         "mean": value,
         "median": value,
         "sd": sd,
-        "q05": value - 1.6448536269514722 * sd,
-        "q95": value + 1.6448536269514722 * sd,
+        "q05": value - HALF_90 * sd,
+        "q95": value + HALF_90 * sd,
         "unit": unit,
     }
 
 
 def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:
     """A posterior that is a sum of normals, `weight` of each not normalized, in the form of the contract."""
-    sd = np.broadcast_to(np.asarray(sd, np.float64), mean.shape)
-    held = weight > 1e-6 * weight.max()
-    weight, mean, sd = weight[held] / weight[held].sum(), mean[held], sd[held]
-    middle = float(weight @ mean)
-    spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
-
-    def quantile(p: float) -> float:
-        low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
-        for _ in range(40):
-            at = 0.5 * (low + high)
-            low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
-        return 0.5 * (low + high)
-
-    points = {name: quantile(p) for name, p in (("median", 0.5), ("q05", 0.05), ("q95", 0.95))}
-    return {"mean": middle, "sd": spread, **points, "unit": unit}
+    found = of_mixture(weight, mean, np.broadcast_to(np.asarray(sd, np.float64), mean.shape))
+    return {**dict(zip(("mean", "sd", "q05", "median", "q95"), found, strict=True)), "unit": unit}

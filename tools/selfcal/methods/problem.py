@@ -13,11 +13,10 @@ from scipy import optimize
 from selfcal.allan import Terms, overlapping, terms_of
 from selfcal.laws import NAMED
 from selfcal.model import Group
+from selfcal.result import HALF_90
 
 Floats = NDArray[np.float64]
 
-#: Standard deviations in half the width of a normal's 90 % interval.
-HALF_90 = 1.6448536269514722
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
 REACH = 1e5
 #: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.

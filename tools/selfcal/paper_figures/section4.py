@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel
 from selfcal.methods.allan import fit
-from selfcal.methods.problem import HALF_90, Problem, Value
+from selfcal.methods.problem import Problem, Value
 from selfcal.model import Model, Prior
 from selfcal.paper_figures.section3 import PAPER, over_time
 from selfcal.paper_figures.told import Told
 from selfcal.recording import as_float, load
-from selfcal.result import AxisResult
+from selfcal.result import HALF_90, AxisResult
 from selfcal.tables import make_tables
 from selfcal.verbs.montecarlo import simulate_bank_samples
 

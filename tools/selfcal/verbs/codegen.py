@@ -11,6 +11,8 @@ from rich.console import Console
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.output import whole
+from selfcal.recording import SIDE_CHANNELS
+from selfcal.regressors import COLUMN_KINDS
 from selfcal.tables import AxisTable, Grid, HypothesisTable, RegressorTable, Tables, gate_table, make_tables
 from selfcal.wire import carries
 
@@ -132,7 +134,7 @@ def _header(model: Model, tables: Tables) -> str:
 /* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units{_units(tables)}. */
 #define SELFCAL_MODEL_CHANNELS {len(tables.channels)}U
 /* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
-#define SELFCAL_MODEL_CHANNELS_READ {int(set(tables.channels) <= {("temp", "degC"), ("supply", "V")})}
+#define SELFCAL_MODEL_CHANNELS_READ {int(set(tables.channels) <= set(SIDE_CHANNELS.values()))}
 /* With SELFCAL_FIXED no record overflows (lib/bank_kernel_fixed.c). The coarsest step of each axis that readings within
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
@@ -274,8 +276,7 @@ def _regressors(tables: Tables) -> list[str]:
 def _column_source(tables: Tables, column: RegressorTable) -> str:
     kind, number, name, unit = column.source
     places = [*((axis.name, axis.unit) for axis in tables.axes), *tables.channels]
-    what = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP")[kind]
-    return f"{{SELFCAL_COLUMN_{what}, {places.index((name, unit)) if name else 0}U, {_f(number)}}}"
+    return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {places.index((name, unit)) if name else 0}U, {_f(number)}}}"
 
 
 def _gate(model: Model, tables: Tables) -> list[str]:

@@ -15,14 +15,13 @@ from rich.table import Table
 from selfcal.document import check_writable, write_json
 from selfcal.ending import Held
 from selfcal.errors import UserError, printable
+from selfcal.result import HALF_90
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
 SCHEMA = "selfcal.compare/1"
 #: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
 LIMIT = 3.4
-#: Standard deviations in half the width of a 90 % interval.
-HALF_90 = 1.6448536269514722
 #: Estimates that are sizes of a cause; places in time belong to one recording alone.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
 

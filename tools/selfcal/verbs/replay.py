@@ -30,7 +30,7 @@ from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
-from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, load
 from selfcal.regressors import (
     Choice,
     Inclusion,
@@ -52,7 +52,7 @@ from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names
 
 MAGIC = b"SELFCAL1"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
-SIDE = (("temp", "degC"), ("supply", "V"))
+SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from selfcal import _reference, recording, units
 from selfcal.errors import UserError, printable
-from selfcal.laws import NAMED, PARAMETERS, PLACES
+from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
 from selfcal.model import Group, Model, Prior
 from selfcal.output import check_place
 from selfcal.tables import bank_block
@@ -186,7 +186,7 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         law = fields.get("hypothesis", law)
         drawn |= {key: value for key, value in fields.items() if key != "hypothesis"}
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
-        of = model.laws.get(law, NAMED.get(law))
+        of = _laws(model).get(law)
         if of is None or any(math.isnan(term.bandwidth) for term in of.terms):
             raise UserError(f"{model.path}: simulate.{where}.hypothesis: the model has no hypothesis '{law}'")
         for parameter in of.parameters:
@@ -197,6 +197,11 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         if times:
             truth[name]["correlation_time_s"] = times[0] if len(times) == 1 else times
     return truth
+
+
+def _laws(of: Model | Group) -> dict[str, Law]:
+    """The laws that can be simulated: the model's, and those that have a name without it."""
+    return {**NAMED, **of.laws}
 
 
 def _pick(probability: Mapping[str, float], u: float) -> str:
@@ -216,7 +221,7 @@ def _draw(prior: Prior, u: float) -> float:
 
 def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
     axis = _reference.Axis()
-    law = {**NAMED, **group.laws}[truth["hypothesis"]]
+    law = _laws(group)[truth["hypothesis"]]
     axis.law, axis.bias, axis.N = law.as_tuple, truth["bias"], truth["N"]
     axis.drift, axis.second = law.node(truth)
     axis.range, axis.lsb = group.range, group.lsb

@@ -13,6 +13,7 @@ from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
+from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import coefficient_unit
 
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
@@ -43,7 +44,7 @@ def looks(state: State, record: Record) -> list[Look]:
     for cause, values in record.channels.items():
         if cause in known:
             continue
-        unit = {"temperature": "degC", "supply": "V"}[cause]
+        _, unit = SIDE_CHANNELS[cause]
         heading = record.channel_names[cause]
         options = []
         for width in SMOOTHING_S:
