@@ -366,10 +366,13 @@ static void gather(selfcal_adequacy_t *self, const float channels[], const float
         const bool channel = k < SELFCAL_ADEQUACY_CHANNELS;
         const float *from = channel ? channels : values;
         const float value = from == NULL ? 0.0F : from[channel ? k : k - SELFCAL_ADEQUACY_CHANNELS];
-        if (self->used == 0U && !self->any) {
+        if (!self->any) {
             self->first[k] = isfinite(value) ? (selfcal_real_t)value : R(0.0); /* sums about it lose no digits */
         }
-        self->sum[k] += isfinite(value) ? (selfcal_real_t)value - self->first[k] : R(0.0);
+        if (isfinite(value)) {
+            self->held[k] = (selfcal_real_t)value - self->first[k];
+        }
+        self->sum[k] += self->held[k];
     }
     self->any = true;
     self->used++;

@@ -589,8 +589,9 @@ typedef struct selfcal_adequacy selfcal_adequacy_t;
 /* Begin; after selfcal_init() and selfcal_restore() of the bank. */
 selfcal_status_t selfcal_adequacy_init(selfcal_adequacy_t *self, const selfcal_t *bank);
 
-/* After each selfcal_push() or selfcal_push_with(). `channels`: temperature and supply; a value that is not finite is
- * left out; NULL: neither is known. `values`: of the regressors; NULL without any. O(axes^2) at an interval's end. */
+/* After each selfcal_push() or selfcal_push_with(). `channels`: temperature and supply. For a value that is not finite
+ * the one before stands. NULL: neither is known. `values`: of the regressors; NULL without any. O(axes^2) at an
+ * interval's end. */
 void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, const float channels[],
                            const float values[]);
 

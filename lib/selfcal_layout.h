@@ -471,7 +471,8 @@ typedef struct {
 struct selfcal_adequacy {
     uint32_t seen, before, length, count, elapsed, used;
     bool any;
-    selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
+    selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], held[SELFCAL_ADEQUACY_INPUTS];
+    selfcal_real_t base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
     selfcal_watch_t watch[SELFCAL_AXES_MAX];
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };
