@@ -1,7 +1,8 @@
 /* Whether the model of the last report explains the readings after it: tests on the innovations of one filter an axis.
  *
  * Time is cut into epochs of half the record before them, within SELFCAL_EPOCH_MIN and SELFCAL_EPOCH_MAX bank samples.
- * At the start of an epoch each axis takes a law from its last report. A filter begins without a prior for the bias.
+ * At the start of an epoch each axis takes a law from its last report. A filter begins without a prior for the bias, and
+ * goes on from epoch to epoch while the law has as many states; beside regressors it begins anew.
  * The report leaves the drift open, and this doubt must not look like a fault of the model. So the filter allows the
  * most drift that is plausible: the 95 % quantile of the drift parameter, under a law with a walk if one has 1 % of the
  * probability, else under one with a drift. Too much drift makes z negatively correlated: only positive correlation
@@ -56,6 +57,26 @@ static uint8_t widest(const selfcal_model_t *model, const selfcal_report_t *repo
     return found;
 }
 
+/* Where the likeliest law lies among the nodes. */
+static selfcal_reopening_t likely_place(const selfcal_model_t *model, const selfcal_report_t *report) {
+    uint8_t best = 0;
+    for (uint8_t h = 1; h < model->hypotheses; h++) {
+        best = report->hypothesis[h].probability > report->hypothesis[best].probability ? h : best;
+    }
+    const selfcal_law_t *law = model->hypothesis[best].law;
+    const selfcal_estimate_t *parameter = report->hypothesis[best].parameter;
+    const selfcal_real_t root_dt = r_sqrt((selfcal_real_t)model->dt_s);
+    selfcal_reopening_t at = {.hypothesis = best, .sigma_v = parameter[SELFCAL_N].median / (float)root_dt};
+    if (has_drift(law)) {
+        const selfcal_real_t drift = (selfcal_real_t)parameter[drift_parameter(law)].median;
+        at.ln_rho = (float)r_log(drift * (has_walk(law) ? root_dt : R(1.0)) / (selfcal_real_t)at.sigma_v);
+    }
+    if (has_alpha(law) || has_ratio(law)) {
+        at.ln_second = (float)r_log((selfcal_real_t)parameter[SELFCAL_ALPHA].median);
+    }
+    return at;
+}
+
 void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *model, const selfcal_report_t *report,
                              const float coefficient[]) {
     selfcal_watch_t *watch = &self->watch[report->axis];
@@ -69,6 +90,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
     const selfcal_wide_t second = decays ? (selfcal_wide_t)parameter[SELFCAL_ALPHA].median : 1.0;
     const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0) / variance; /* rho^2 */
     watch->known = !law->coloured_noise && isfinite(square) && isfinite(second) && variance > 0.0 && second > 0.0;
+    watch->likely = likely_place(model, report);
     watch->reason = law->coloured_noise ? SELFCAL_REASON_LAW_NOT_WATCHED : SELFCAL_REASON_NO_REPORT;
     if (!watch->known) {
         return;
@@ -99,6 +121,18 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
 
 /* ---------------------------------------------------------------------------------------------------------- filter */
 
+/* The filter goes on under a new law: in units of its sigma_v. What a channel was before counts for its value now. */
+static void carry_over(selfcal_watch_t *watch) {
+    const selfcal_real_t ratio = watch->law.sigma / watch->next.sigma;
+    for (size_t a = 0; a < SELFCAL_FILTER_STATES; a++) {
+        watch->state[0][a] *= ratio;
+        for (size_t b = 0; b <= a; b++) {
+            watch->covariance[term_pair(a, b)] *= ratio * ratio;
+        }
+    }
+    memset(watch->state[1], 0, sizeof watch->state - sizeof watch->state[0]);
+}
+
 static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
     const uint32_t before = bank->weight > 1.0 ? (uint32_t)bank->weight : 1U, half = before / 2U;
     self->length = half < SELFCAL_EPOCH_MIN ? SELFCAL_EPOCH_MIN : half > SELFCAL_EPOCH_MAX ? SELFCAL_EPOCH_MAX : half;
@@ -107,7 +141,11 @@ static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
         selfcal_watch_t *watch = &self->watch[axis];
         watch->running = watch->known && !selfcal_retired(bank, axis);
-        watch->begun = false;
+        watch->begun = watch->begun && watch->running && watch->next.states == watch->law.states &&
+            regressors_of(bank->model) == 0U;
+        if (watch->begun) {
+            carry_over(watch);
+        }
         watch->law = watch->next;
         memset(&watch->epoch, 0, sizeof watch->epoch);
         watch->last = watch->slow = watch->fourth = watch->square[0] = watch->square[1] = R(0.0);
@@ -179,7 +217,7 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
         return R(0.0);
     }
     predict(watch, gap + 1U);
-    selfcal_real_t with[SELFCAL_FILTER_STATES], gain[SELFCAL_FILTER_STATES], s = r;
+    selfcal_real_t with[SELFCAL_FILTER_STATES], *gain = watch->gain, s = r;
     for (size_t a = 0; a < states; a++) {
         with[a] = R(0.0);
         for (size_t b = 0; b < states; b++) {
@@ -193,7 +231,7 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
             watch->covariance[term_pair(a, b)] -= gain[a] * with[b];
         }
     }
-    const selfcal_real_t root = R(1.0) / r_sqrt(s);
+    const selfcal_real_t root = watch->root = R(1.0) / r_sqrt(s);
     const selfcal_real_t z = innovate(watch->state[0], states, reading, gain) * root;
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
         w[k] = innovate(watch->state[1U + k], states, channel[k], gain) * root;
@@ -354,6 +392,9 @@ static void take(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_
             add(&self->watch[axis], z, axis, axes, gap, w[axis], self->count >= self->length / 2U);
         }
     }
+    if (self->look != NULL) {
+        self->look(self, bank, z, gap);
+    }
     self->count++;
     if (self->count == self->length) {
         judge_axes(self, bank);
@@ -410,6 +451,10 @@ selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const self
         told.reason = SELFCAL_REASON_RETIRED;
     } else if (told.state == SELFCAL_NOT_JUDGED) {
         told.reason = watch->known ? SELFCAL_REASON_FIRST_EPOCH : watch->reason;
+    }
+    if (told.changes > 0U) {
+        const uint32_t now = selfcal_count(bank) + bank->counters.blocks_lost;
+        told.change.ago_s += (float)(now - self->changes->found_at[axis]) * bank->model->dt_s;
     }
     return told;
 }

@@ -123,12 +123,16 @@ static bool valid_model(const selfcal_model_t *model) {
         nodes += hypothesis_nodes(hypothesis);
     }
     const selfcal_regressors_t *regressors = model->regressors;
+    const selfcal_handling_t *handling = model->handling;
+    if (handling != NULL && (!(handling->outlier_sd >= 0.0F) || !isfinite(handling->outlier_sd) ||
+                             ((handling->steps || handling->variance_changes) && regressors != NULL))) {
+        return false;
+    }
     return nodes == model->nodes && nodes <= SELFCAL_NODES_MAX &&
         (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
 }
 
-/* A node at the instant of its first sample. */
-static void init_node(selfcal_t *self, uint16_t index) {
+void selfcal_bank_start_node(selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
     selfcal_node_t *node = &self->node[index];
@@ -292,6 +296,9 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     self->variance_ratio = R(1.0);
     self->keep = 1.0;
     self->beginning = 1.0;
+    for (uint8_t axis = 0; axis < model->axes; axis++) {
+        self->prior_sd[axis] = model->axis[axis].bias_sd;
+    }
     self->b = memory; /* first, since they may need 8-byte alignment */
     self->c = self->b + cells;
     self->node = (selfcal_node_t *)(void *)(self->c + cells);
@@ -392,8 +399,7 @@ static void gains_steady(selfcal_node_t *node, gains_t *gains) {
     sum_add_scaled(&node->a, gains->scale, a);
 }
 
-/* A level node is no longer so. What its constant u added to A comes due. */
-static void leave_level(selfcal_t *self, size_t j) {
+void selfcal_bank_leave_level(selfcal_t *self, size_t j) {
     selfcal_node_t *node = &self->node[j];
     if (node->level) {
         selfcal_kernel_unsettle(self, j);
@@ -444,7 +450,7 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
                 }
             }
         } else {
-            leave_level(self, j);
+            selfcal_bank_leave_level(self, j);
             gains_varying(batch, node, &gains);
             run(self, j, &gains);
             if (r_fabs(now->d) <= CONVERGED * node->p_inf) {
@@ -468,7 +474,7 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
         if (node->q == R(0.0)) {
             continue; /* the constant law: nothing changes */
         }
-        leave_level(self, j);
+        selfcal_bank_leave_level(self, j);
         const selfcal_wide_t beta = (selfcal_wide_t)node->beta, d = (selfcal_wide_t)now->d, e = (selfcal_wide_t)now->e;
         if (node->beta == R(0.0)) {
             now->d = r_fmin((selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q), P_MAX);
@@ -494,7 +500,7 @@ static void run_batch(selfcal_t *self, uint16_t from, uint16_t to) {
         self->model->forgetting->code->fade(self, kernel_node(self, i));
     }
     for (uint16_t i = from; self->n == 0U && i < to; i++) {
-        init_node(self, (uint16_t)kernel_node(self, i));
+        selfcal_bank_start_node(self, (uint16_t)kernel_node(self, i));
     }
     span_t span = {0, 0};
     while (span.from < batch->count) {
@@ -605,7 +611,7 @@ selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis) {
 }
 
 selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
-    return selfcal_offset(self, axis) - (selfcal_wide_t)self->shifted[axis];
+    return selfcal_offset(self, axis) - (selfcal_wide_t)self->prior_mean[axis];
 }
 
 void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {

@@ -30,6 +30,11 @@ bool selfcal_bank_hand_over(selfcal_t *self);
 /* Both, to the end. */
 void selfcal_bank_flush(selfcal_t *self);
 
+/* A node at the instant of its first sample. */
+void selfcal_bank_start_node(selfcal_t *self, uint16_t index);
+/* A level node is no longer so. What its constant u added to A comes due. */
+void selfcal_bank_leave_level(selfcal_t *self, size_t j);
+
 /* selfcal_offset() less the mean of the bias's prior, which moves with selfcal_shift(). */
 selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis);
 /* Where a node lies: its hypothesis, and ln of its rho and alpha; NaN where the law has none. */
@@ -131,6 +136,10 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
 /* Forgetting: sums B and C of every axis of node `j`, times the part that is kept of each. */
 void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
 
+/* The record begins anew for cell `k` = node * axes + axis, whose node is not level: C stands at `c`, B and the drift at
+ * 0. */
+void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c);
+
 /* The nodes have been placed: chooses an axis's step by ln of its white noise per bank sample. */
 void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma);
 
@@ -225,6 +234,8 @@ struct selfcal_states_code {
     /* Forgetting: the samples of D that were only counted come due. Then selfcal_kernel_fade() of its own sums. */
     void (*settle)(selfcal_t *self, size_t j);
     void (*fade)(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
+    /* selfcal_reopen(): begins anew with the sums C of each axis, and the part of D that is kept. */
+    void (*restart)(selfcal_t *self, size_t j, const selfcal_wide_t c[], selfcal_wide_t keep);
     /* All but the node's place. */
     void (*view)(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
     /* Covariance of the terms of the drift at the last interval, given x0, over sigma_v^2. */

@@ -273,7 +273,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->left[0] = normal->node.bias_left;
     normal->lost[0][0] = 1.0 - normal->left[0];
     normal->drift[0] = normal->node.drift;
-    normal->sd[0] = (selfcal_wide_t)self->model->axis[axis].bias_sd;
+    normal->sd[0] = (selfcal_wide_t)self->prior_sd[axis];
     normal->first[0] = selfcal_bank_from_prior(self, axis);
     const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
     const size_t p = mask != 0U ? columns_of(self) : 0U;

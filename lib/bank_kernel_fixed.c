@@ -394,6 +394,13 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less) {
     }
 }
 
+void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c) {
+    const int exponent = self->integers.scale[k % self->model->axes].exponent;
+    self->x[k] = 0;
+    self->b[k] = 0;
+    self->c[k] = (selfcal_total_t)ldexp(c, -2 * exponent - 16);
+}
+
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
     if (self->columns != NULL) {
         const selfcal_reading_t *reading = &self->columns->reading[k];

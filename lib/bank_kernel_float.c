@@ -134,6 +134,12 @@ void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfc
     }
 }
 
+void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c) {
+    self->x[k] = R(0.0);
+    self->b[k] = make_sum(0.0);
+    self->c[k] = make_sum(c);
+}
+
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
     const selfcal_node_t *node = &self->node[k / self->model->axes];
     *b = sum_value(self->b[k]);

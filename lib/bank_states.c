@@ -174,6 +174,20 @@ static void fade_states(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfca
     }
 }
 
+static void restart_states(selfcal_t *self, size_t j, const selfcal_wide_t c[], selfcal_wide_t keep) {
+    const size_t index = term_of(self, j).index;
+    settle_node(self, j);
+    const selfcal_sum_t ln_s = make_sum(keep * sum_value(self->node[j].ln_s));
+    selfcal_bank_start_node(self, (uint16_t)j);
+    self->node[j].ln_s = ln_s;
+    memset(states(self, index, 0), 0, series_of(self) * SELFCAL_TERMS_MAX * sizeof(selfcal_sum_t));
+    for (size_t axis = 0; axis < self->model->axes; axis++) {
+        const reading_sums_t sums = selfcal_kernel_state_sums(self, j, index, axis);
+        *sums.b = make_sum(0.0);
+        *sums.c = make_sum(c[axis]);
+    }
+}
+
 static void state_gains_steady(const selfcal_term_node_t *term, size_t order, term_gains_t *gains) {
     const gain_t gain = gain_of(term, order, 1.0);
     gains->sums.scale = make_sum(1.0 / gain.s);
@@ -447,5 +461,5 @@ static bool valid_sum(const selfcal_law_t *law, float dt_s) {
 
 const selfcal_states_code_t selfcal_states_code = {
     valid_sum, init_states, states_sound, start_node, run_states, run_states_gap,
-    settle_node, fade_states, view_states, spread_of, drift_of,
+    settle_node, fade_states, restart_states, view_states, spread_of, drift_of,
 };

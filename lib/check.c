@@ -16,7 +16,7 @@ SELFCAL_STATIC_ASSERT(push_nodes, SELFCAL_PUSH_NODES >= 1 && SELFCAL_PUSH_NODES 
 SELFCAL_STATIC_ASSERT(push_every, SELFCAL_PUSH_EVERY >= 1 && SELFCAL_PUSH_EVERY <= 256 &&
                                       (SELFCAL_PUSH_EVERY & (SELFCAL_PUSH_EVERY - 1)) == 0);
 SELFCAL_STATIC_ASSERT(lines, SELFCAL_LINES >= 8 && SELFCAL_LINES <= 64 && SELFCAL_LINES % 2 == 0);
-SELFCAL_STATIC_ASSERT(retire, SELFCAL_RETIRE_BLOCKS >= 0);
+SELFCAL_STATIC_ASSERT(retire, SELFCAL_RETIRE_BLOCKS >= 0 && SELFCAL_RETIRE_BLOCKS < 65535);
 SELFCAL_STATIC_ASSERT(quality, SELFCAL_REPORT_QUALITY >= 0 && SELFCAL_REPORT_QUALITY <= 3);
 
 /* The prices that selfcal_layout.h states, of the float build and the integer one. */
@@ -91,6 +91,9 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
 
 /* Weight of the samples: one each, or less where they are forgotten. */
 static bool weight_is_sound(const selfcal_t *self) {
+    if (self->model->handling != NULL) {
+        return self->weight <= (selfcal_wide_t)self->n; /* selfcal_reopen() */
+    }
     if (self->model->forgetting != NULL) {
         /* nothing to forget yet */
         return self->weight <= (selfcal_wide_t)self->n && (self->n > 0U || self->keep == 1.0);
@@ -133,7 +136,9 @@ static bool intake_is_sound(const selfcal_t *self) {
         return false;
     }
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        if (self->bad[axis] > self->watched || !isfinite(self->last[axis]) || !isfinite(self->shifted[axis])) {
+        if (self->bad[axis] > self->watched || !isfinite(self->last[axis]) || !isfinite(self->shifted[axis]) ||
+            !isfinite(self->usual.level[axis]) || !(self->usual.limit[axis] >= 0.0F) ||
+            !isfinite(self->prior_mean[axis]) || !(self->prior_sd[axis] > 0.0F) || !isfinite(self->prior_sd[axis])) {
             return false;
         }
         if (!selfcal_retired(self, axis) &&

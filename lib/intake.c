@@ -13,6 +13,11 @@
 /* --------------------------------------------------------------------------------------------------------------
  * blocks */
 
+/* Samples that tell an axis's scatter well enough, and how many outliers in a row are so: more are a step or a motion,
+ * which is not for a sample to decide. */
+#define OUTLIER_DOF 64U
+#define OUTLIER_RUN 4U
+
 static void start_block(selfcal_t *self) {
     self->position = 0;
     self->used = 0;
@@ -25,6 +30,16 @@ COLD static void lose_blocks(selfcal_t *self, uint64_t count) {
     const uint32_t room = UINT32_MAX - self->counters.blocks_lost;
     self->counters.blocks_lost += count < room ? (uint32_t)count : room;
     selfcal_bank_gap(self, count);
+}
+
+/* How far a sample of the next block may be from the level of this one, whose mean is uncertain too. */
+static void set_limits(selfcal_t *self, const selfcal_real_t y[]) {
+    const float sds = self->model->handling->outlier_sd * sqrtf(1.0F + 1.0F / (float)self->used);
+    for (uint8_t axis = 0; axis < self->model->axes && self->within_dof >= OUTLIER_DOF; axis++) {
+        self->usual.level[axis] = self->origin[axis] + (float)(self->offset[axis] + y[axis]);
+        const float limit = sds * selfcal_within_sd(self, axis);
+        self->usual.limit[axis] = limit > 0.0F ? limit : 0.0F; /* NaN of a retired axis: none */
+    }
 }
 
 static void close_block(selfcal_t *self) {
@@ -50,6 +65,9 @@ static void close_block(selfcal_t *self) {
         self->within[axis] += scatter;
     }
     self->within_dof += self->used - 1U;
+    if (self->model->handling != NULL && self->model->handling->outlier_sd > 0.0F) {
+        set_limits(self, y);
+    }
     if (self->used < block) {
         self->counters.blocks_part++;
     }
@@ -102,6 +120,7 @@ selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count) {
  * passed, or that has been done. */
 static bool drop_block(selfcal_t *self) {
     const uint32_t position = self->position;
+    memset(&self->usual, 0, sizeof self->usual); /* the level may have changed */
     if (position == 0U || self->dropped) {
         return false;
     }
@@ -143,6 +162,7 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount) {
         return SELFCAL_BAD_ARGUMENT;
     }
     self->shifted[axis] += amount;
+    self->prior_mean[axis] += amount;
     if (selfcal_retired(self, axis)) {
         return SELFCAL_OK;
     }
@@ -196,6 +216,26 @@ static uint32_t faults(selfcal_t *self, const float sample[]) {
     return bad;
 }
 
+/* Counts samples far from the level of the block before; a bit for each axis with one. */
+static uint32_t outliers(selfcal_t *self, const float sample[], uint32_t live) {
+    uint32_t odd = 0;
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        selfcal_usual_t *usual = &self->usual;
+        const bool far = (live >> axis & 1U) != 0U && usual->limit[axis] > 0.0F &&
+            fabsf(sample[axis] - usual->level[axis]) > usual->limit[axis];
+        if (!far) {
+            usual->run[axis] = 0;
+        } else if (usual->run[axis] < OUTLIER_RUN) {
+            usual->run[axis]++;
+            if (self->counters.outliers[axis] < UINT16_MAX) {
+                self->counters.outliers[axis]++;
+            }
+            odd |= 1U << axis;
+        }
+    }
+    return odd;
+}
+
 /* Retires the axes that keep the others waiting. `bad`, `live`: axes at fault, and not yet retired. Only samples in
  * which some live axis is sound are counted: where all fail (the sensor unplugged) nobody is kept waiting by
  * anybody. */
@@ -213,7 +253,7 @@ static void retire(selfcal_t *self, uint32_t bad, uint32_t live) {
     }
     for (uint8_t axis = 0; axis < axes; axis++) {
         const bool mostly = self->bad[axis] > self->watched - self->bad[axis];
-        self->bad_blocks[axis] = mostly ? self->bad_blocks[axis] + 1U : 0U;
+        self->bad_blocks[axis] = (uint16_t)(mostly ? self->bad_blocks[axis] + 1U : 0U);
         if (SELFCAL_RETIRE_BLOCKS > 0 && self->bad_blocks[axis] >= SELFCAL_RETIRE_BLOCKS && live != 1U << axis) {
             live &= ~(1U << axis); /* but never the last one */
             self->retired |= 1U << axis;
@@ -238,7 +278,8 @@ void selfcal_take(selfcal_t *self, const float sample[], const float regressors[
     const uint32_t bad = faults(self, sample) & live;
     retire(self, bad, live);
     const bool known = moving || self->columns == NULL || self->model->regressors->code->usable(self, regressors);
-    const bool sound = bad == 0U && known;
+    const bool handles = self->model->handling != NULL && !moving && bad == 0U;
+    const bool sound = bad == 0U && known && (!handles || outliers(self, sample, live) == 0U);
     if (!sound || moving || self->dropped) {
         pass(self, sound, 1U);
         return;

@@ -19,7 +19,7 @@ void selfcal_node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t 
     const selfcal_t *bank = work->bank;
     const uint16_t index = (uint16_t)(work->first_node + k);
     const selfcal_wide_t n = bank->weight;
-    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, p0 = sd * sd;
+    const selfcal_wide_t sd = (selfcal_wide_t)axis_of(work)->bias_sd, p0 = sd * sd; /* of the model, always wide */
     /* A record without any scatter has no likelihood; the floor keeps its logarithm finite, far below any prior's N
      * over the largest rho. */
     const selfcal_wide_t least = 1e-28 * p0;
@@ -106,7 +106,7 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
     }
     if (work->at == 0U) {
         work->per_n = 1.0 / work->bank->weight;
-        work->per_bias_sd = 1.0 / (selfcal_wide_t)axis_of(work)->bias_sd;
+        work->per_bias_sd = 1.0 / (selfcal_wide_t)work->bank->prior_sd[work->axis];
     }
     for (uint16_t k = step_part(work, step_nodes(work), model->nodes); k < work->at; k++) {
         const selfcal_place_t place = place_of(work, k);

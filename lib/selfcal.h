@@ -222,6 +222,17 @@ typedef struct {
     float half_life_s; /* at least SELFCAL_BATCH dt_s */
 } selfcal_forgetting_t;
 
+/* What no model file can foresee and the module handles by itself. Outliers: selfcal_push(). Steps of the bias and
+ * changes of the noise: selfcal_changes_t; not beside regressors. */
+typedef struct {
+    /* A sample so many standard deviations from the mean of the block before is kept out of the sums; 0: none. After 4
+     * in a row the next are taken. Of normal noise 6 keep out one sample in 5e8, which is 35 in 1000 h of six axes at
+     * 819 Hz. Not where a bank interval is one sample. */
+    float outlier_sd;
+    bool steps;
+    bool variance_changes;
+} selfcal_handling_t;
+
 typedef struct {
     uint32_t id;        /* checksum of the tables: a snapshot or a monitor tells models apart by it */
     float dt_s;         /* bank interval, 1e-6 to 1e6 */
@@ -234,6 +245,7 @@ typedef struct {
     const selfcal_regressors_t *regressors; /* NULL: none, and none of their cost */
     const selfcal_forgetting_t *forgetting; /* likewise */
     const selfcal_states_code_t *states;    /* &selfcal_states_code if a law is a sum, else NULL */
+    const selfcal_handling_t *handling;     /* NULL: nothing is handled, and none of its cost */
 } selfcal_model_t;
 
 /* ------------------------------------------------------------------------------------------------------------- bank */
@@ -269,6 +281,7 @@ typedef struct {
     uint32_t not_finite[SELFCAL_AXES_MAX]; /* samples kept out, by the axis at fault */
     uint32_t saturated[SELFCAL_AXES_MAX];
     uint32_t stuck[SELFCAL_AXES_MAX];
+    uint16_t outliers[SELFCAL_AXES_MAX]; /* see selfcal_handling_t; held at 65535 */
     /* samples kept out because a regressor's value was not finite or SELFCAL_SAMPLE_MAX */
     uint32_t regressor_not_finite;
 } selfcal_counters_t;
@@ -337,6 +350,25 @@ selfcal_status_t selfcal_rate(selfcal_t *self, uint32_t block, float variance_ra
  * progress yields no value. Begin a report under way anew. SELFCAL_BAD_ARGUMENT, and nothing changes: no such axis, or
  * `amount` or the sum of all of them is not below SELFCAL_SAMPLE_MAX. Of a retired axis that sum alone is kept. */
 selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount);
+
+/* The bias or the noise has changed. What is known of the laws and their parameters is kept; the bias of each axis
+ * begins anew from what it is now. O(nodes axes), with logarithms: for rare events. Reports under way are given up
+ * (SELFCAL_OVERTAKEN).
+ * `at`: of each axis of the model the likeliest law and where it lies. `keep`: the part of what was learned of the noise
+ * that is kept, above 0 to 1. `learned`: by selfcal_learned(), from before the change; NULL: there is none.
+ * SELFCAL_BAD_ARGUMENT; SELFCAL_BAD_MODEL if the model handles nothing or has regressors; SELFCAL_TOO_SHORT. Method:
+ * bank_reopen.c. */
+typedef struct {
+    uint8_t hypothesis;
+    float ln_rho, ln_second; /* of its nodes; ln_second of alpha or the ratio */
+    float sigma_v;           /* unit; where it is not above 0 the residuals tell it */
+    float bias, bias_sd;     /* unit, of an axis with a step; else bias_sd is 0. Such an axis takes what was learned
+                                before, since the readings after the step say something else. */
+} selfcal_reopening_t;
+selfcal_status_t selfcal_reopen(selfcal_t *self, const selfcal_reopening_t at[], float keep, const float learned[]);
+
+/* What the bank knows of the noise and the drift now, for selfcal_reopen(): `learned` [nodes][axes]. O(nodes axes). */
+void selfcal_learned(selfcal_t *self, float learned[]);
 
 /* The following take a bank that selfcal_init() has prepared and an axis of its model. Anything else is a bug. */
 
@@ -564,7 +596,9 @@ typedef enum {
     SELFCAL_SUSPECT_COLORED_NOISE = 5,
     SELFCAL_SUSPECT_FLICKER = 6, /* or another drift than the law's */
     SELFCAL_SUSPECT_VARIANCE_CHANGE = 7,
-    SELFCAL_SUSPECT_OUTLIERS = 8
+    SELFCAL_SUSPECT_OUTLIERS = 8,
+    SELFCAL_SUSPECT_STEP = 9, /* this and motion: of a selfcal_change_t alone */
+    SELFCAL_SUSPECT_MOTION = 10
 } selfcal_suspect_t;
 
 /* Why an axis is not judged. */
@@ -576,12 +610,21 @@ typedef enum {
     SELFCAL_REASON_RETIRED = 4
 } selfcal_reason_t;
 
+/* A change that was found while the samples came. */
+typedef struct {
+    selfcal_suspect_t cause; /* STEP; MOTION: several axes stepped at once; VARIANCE_CHANGE */
+    float size;              /* of a step, unit; of a change of variance, the noise over that before */
+    float ago_s;             /* since its onset */
+} selfcal_change_t;
+
 typedef struct {
     selfcal_adequacy_state_t state;
     selfcal_reason_t reason;
     selfcal_suspect_t suspect; /* the strongest one, also of an adequate model */
     float score;               /* of the suspect, in standard deviations of its null law */
     uint32_t samples;          /* bank samples that it rests on */
+    uint32_t changes;          /* found on this axis so far ... */
+    selfcal_change_t change;   /* ... and the last of them */
 } selfcal_judgement_t;
 
 typedef struct selfcal_adequacy selfcal_adequacy_t;
@@ -599,8 +642,29 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
 void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *model, const selfcal_report_t *report,
                              const float coefficient[]);
 
-/* The judgement of the last epoch. */
+/* The judgement of the last epoch, and the last change. */
 selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis);
+
+/* --------------------------------------------------------------------------------------------------------- changes
+ * Steps of the bias and changes of the noise, found while the samples come, for a model whose `handling` says so.
+ * Method, false-alarm rates and delays: changes.c.
+ *
+ *     selfcal_changes_init(&changes, &adequacy, &bank, learned);
+ *     each sample, after selfcal_adequacy_push():
+ *         if (selfcal_changes_handle(&adequacy, &bank) != 0) { ask for a report; selfcal_judgement() has the changes }
+ */
+
+typedef struct selfcal_changes selfcal_changes_t;
+
+/* After selfcal_adequacy_init(). `learned`: memory for [nodes][axes], which must outlive the use. SELFCAL_BAD_ARGUMENT
+ * on a null pointer. SELFCAL_BAD_MODEL if the model handles neither. */
+selfcal_status_t selfcal_changes_init(selfcal_changes_t *self, selfcal_adequacy_t *adequacy, const selfcal_t *bank,
+                                      float learned[]);
+
+/* Call it after each sample; from time to time it keeps what was learned. Returns a bit for each axis that has changed.
+ * Then the bank has been reopened (selfcal_reopen()): after a step the bias of such an axis is learned anew; after a
+ * change of variance all noise learned before it is forgotten. */
+uint32_t selfcal_changes_handle(selfcal_adequacy_t *adequacy, selfcal_t *bank);
 
 /* ------------------------------------------------------------------------------------------------------------- gate
  * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both).

@@ -183,6 +183,13 @@ typedef struct {
                                   (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + \
                                    (size_t)(axes) * (SELFCAL_TERMS_MAX + SELFCAL_STATE_SUMS)) * sizeof(selfcal_sum_t)))
 
+/* What an axis's samples are held against, see selfcal_handling_t. */
+typedef struct {
+    float level[SELFCAL_AXES_MAX], limit[SELFCAL_AXES_MAX]; /* mean of the block before; how far a sample may be from it,
+                                                               0: not known */
+    uint8_t run[SELFCAL_AXES_MAX];                          /* outliers in a row */
+} selfcal_usual_t;
+
 /* Pointers first: a snapshot has the members that follow them. */
 struct selfcal {
     const selfcal_model_t *model;
@@ -220,10 +227,13 @@ struct selfcal {
     uint32_t equal[SELFCAL_AXES_MAX];
     bool in_gap;
     float shifted[SELFCAL_AXES_MAX]; /* by selfcal_shift(), in all, unit */
+    /* of the bias's prior, unit: the model's until selfcal_reopen() */
+    float prior_mean[SELFCAL_AXES_MAX], prior_sd[SELFCAL_AXES_MAX];
     uint32_t retired;                /* a bit for each axis */
     uint32_t watched;                /* samples looked at since the axes were last judged ... */
     uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
-    uint32_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
+    uint16_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
+    selfcal_usual_t usual;
     selfcal_counters_t counters;
 };
 
@@ -462,13 +472,45 @@ typedef struct {
     bool known, running, begun;
     selfcal_reason_t reason; /* if not known */
     selfcal_filter_law_t next, law; /* of the last report; in use */
+    selfcal_reopening_t likely;     /* where the likeliest law of the last report lies */
+    selfcal_real_t gain[SELFCAL_FILTER_STATES], root; /* of the last bank sample; root of 1/S */
     selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
     selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
     selfcal_real_t last, slow, fourth, square[2];
     selfcal_sums_t epoch, all;
 } selfcal_watch_t;
 
+/* A step of the bias that may have begun with some bank sample. */
+enum { SELFCAL_ONSETS = 8 };
+typedef struct {
+    selfcal_real_t state[SELFCAL_FILTER_STATES]; /* of the filter, over a step of 1 */
+    selfcal_real_t along, weight, size; /* sums of z w, z held, and of w^2; of z w */
+    selfcal_real_t late, late_weight;   /* along and weight when the score had been over its limit for a while */
+    uint16_t age, held;                 /* bank samples; those in a row with the score over its limit */
+} selfcal_onset_t;
+
+typedef struct {
+    selfcal_onset_t onset[SELFCAL_ONSETS];
+    selfcal_real_t power, square, sum; /* of this window's innovations: squares, held and whole, and themselves */
+    selfcal_real_t level, whole;       /* their means over the windows before */
+    selfcal_real_t odd, odd_square;    /* of the window before, if it was off that level; else 0 */
+    uint16_t windows;                  /* before */
+} selfcal_change_watch_t;
+
+struct selfcal_changes {
+    uint32_t in_window; /* its bank samples so far */
+    uint32_t found_at[SELFCAL_AXES_MAX]; /* bank intervals before the last change was found */
+    float *learned;  /* [nodes][axes]: before a change */
+    bool keeps, due; /* there is something in it; it is to be renewed */
+    uint32_t found;  /* a bit for each axis with a change that is not yet handled: */
+    selfcal_change_t change[SELFCAL_AXES_MAX];
+    float bias[SELFCAL_AXES_MAX], bias_sd[SELFCAL_AXES_MAX]; /* after a step, unit; less the bank's offset */
+    selfcal_change_watch_t watch[SELFCAL_AXES_MAX];
+};
+
 struct selfcal_adequacy {
+    selfcal_changes_t *changes; /* NULL: they are not looked for */
+    void (*look)(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_real_t z[], uint32_t gap);
     uint32_t seen, before, length, count, elapsed, used;
     bool any;
     selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], held[SELFCAL_ADEQUACY_INPUTS];

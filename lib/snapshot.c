@@ -1,6 +1,6 @@
 /* Snapshot: all that a bank knows, as bytes.
  *
- * Format 2. Numbers of the header and the checksum are little-endian.
+ * Format 3. Numbers of the header and the checksum are little-endian.
  *        0  4  "SFCL"
  *        4  4  bytes of the whole, checksum included
  *        8  2  format version
@@ -18,7 +18,7 @@
  * The version counts up when the meaning of a member changes, or the header. */
 #include "bank.h"
 
-#define VERSION 2U
+#define VERSION 3U
 enum { HEADER = 24, TRAILER = 4 };
 static const uint8_t magic[4] = {'S', 'F', 'C', 'L'};
 

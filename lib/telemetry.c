@@ -17,7 +17,8 @@ SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
 SELFCAL_STATIC_ASSERT(judgement_is_as_on_the_wire,
                       (unsigned)SELFCAL_INADEQUATE == SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE &&
-                      (unsigned)SELFCAL_SUSPECT_OUTLIERS == SELFCAL_ADEQUACY_SUSPICION_OUTLIERS &&
+                      (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_SUSPICION_MOTION &&
+                      (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_CHANGE_MOTION &&
                       (unsigned)SELFCAL_REASON_RETIRED == SELFCAL_ADEQUACY_REASON_RETIRED);
 enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
@@ -154,7 +155,8 @@ static bool next_part(selfcal_telemetry_t *self)
         begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, COLUMN_ITEMS * columns(self) - 1U);
     } else if (k <= hypotheses + 1U && self->judgement != NULL) {
         self->part = (uint8_t)(hypotheses + 2U);
-        begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0, SELFCAL_ADEQUACY_JUDGED);
+        begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0, self->judgement->changes > 0U ?
+                      (uint8_t)SELFCAL_ADEQUACY_CHANGE_AGO : (uint8_t)SELFCAL_ADEQUACY_JUDGED);
     } else {
         self->part = (uint8_t)(hypotheses + 3U);
         begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
@@ -301,7 +303,8 @@ static uint32_t health_value(const selfcal_telemetry_t *self)
            (c->gaps != 0 ? 1U << SELFCAL_AXIS_GAPS_SHIFT : 0U) |
            (c->blocks_lost != 0 ? 1U << SELFCAL_AXIS_BLOCKS_LOST_SHIFT : 0U) |
            (uint32_t)self->model->hypotheses << SELFCAL_AXIS_HYPOTHESES_SHIFT |
-           columns_told(self) << SELFCAL_AXIS_COLUMNS_SHIFT;
+           columns_told(self) << SELFCAL_AXIS_COLUMNS_SHIFT |
+           (uint32_t)c->outliers[axis] << SELFCAL_AXIS_OUTLIERS_SHIFT;
 }
 
 static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)
@@ -327,7 +330,11 @@ static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item)
     case SELFCAL_ADEQUACY_SUSPICION: return (uint32_t)self->judgement->suspect;
     case SELFCAL_ADEQUACY_SUSPICION_SCORE: return float_bits(self->judgement->score);
     case SELFCAL_ADEQUACY_REASON: return (uint32_t)self->judgement->reason;
-    default: return self->judgement->samples;
+    case SELFCAL_ADEQUACY_JUDGED: return self->judgement->samples;
+    case SELFCAL_ADEQUACY_CHANGE_COUNT: return self->judgement->changes;
+    case SELFCAL_ADEQUACY_CHANGE: return (uint32_t)self->judgement->change.cause;
+    case SELFCAL_ADEQUACY_CHANGE_SIZE: return float_bits(self->judgement->change.size);
+    default: return float_bits(self->judgement->change.ago_s);
     }
 }
 

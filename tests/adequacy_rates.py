@@ -1,11 +1,13 @@
-"""How often the module's adequacy (lib/adequacy.c) flags records, clean ones and ones with an effect.
+"""How often the module's adequacy (lib/adequacy.c) flags records, and what changes (lib/changes.c) it finds in them:
+clean ones and ones with an effect.
 
-    python tests/adequacy_rates.py --records 50 --hours 10 --seed 1 [--effect NAME --size S] [--out FILE]
+    python tests/adequacy_rates.py --records 50 --hours 10 --seed 1 [--effect NAME --size S] [--handle] [--out FILE]
 
 Each record has six axes at 1 Hz, each with a law drawn from those of the default model and parameters from its priors.
 An effect is on gx alone, whose drift is small. Clean ones have a temperature that warms up and wanders, a supply that
 steps, and gaps: none of them moves the bias. The library in float runs as on a module, with a report before each epoch.
-Prints the flags by suspicion; `--out` takes every judgement.
+`--handle`: the model handles steps and changes of the variance. Prints the flags by suspicion, and the changes.
+`--out` takes every judgement.
 """
 
 from __future__ import annotations
@@ -14,13 +16,14 @@ import argparse
 import json
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.engines.library import Bank
-from selfcal.model import Model
+from selfcal.model import Handling, Model
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 from selfcal.wire import choices
@@ -85,8 +88,10 @@ def with_effect(
     raise SystemExit(f"there is no effect {name}")
 
 
-def record(tables: Tables, model: Model, hours: float, seed: int, effect: str, size: float) -> list[tuple[int, ...]]:
-    """Judgements of one record; an effect is on gx alone."""
+def record(
+    tables: Tables, model: Model, hours: float, seed: int, effect: str, size: float
+) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
+    """Judgements and changes of one record; an effect is on gx alone."""
     rng = np.random.default_rng(seed)
     n = round(hours * 3600)
     channels = channels_of(rng, n)
@@ -103,8 +108,10 @@ def record(tables: Tables, model: Model, hours: float, seed: int, effect: str, s
     if effect == "cross_axis":
         columns[0] = columns[0] + size * np.std(np.diff(columns[0])) / np.std(np.diff(columns[1])) * columns[1]
     missing = np.where(rng.uniform(size=n) < 1e-3, rng.integers(1, 30, n), 0).astype(np.uint64)
-    told = Bank(tables).raw.watch(np.column_stack(columns).astype(np.float32), missing, channels.astype(np.float32))
-    return list(told)
+    told, found = Bank(tables).raw.watch(
+        np.column_stack(columns).astype(np.float32), missing, channels.astype(np.float32)
+    )
+    return list(told), list(found)
 
 
 def main() -> None:
@@ -114,16 +121,25 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--effect", default="")
     parser.add_argument("--size", type=float, default=1.0)
+    parser.add_argument("--handle", action="store_true")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    model = Model.load(None)
+    model = replace(Model.load(None), handling=Handling(steps=given.handle, variance_changes=given.handle))
     tables = make_tables(model, 1.0, AXES)
     flags: Counter[str] = Counter()
+    changes: Counter[str] = Counter()
+    delays: list[float] = []
     judged = 0
     rows = []
     first: list[float] = []
     for k in range(given.records):
-        told = record(tables, model, given.hours, given.seed + k, given.effect, given.size)
+        told, found = record(tables, model, given.hours, given.seed + k, given.effect, given.size)
+        for axis, at, cause, size, _ in found:
+            late = at - round(given.hours * 1800)
+            where = "" if not given.effect else "right" if axis == 0 and 0 <= late < 600 else "other"
+            changes[f"{SUSPECTS[cause]} {where}".strip()] += 1
+            delays += [late] if where == "right" else []
+            print(f"  record {k}, {AXES[axis]}, {at} s: {SUSPECTS[cause]} {size:.3g}", flush=True)
         for axis, at, state, suspect, score, samples in told:
             if state:
                 judged += 1
@@ -138,10 +154,12 @@ def main() -> None:
         f"{hours:g} h of {given.effect or 'clean'} records, {judged} judgements: {sum(flags.values())} flags",
         dict(flags),
     )
+    if given.handle:
+        print(f"changes: {dict(changes)}", f"delay {np.median(delays):.0f} s in the median" if delays else "")
     if given.effect:
-        found = np.array(first)
-        after = f", after {np.nanmedian(found):.2f} h in the median" if np.isfinite(found).any() else ""
-        print(f"flagged {np.isfinite(found).mean():.0%} of records{after}")
+        hours_to = np.array(first)
+        after = f", after {np.nanmedian(hours_to):.2f} h in the median" if np.isfinite(hours_to).any() else ""
+        print(f"flagged {np.isfinite(hours_to).mean():.0%} of records{after}")
     if given.out:
         given.out.write_text(json.dumps(rows))
 

@@ -111,6 +111,10 @@ typedef struct {
     selfcal_report_t report;
 #if APP_ADEQUACY
     selfcal_adequacy_t adequacy;
+#if SELFCAL_MODEL_CHANGES
+    selfcal_changes_t changes;
+    float learned[SELFCAL_MODEL_NODES * SELFCAL_MODEL_AXES]; /* before a change */
+#endif
     selfcal_judgement_t judged; /* of the axis of the report that is sent */
 #endif
 #if SELFCAL_MODEL_REGRESSORS > 0

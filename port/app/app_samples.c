@@ -14,6 +14,9 @@ void app_begin_columns(app_t *app)
 #endif
 #if APP_ADEQUACY
     (void)selfcal_adequacy_init(&app->adequacy, &app->bank);
+#if SELFCAL_MODEL_CHANGES
+    (void)selfcal_changes_init(&app->changes, &app->adequacy, &app->bank, app->learned);
+#endif
 #endif
     (void)app;
 }
@@ -68,6 +71,24 @@ static void leave_out_retired(app_t *app)
 }
 #endif
 
+#if APP_ADEQUACY && SELFCAL_MODEL_CHANGES
+/* Where something has changed the last reports are of the past: there is no corrected sample until the next ones, which
+ * are due at once. */
+static void handle_changes(app_t *app)
+{
+    const uint32_t changed = selfcal_changes_handle(&app->adequacy, &app->bank);
+    if (changed == 0U) {
+        return;
+    }
+    app->due_ms = app_now(app);
+#if APP_CORRECTED_MS
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        app->has_report[axis] = app->has_report[axis] && (changed >> axis & 1U) == 0U;
+    }
+#endif
+}
+#endif
+
 /* By the rule at selfcal_push_moving(). */
 static void give(app_t *app, const float reading[], const float values[])
 {
@@ -115,6 +136,9 @@ bool app_take_sample(app_t *app)
 #if APP_ADEQUACY
         const float *side = reading + SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS;
         selfcal_adequacy_push(&app->adequacy, &app->bank, side, values);
+#if SELFCAL_MODEL_CHANGES
+        handle_changes(app);
+#endif
 #endif
         app->fresh = true;
 #if APP_CORRECTED_MS

@@ -47,7 +47,7 @@ def watch(
     before[::97] = 5 if missing else 0
     tables = tables or tables_of(*("gx", "gy", "gz")[: y.shape[1]])
     beside = None if channels is None else channels.astype(np.float32)
-    told = Bank(tables).raw.watch(np.ascontiguousarray(y, np.float32), before, beside)
+    told, _ = Bank(tables).raw.watch(np.ascontiguousarray(y, np.float32), before, beside)
     return [(axis, at, state, SUSPECTS[suspect], score, n) for axis, at, state, suspect, score, n in told]
 
 

@@ -4,6 +4,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -46,7 +47,8 @@ class Bank {
 public:
     Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes,
          const std::vector<HypothesisTuple> &hypotheses,
-         uint32_t id, const std::optional<RegressorsTuple> &regressors, double half_life_s) {
+         uint32_t id, const std::optional<RegressorsTuple> &regressors, double half_life_s,
+         const std::tuple<double, bool, bool> &handling) {
         for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
             if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS ||
@@ -78,7 +80,8 @@ public:
                   hypotheses_.data(),
                   nullptr,
                   nullptr,
-                  &selfcal_states_code};
+                  &selfcal_states_code,
+                  nullptr};
         if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
             throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
         if (regressors) {
@@ -93,6 +96,10 @@ public:
         forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
         if (half_life_s != 0.0)
             model_.forgetting = &forgetting_;
+        const auto [outlier_sd, steps, variance_changes] = handling;
+        handling_ = {static_cast<float>(outlier_sd), steps, variance_changes};
+        if (outlier_sd != 0.0 || steps || variance_changes)
+            model_.handling = &handling_;
         memory_.resize(size() / sizeof(double) + 1);
         check(selfcal_init(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double)));
     }
@@ -117,7 +124,9 @@ public:
 
     // Judgements (axis, sample, state, suspect, score, samples) of a record, with a report on every axis just before
     // each epoch: a module reports every few seconds. `channels` [n, 2]: temperature and supply.
-    std::vector<std::tuple<int, size_t, int, int, float, uint32_t>>
+    // And the changes (axis, sample, cause, size, s since the onset) that the model handles.
+    std::pair<std::vector<std::tuple<int, size_t, int, int, float, uint32_t>>,
+              std::vector<std::tuple<int, size_t, int, float, float>>>
     watch(const Rows &samples,
           const nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> &missing_before,
           const std::optional<Rows> &channels) {
@@ -125,9 +134,15 @@ public:
             (channels && (channels->shape(0) != samples.shape(0) || channels->shape(1) != SELFCAL_ADEQUACY_CHANNELS)))
             throw std::invalid_argument("samples must be [n, axes], missing_before [n], channels [n, 2]");
         std::vector<std::tuple<int, size_t, int, int, float, uint32_t>> told;
+        std::vector<std::tuple<int, size_t, int, float, float>> found;
         nb::gil_scoped_release release;
         auto adequacy = std::make_unique<selfcal_adequacy_t>();
         check(selfcal_adequacy_init(adequacy.get(), &bank_));
+        auto changes = std::make_unique<selfcal_changes_t>();
+        std::vector<float> learned(size_t{model_.nodes} * model_.axes);
+        if (model_.handling && (model_.handling->steps || model_.handling->variance_changes))
+            check(selfcal_changes_init(changes.get(), adequacy.get(), &bank_, learned.data()));
+        size_t changed = samples.shape(0);
         selfcal_report_t report{};
         for (size_t i = 0; i < samples.shape(0); i++) {
             if (missing_before.data()[i] > 0)
@@ -141,12 +156,20 @@ public:
                 const selfcal_judgement_t j = selfcal_judgement(adequacy.get(), &bank_, axis);
                 told.emplace_back(axis, i, j.state, j.suspect, j.score, j.samples);
             }
-            const bool due = ended || (adequacy->length == 0 && (i + 1) % SELFCAL_EPOCH_MIN == 0);
+            const uint32_t at = selfcal_changes_handle(adequacy.get(), &bank_);
+            for (uint8_t axis = 0; axis < axes_.size(); axis++)
+                if ((at >> axis & 1U) != 0) {
+                    const selfcal_change_t change = selfcal_judgement(adequacy.get(), &bank_, axis).change;
+                    found.emplace_back(axis, i, change.cause, change.size, change.ago_s);
+                    changed = i;
+                }
+            const bool again = i >= changed && (i - changed) % 64 == 0 && i - changed <= 512;
+            const bool due = ended || again || (adequacy->length == 0 && (i + 1) % SELFCAL_EPOCH_MIN == 0);
             for (uint8_t axis = 0; due && axis < axes_.size(); axis++)
                 if (selfcal_report(work_.get(), &bank_, axis, &report) == SELFCAL_OK)
                     selfcal_adequacy_report(adequacy.get(), &model_, &report, nullptr);
         }
-        return told;
+        return {told, found};
     }
 
     void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
@@ -158,6 +181,18 @@ public:
             check(selfcal_push_moving(&bank_, samples.data() + i * axes_.size()));
     }
     void rate(uint32_t block, float variance_ratio) { check(selfcal_rate(&bank_, block, variance_ratio)); }
+
+    // Of each axis hypothesis, ln rho, ln of the second parameter, sigma_v, bias and its sd, see selfcal_reopening_t.
+    void reopen(const std::vector<std::tuple<uint8_t, float, float, float, float, float>> &at, float keep) {
+        if (at.size() != axes_.size())
+            throw std::invalid_argument("one place an axis");
+        selfcal_reopening_t given[SELFCAL_AXES_MAX]{};
+        for (size_t axis = 0; axis < at.size(); axis++) {
+            const auto [hypothesis, ln_rho, ln_second, sigma_v, bias, bias_sd] = at[axis];
+            given[axis] = {hypothesis, ln_rho, ln_second, sigma_v, bias, bias_sd};
+        }
+        check(selfcal_reopen(&bank_, given, keep, nullptr));
+    }
 
     bool retired(uint8_t axis) const {
         if (axis >= axes_.size())
@@ -378,6 +413,7 @@ private:
     std::vector<float> reference_, coefficient_sd_;
     selfcal_regressors_t regressors_{};
     selfcal_forgetting_t forgetting_{};
+    selfcal_handling_t handling_{};
     std::vector<double> memory_;
     selfcal_model_t model_{};
     selfcal_t bank_{};
@@ -498,15 +534,16 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("OFF_GRID") = static_cast<int>(SELFCAL_OFF_GRID);
     nb::class_<Bank>(m, "Bank")
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t,
-                      const std::optional<RegressorsTuple> &, double>(),
+                      const std::optional<RegressorsTuple> &, double, const std::tuple<double, bool, bool> &>(),
              nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(),
-                 nb::arg("half_life_s") = 0.0)
+                 nb::arg("half_life_s") = 0.0, nb::arg("handling") = std::make_tuple(0.0, false, false))
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("watch", &Bank::watch)
         .def("skip", &Bank::skip)
         .def("moving", &Bank::moving)
         .def("push_moving", &Bank::push_moving)
         .def("rate", &Bank::rate)
+        .def("reopen", &Bank::reopen)
         .def("retired", &Bank::retired)
         .def("report", &Bank::report, nb::arg("axis"), nb::arg("mask") = 0)
         .def("predict", &Bank::predict)

@@ -100,6 +100,10 @@ class Regressor:
         return (f"{self.name}.sin", f"{self.name}.cos") if self.kind == "periodic" else (self.name,)
 
 
+#: Nearer than so many standard deviations too much of the noise itself would be kept out.
+LEAST_OUTLIER_SD = 4.0
+
+
 @dataclass(frozen=True)
 class Gate:
     """The stationary gate's configuration (`selfcal_gate_config_t`); `N` by group, white noise density to start from,
@@ -111,6 +115,20 @@ class Gate:
     settle: int
     memory: int
     N: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Handling:
+    """What the module handles by itself (`selfcal_handling_t`): samples `outlier_sd` standard deviations off are kept
+    out (0: none), steps of the bias reopen it, changes of the noise are learned anew."""
+
+    outlier_sd: float = 0.0
+    steps: bool = False
+    variance_changes: bool = False
+
+    @property
+    def as_tuple(self) -> tuple[float, bool, bool]:
+        return self.outlier_sd, self.steps, self.variance_changes
 
 
 @dataclass(frozen=True)
@@ -139,6 +157,7 @@ class Model:
     regressors: tuple[Regressor, ...] = ()
     half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
     gate: Gate | None = None
+    handling: Handling = Handling()
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -412,6 +431,18 @@ class _Reader:
             N={name: self.number(value, f"gate.N.{name}") for name, value in noise.items()},
         )
 
+    def handling(self, tree: Any, regressors: bool) -> Handling:
+        fields = self.only(tree, ("outlier_sd", "steps", "variance_changes"), "handle")
+        outlier_sd = self.number(fields.get("outlier_sd", 0.0), "handle.outlier_sd", strict=False)
+        if 0.0 < outlier_sd < LEAST_OUTLIER_SD:
+            raise self.fail("handle.outlier_sd", f"must be 0 or at least {LEAST_OUTLIER_SD:g}, not {outlier_sd:g}")
+        for name in ("steps", "variance_changes"):
+            if not isinstance(fields.get(name, False), bool):
+                raise self.fail(f"handle.{name}", f"must be true or false, not {shown(fields[name])}")
+            if fields.get(name) and regressors:
+                raise self.fail(f"handle.{name}", "does not go with regressors: leave one of them out")
+        return Handling(outlier_sd, fields.get("steps", False), fields.get("variance_changes", False))
+
     def nodes(self, tree: Any, where: str, laws: Mapping[str, Law]) -> GridNodes:
         fields = self.only(tree, tuple(dict.fromkeys((*NAMED, *laws))), where)
         found: dict[str, tuple[int, ...]] = {}
@@ -533,7 +564,7 @@ class _Reader:
         raw = self.tree()
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
-        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "correlation_time_s"), "")
+        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "handle", "correlation_time_s"), "")
         name = self.text(tree, "name", "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         weights, laws = self.hypotheses(tree)
@@ -568,4 +599,5 @@ class _Reader:
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
+            handling=self.handling(tree.get("handle") or {}, bool(tree.get("regressors"))),
         )

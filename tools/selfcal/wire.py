@@ -198,7 +198,11 @@ class AxisReport:
             return choices(f"{AXES[0].upper()}_ADEQUACY", signal).get(int(number), f"{number:g}")
 
         score, samples = self.values["suspicion_score"], int(self.values["judged"])
-        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples)
+        change = None
+        if {"change_count", "change", "change_size", "change_ago"} <= self.values.keys():
+            count, size, ago_s = (self.values[f"change_{name}"] for name in ("count", "size", "ago"))
+            change = Change(word("change"), size, ago_s, int(count))
+        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, change)
 
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
         """Mean, sd and probability of use of each regressor column that was told."""
@@ -207,6 +211,23 @@ class AxisReport:
             for c, (name, _) in enumerate(names.columns)
             if f"c{c}_mean" in self.values
         }
+
+
+@dataclass(frozen=True)
+class Change:
+    """The last change that a module found and handled on an axis (lib/changes.c), and how many there were.
+
+    `size`: of a step or a motion in the axis's unit, of a variance_change the noise over that before.
+    """
+
+    cause: str
+    size: float
+    ago_s: float
+    count: int
+
+    def __str__(self) -> str:
+        size = f"noise x{self.size:.2f}" if self.cause == "variance_change" else f"{self.cause} of {self.size:+.3g}"
+        return f"{size} {self.ago_s:.0f} s ago, handled"
 
 
 @dataclass(frozen=True)
@@ -222,11 +243,14 @@ class Adequacy:
     suspicion: str
     score: float
     samples: int
+    change: Change | None = None
 
     def __str__(self) -> str:
+        changed = f"; {self.change}" if self.change is not None else ""
         if self.state == "inadequate":
-            return f"not adequate: {self.suspicion} ({self.score:+.1f} sd)"
-        return "adequate" if self.state == "adequate" else f"not judged: {self.reason.replace('_', ' ')}"
+            return f"not adequate: {self.suspicion} ({self.score:+.1f} sd){changed}"
+        judged = "adequate" if self.state == "adequate" else f"not judged: {self.reason.replace('_', ' ')}"
+        return f"{judged}{changed}"
 
 
 @dataclass

@@ -58,6 +58,7 @@ class Bank:
             tables.id,
             _regressors(tables),
             tables.half_life_s,
+            tables.handling.as_tuple,
         )
 
     def push(

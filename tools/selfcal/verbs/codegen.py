@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.errors import UserError
-from selfcal.model import Model
+from selfcal.model import Handling, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import COLUMN_KINDS
@@ -131,6 +131,8 @@ def _header(model: Model, tables: Tables) -> str:
 #define SELFCAL_MODEL_AXES {axes}U
 #define SELFCAL_MODEL_HYPOTHESES {hypotheses}U
 #define SELFCAL_MODEL_REGRESSORS {len(tables.regressors)}U
+/* 1: it handles steps of the bias, or changes of the noise (lib/changes.c). */
+#define SELFCAL_MODEL_CHANGES {int(tables.handling.steps or tables.handling.variance_changes)}
 /* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units{_units(tables)}. */
 #define SELFCAL_MODEL_CHANNELS {len(tables.channels)}U
 /* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
@@ -204,6 +206,10 @@ def _source(model: Model, tables: Tables) -> str:
     if tables.half_life_s:
         code = f"{{&selfcal_forgetting_code, {_f(tables.half_life_s)}}}"
         parts += [f"static const selfcal_forgetting_t forgetting = {code};", ""]
+    handling = tables.handling
+    if handling != Handling():
+        given = ", ".join([_f(handling.outlier_sd), *(str(b).lower() for b in handling.as_tuple[1:])])
+        parts += [f"static const selfcal_handling_t handling = {{{given}}};", ""]
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
     channels = ", ".join(f'"{name}"' for name, _ in tables.channels)
     parts += [
@@ -218,6 +224,7 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {'&regressors' if tables.regressors else 'NULL'},",
         f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
         f"    {'&selfcal_states_code' if tables.term_nodes else 'NULL'},",
+        f"    {'&handling' if handling != Handling() else 'NULL'},",
         "};",
         "",
     ]
