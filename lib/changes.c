@@ -9,8 +9,8 @@
  * With the drift's gain g, T ends at d / (sigma_v sqrt(2 g)): a walk hides a step of less than some 10 sd of its own
  * bias.
  *
- * VARIANCE The mean square of the innovations, z^2 held at 4, over windows of WINDOW bank samples, against its mean over the windows
- * before. It is told where two windows in a row are off by VARIANCE_LIMIT sd to the same side.
+ * VARIANCE The mean square of the innovations, z^2 held at 4, over windows of WINDOW bank samples, against its mean over
+ * the windows before. It is told where two windows in a row are off by VARIANCE_LIMIT sd to the same side.
  * Of normal z, min(z^2, 4) has mean 0.9205 and variance 1.2324. So held, eight samples of a burst do not tell.
  *
  * tests/README.md has the rates of false alarms and the delays as measured. */
@@ -52,7 +52,7 @@ static selfcal_real_t loudness(const selfcal_changes_t *self, const selfcal_chan
 }
 
 /* One bank sample of one axis into one onset; whether a step there is told. */
-static bool follow(selfcal_onset_t *onset, const selfcal_watch_t *filter, selfcal_real_t z, selfcal_real_t loud) {
+static bool follow_onset(selfcal_onset_t *onset, const selfcal_watch_t *filter, selfcal_real_t z, selfcal_real_t loud) {
     selfcal_real_t innovation = R(1.0);
     for (size_t a = 0; a < filter->law.states; a++) {
         onset->state[a] *= filter->law.pole[a];
@@ -130,7 +130,7 @@ static bool look_for_step(selfcal_changes_t *self, const selfcal_watch_t *filter
     bool told = false;
     for (size_t i = 0; i < SELFCAL_ONSETS; i++) {
         selfcal_onset_t *onset = &watch->onset[i];
-        if (onset->age > 0U && follow(onset, filter, z, loud)) {
+        if (onset->age > 0U && follow_onset(onset, filter, z, loud)) {
             told = true;
         }
     }

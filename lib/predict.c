@@ -69,3 +69,22 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
     *sd = (float)r_sqrt(var);
     return SELFCAL_OK;
 }
+
+selfcal_reason_t selfcal_reason(const selfcal_model_t *model, const selfcal_report_t *report,
+                                selfcal_adequacy_state_t state) {
+    if (!isfinite(report->bias_mean)) {
+        return SELFCAL_REASON_OUTSIDE_PRIORS;
+    }
+    if (state == SELFCAL_INADEQUATE) {
+        return SELFCAL_REASON_INADEQUATE;
+    }
+    float identified = 0.0F;
+    for (uint8_t h = 0; h < model->hypotheses; h++) {
+        const selfcal_law_t *law = model->hypothesis[h].law;
+        const selfcal_estimate_t *parameter = report->hypothesis[h].parameter;
+        const unsigned flags = parameter[SELFCAL_N].flags,
+                       of_drift = has_drift(law) ? parameter[drift_parameter(law)].flags : flags;
+        identified += (flags & of_drift & SELFCAL_IDENTIFIED) != 0U ? report->hypothesis[h].probability : 0.0F;
+    }
+    return identified >= 0.5F ? SELFCAL_REASON_NONE : SELFCAL_REASON_NOT_IDENTIFIED;
+}

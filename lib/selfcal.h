@@ -354,8 +354,8 @@ selfcal_status_t selfcal_shift(selfcal_t *self, uint8_t axis, float amount);
 /* The bias or the noise has changed. What is known of the laws and their parameters is kept; the bias of each axis
  * begins anew from what it is now. O(nodes axes), with logarithms: for rare events. Reports under way are given up
  * (SELFCAL_OVERTAKEN).
- * `at`: of each axis of the model the likeliest law and where it lies. `keep`: the part of what was learned of the noise
- * that is kept, above 0 to 1. `learned`: by selfcal_learned(), from before the change; NULL: there is none.
+ * `at`: of each axis of the model the likeliest law and where it lies. `keep`: the part of what was learned of the
+ * noise that is kept, above 0 to 1. `learned`: by selfcal_learned(), from before the change; NULL: there is none.
  * SELFCAL_BAD_ARGUMENT; SELFCAL_BAD_MODEL if the model handles nothing or has regressors; SELFCAL_TOO_SHORT. Method:
  * bank_reopen.c. */
 typedef struct {
@@ -601,13 +601,19 @@ typedef enum {
     SELFCAL_SUSPECT_MOTION = 10
 } selfcal_suspect_t;
 
-/* Why an axis is not judged. */
+/* Why an axis is not judged, has no corrected sample, or has a calibration that is not to be relied on. */
 typedef enum {
     SELFCAL_REASON_NONE = 0,
-    SELFCAL_REASON_FIRST_EPOCH = 1,     /* still under way */
-    SELFCAL_REASON_NO_REPORT = 2,       /* none yet, or the record lies outside the priors */
-    SELFCAL_REASON_LAW_NOT_WATCHED = 3, /* the likeliest law has coloured noise */
-    SELFCAL_REASON_RETIRED = 4
+    SELFCAL_REASON_FIRST_EPOCH = 1,     /* not judged: still under way */
+    SELFCAL_REASON_NO_REPORT = 2,       /* none yet */
+    SELFCAL_REASON_LAW_NOT_WATCHED = 3, /* not judged: the likeliest law has coloured noise */
+    SELFCAL_REASON_RETIRED = 4,
+    SELFCAL_REASON_OUTSIDE_PRIORS = 5,  /* the report has no numbers */
+    SELFCAL_REASON_MOVING = 6,          /* no report yet, and the gate sees motion */
+    SELFCAL_REASON_INADEQUATE = 7,      /* the model does not explain the readings */
+    SELFCAL_REASON_NOT_IDENTIFIED = 8,  /* half of the probability has an N or a drift that is not */
+    SELFCAL_REASON_BAD_SAMPLE = 9,      /* on some axis it is not finite or saturated */
+    SELFCAL_REASON_STUCK = 10           /* the axis repeats one reading */
 } selfcal_reason_t;
 
 /* A change that was found while the samples came. */
@@ -616,6 +622,11 @@ typedef struct {
     float size;              /* of a step, unit; of a change of variance, the noise over that before */
     float ago_s;             /* since its onset */
 } selfcal_change_t;
+
+/* Why the calibration in a report is not to be relied on. `state`: of the axis's last judgement.
+ * The first that applies of SELFCAL_REASON_OUTSIDE_PRIORS, _INADEQUATE, _NOT_IDENTIFIED and _NONE. */
+selfcal_reason_t selfcal_reason(const selfcal_model_t *model, const selfcal_report_t *report,
+                                selfcal_adequacy_state_t state);
 
 typedef struct {
     selfcal_adequacy_state_t state;
@@ -787,6 +798,7 @@ typedef struct {
     uint32_t motion;
     uint32_t gate_alarm_count;
     uint32_t retired; /* a bit for each axis of the model */
+    selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* why an axis has no calibration to rely on */
     uint32_t command_count;
     uint32_t command_refused_count;
     /* of each axis of the model, unit: added by the sensor itself, see selfcal_shift() */
@@ -798,6 +810,7 @@ typedef struct {
     float value[SELFCAL_AXES_MAX]; /* reading less bias, see selfcal_predict() */
     float sd[SELFCAL_AXES_MAX];    /* of that bias */
     uint32_t motion;               /* code as in selfcal.dbc */
+    selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* why there is none, or why it is not to be relied on */
 } selfcal_corrected_t;
 
 /* The coefficient of one regressor column, given that the column is in use, and the probability that it is. With a mean

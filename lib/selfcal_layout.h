@@ -185,9 +185,9 @@ typedef struct {
 
 /* What an axis's samples are held against, see selfcal_handling_t. */
 typedef struct {
-    float level[SELFCAL_AXES_MAX], limit[SELFCAL_AXES_MAX]; /* mean of the block before; how far a sample may be from it,
-                                                               0: not known */
-    uint8_t run[SELFCAL_AXES_MAX];                          /* outliers in a row */
+    float level[SELFCAL_AXES_MAX]; /* mean of the block before */
+    float limit[SELFCAL_AXES_MAX]; /* how far a sample may be from it; 0: not known */
+    uint8_t run[SELFCAL_AXES_MAX]; /* outliers in a row */
 } selfcal_usual_t;
 
 /* Pointers first: a snapshot has the members that follow them. */

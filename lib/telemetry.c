@@ -7,6 +7,7 @@
 
 enum { STATUS, REPORT, CORRECTED, ANSWER }; /* what the frames under way are of */
 enum { NO_PARAMETER = SELFCAL_PARAMETERS };
+enum { REASON_BITS = 4 };
 
 static const char *const axis_names[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_NAMES;
 
@@ -19,7 +20,10 @@ SELFCAL_STATIC_ASSERT(judgement_is_as_on_the_wire,
                       (unsigned)SELFCAL_INADEQUATE == SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE &&
                       (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_SUSPICION_MOTION &&
                       (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_CHANGE_MOTION &&
-                      (unsigned)SELFCAL_REASON_RETIRED == SELFCAL_ADEQUACY_REASON_RETIRED);
+                      (unsigned)SELFCAL_REASON_STUCK == SELFCAL_ADEQUACY_REASON_STUCK);
+SELFCAL_STATIC_ASSERT(reasons_lie_alike, SELFCAL_STATUS_REASON_GX_SHIFT == SELFCAL_CORRECTED_REASON_GX_SHIFT &&
+                      SELFCAL_STATUS_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_GX_SHIFT + 5 * REASON_BITS &&
+                      SELFCAL_CORRECTED_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_AZ_SHIFT);
 enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
 uint16_t selfcal_crc12(const uint8_t *data, size_t length)
@@ -376,9 +380,19 @@ static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message)
     return 0U;
 }
 
+/* A reason by axis, above what else the item holds. */
+static uint32_t reason_bits(const selfcal_telemetry_t *self, const selfcal_reason_t reason[])
+{
+    uint32_t bits = 0;
+    for (uint8_t axis = 0; axis < self->model->axes; axis++) {
+        bits |= (uint32_t)reason[axis] << (SELFCAL_STATUS_REASON_GX_SHIFT + REASON_BITS * self->message[axis]);
+    }
+    return bits;
+}
+
 static uint32_t retired_value(const selfcal_telemetry_t *self)
 {
-    uint32_t axes = 0;
+    uint32_t axes = reason_bits(self, self->module->reason);
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         axes |= (self->module->retired >> axis & 1U) << self->message[axis];
     }
@@ -447,7 +461,8 @@ static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint3
 {
     const selfcal_corrected_t *corrected = self->corrected;
     if (item == SELFCAL_CORRECTED_TIME_MS || item == SELFCAL_CORRECTED_MOTION) {
-        *value = item == SELFCAL_CORRECTED_TIME_MS ? self->time_ms : corrected->motion;
+        *value = item == SELFCAL_CORRECTED_TIME_MS ? self->time_ms
+                                                   : corrected->motion | reason_bits(self, corrected->reason);
         return true;
     }
     const bool of_sd = item >= SELFCAL_CORRECTED_SD_GX;

@@ -78,6 +78,7 @@ typedef struct {
     uint32_t saved_ms;  /* when the state was saved last, or the start */
     selfcal_module_t told; /* filled in by `module` */
     uint32_t begun_ms; /* start of the axis report under way */
+    selfcal_reason_t reason[SELFCAL_MODEL_AXES]; /* of each axis's last report */
 #if SELFCAL_MODEL_GATE
     bool gated;
     uint64_t learn_at; /* windows of rest after which the gate's noise is taken anew */
@@ -89,7 +90,6 @@ typedef struct {
     uint64_t gathered_at;  /* of them, to the end of the last bank interval of the report under way */
     uint64_t rests_on[SELFCAL_MODEL_AXES]; /* ... of each axis's last report */
     selfcal_report_t last_report[SELFCAL_MODEL_AXES];
-    bool has_report[SELFCAL_MODEL_AXES];
     float reading[SELFCAL_MODEL_AXES]; /* the newest */
     uint32_t reading_ms;
     bool newer;            /* than what was last looked at for a corrected sample */

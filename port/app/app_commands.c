@@ -95,9 +95,6 @@ static uint8_t forget(app_t *app)
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         (void)selfcal_shift(&app->bank, axis, shifted[axis]);
         app->bias[axis] = NAN;
-#if APP_CORRECTED_MS
-        app->has_report[axis] = false;
-#endif
     }
     app_begin_columns(app);
     app->fresh = false;

@@ -18,7 +18,6 @@ void app_keep_report(app_t *app)
 {
     const uint8_t axis = app->report.axis;
     app->last_report[axis] = app->report;
-    app->has_report[axis] = isfinite(app->report.bias_mean); /* NaN if the record lies outside the priors */
     app->rests_on[axis] = app->gathered_at;
 }
 
@@ -41,13 +40,26 @@ static bool stuck(const app_t *app, uint8_t axis)
     return limit > 0U && app->bank.equal[axis] >= limit;
 }
 
+/* Why there is no corrected sample of an axis, or why it is not to be relied on. */
+static selfcal_reason_t reason_of(const app_t *app, uint8_t axis, bool is_faulty)
+{
+    const selfcal_reason_t known = app_reason(app, axis);
+    if (known == SELFCAL_REASON_RETIRED) {
+        return known;
+    }
+    return is_faulty ? SELFCAL_REASON_BAD_SAMPLE : stuck(app, axis) ? SELFCAL_REASON_STUCK : known;
+}
+
 /* The newest sample less the bias predicted for its time. */
 static void correct(app_t *app)
 {
+    const bool is_faulty = faulty(app, app->reading);
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         const uint64_t since = app->passed - app->rests_on[axis];
+        const selfcal_reason_t reason = reason_of(app, axis, is_faulty);
         float bias = NAN, sd = NAN;
-        if (app->has_report[axis] && !selfcal_retired(&app->bank, axis) && !stuck(app, axis)) {
+        if (reason == SELFCAL_REASON_NONE || reason == SELFCAL_REASON_INADEQUATE ||
+            reason == SELFCAL_REASON_NOT_IDENTIFIED) {
             const float elapsed_s = (float)since / SELFCAL_MODEL_RATE_HZ;
             (void)selfcal_predict(&app->last_report[axis], &selfcal_model, elapsed_s, &bias, &sd);
         }
@@ -58,6 +70,7 @@ static void correct(app_t *app)
 #endif
         app->corrected.value[axis] = app->reading[axis] - bias;
         app->corrected.sd[axis] = sd;
+        app->corrected.reason[axis] = reason;
     }
     app->corrected.motion = app_motion(app);
 }
@@ -68,14 +81,11 @@ bool app_begin_corrected(app_t *app)
     const bool due = app->newer && now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt;
     if (due) {
         app->newer = false;
-    }
-    if (due && !faulty(app, app->reading)) {
         app->corrected_ms = now;
         correct(app);
         (void)selfcal_telemetry_corrected(&app->telemetry, &app->corrected, app->reading_ms);
-        return true;
     }
-    return false;
+    return due;
 }
 
 #endif

@@ -38,6 +38,15 @@ uint32_t app_motion(const app_t *app)
     return SELFCAL_STATUS_MOTION_NOT_WATCHED;
 }
 
+selfcal_reason_t app_reason(const app_t *app, uint8_t axis)
+{
+    if (selfcal_retired(&app->bank, axis)) {
+        return SELFCAL_REASON_RETIRED;
+    }
+    const bool kept_waiting = app->reason[axis] == SELFCAL_REASON_NO_REPORT;
+    return kept_waiting && app_motion(app) == SELFCAL_STATUS_MOTION_MOVING ? SELFCAL_REASON_MOVING : app->reason[axis];
+}
+
 void app_tell(app_t *app)
 {
     selfcal_module_t *told = &app->told;
@@ -51,6 +60,7 @@ void app_tell(app_t *app)
     told->retired = app->bank.retired;
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         told->offset[axis] = selfcal_shifted(&app->bank, axis);
+        told->reason[axis] = app_reason(app, axis);
     }
 }
 

@@ -64,6 +64,9 @@ bool app_status_due(const app_t *app, uint32_t now);
 /* The gate's word, as the status has it. */
 uint32_t app_motion(const app_t *app);
 
+/* Why an axis has no calibration to rely on. */
+selfcal_reason_t app_reason(const app_t *app, uint8_t axis);
+
 #if APP_CORRECTED_MS
 /* app_corrected.c: samples less the bias */
 
@@ -73,7 +76,7 @@ void app_keep_sample(app_t *app, const float reading[], uint32_t missing);
 /* Keeps the report that was worked out. */
 void app_keep_report(app_t *app);
 
-/* A corrected sample, if one is due, of a sound sample that none was sent of. After all else: on a wire too slow for
+/* A corrected sample, if one is due, of a sample that none was sent of. After all else: on a wire too slow for
  * corrected samples one would always be due. */
 bool app_begin_corrected(app_t *app);
 #endif

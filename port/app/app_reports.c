@@ -58,11 +58,12 @@ static bool weigh(app_t *app)
 }
 #endif
 
-#if APP_ADEQUACY
 /* The judgement goes out with the report, which the next epoch goes by. */
 static void judge(app_t *app)
 {
     const uint8_t axis = app->report.axis;
+    selfcal_adequacy_state_t state = SELFCAL_NOT_JUDGED;
+#if APP_ADEQUACY
 #if SELFCAL_MODEL_REGRESSORS > 0
     const float *used = app->used[axis];
 #else
@@ -71,8 +72,10 @@ static void judge(app_t *app)
     selfcal_adequacy_report(&app->adequacy, &selfcal_model, &app->report, used);
     app->judged = selfcal_judgement(&app->adequacy, &app->bank, axis);
     selfcal_telemetry_adequacy(&app->telemetry, &app->judged);
-}
+    state = app->judged.state;
 #endif
+    app->reason[axis] = selfcal_reason(&selfcal_model, &app->report, state);
+}
 
 bool app_compute(app_t *app)
 {
@@ -97,11 +100,9 @@ bool app_compute(app_t *app)
 #endif
     app->computing = false;
     app->worked_out = status == SELFCAL_OK;
-#if APP_ADEQUACY
     if (app->worked_out) {
         judge(app);
     }
-#endif
 #if APP_CORRECTED_MS
     if (app->worked_out) {
         app_keep_report(app);

@@ -18,7 +18,9 @@ void app_begin_columns(app_t *app)
     (void)selfcal_changes_init(&app->changes, &app->adequacy, &app->bank, app->learned);
 #endif
 #endif
-    (void)app;
+    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
+        app->reason[axis] = SELFCAL_REASON_NO_REPORT;
+    }
 }
 
 void app_pass(app_t *app, uint32_t count)

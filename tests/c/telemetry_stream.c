@@ -190,6 +190,9 @@ int main(int argc, char **argv)
             const bool is_retired = (random32() & 1U) != 0U;
             module.retired |= is_retired ? 1UL << a : 0U;
             retired |= is_retired ? 1UL << retired_bit(axis_name[a]) : 0U;
+            char why[] = "reason_??";
+            memcpy(why + 7, axis_name[a], 2);
+            module.reason[a] = (selfcal_reason_t)told_count("STATUS", why, random32() % (SELFCAL_REASON_STUCK + 1U));
         }
         (void)told_count("STATUS", "axes_retired", retired);
         selfcal_telemetry_module(&telemetry, &module);

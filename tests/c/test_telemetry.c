@@ -357,7 +357,8 @@ static void test_busy_until_all_frames_are_fetched(void)
  * has not, are left out. */
 static void test_a_corrected_sample_goes_out_by_axis(void)
 {
-    selfcal_corrected_t corrected = {{0.25F, -1.5F}, {0.5F, 0.125F}, 2U};
+    selfcal_corrected_t corrected = {
+        {0.25F, -1.5F}, {0.5F, 0.125F}, 2U, {SELFCAL_REASON_NOT_IDENTIFIED, SELFCAL_REASON_NONE}};
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_corrected(&telemetry, &corrected, 70000));
     static const struct {
         uint32_t item;
@@ -375,7 +376,7 @@ static void test_a_corrected_sample_goes_out_by_axis(void)
         TEST_ASSERT_EQUAL_HEX32(bits_wanted, value(&frame));
     }
     frame = next(13);
-    TEST_ASSERT_EQUAL_UINT32(2, value(&frame));
+    TEST_ASSERT_EQUAL_HEX32(2U | 8U << 24, value(&frame)); /* ay is the fifth axis: bits 24 to 27 */
     TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
     corrected.sd[0] = NAN;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_corrected(&telemetry, &corrected, 0));

@@ -100,7 +100,7 @@ def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> 
     history = {}
     for target in ("host", core):
         firmware = program(model, recording.rate_hz, axes, target, core, tmp_path, flags)
-        history[target] = run(firmware, recording, model, axes, every, target, gate=core == "cortex-m4f")
+        history[target], _ = run(firmware, recording, model, axes, every, target, gate=core == "cortex-m4f")
     assert [len(history[core][axis]) for axis in axes] == [600.0 / every] * len(axes)
     assert values(history[core]) == values(history["host"])
 
@@ -133,7 +133,7 @@ def test_the_c_library_changes_nothing_that_matters(core: str, tmp_path: Path) -
     recording = part(tmp_path, 600.0, axes)
     flags = "-DAPP_ADEQUACY=0" if core == "cortex-m0" else ""
     made = {target: program(model, recording.rate_hz, axes, target, core, tmp_path, flags) for target in ("host", core)}
-    history = {target: run(one, recording, model, axes, 600.0, target) for target, one in made.items()}
+    history = {target: run(one, recording, model, axes, 600.0, target)[0] for target, one in made.items()}
     assert_close(history[core], history["host"])
 
 
@@ -252,7 +252,7 @@ def test_twenty_minutes_of_six_axes(core: str, name: str, tmp_path: Path) -> Non
     history = {
         target: run(
             program(model, recording.rate_hz, SIX, target, core, tmp_path), recording, model, SIX, 1200.0, target
-        )
+        )[0]
         for target in ("host", core)
     }
     assert_close(history[core], history["host"])

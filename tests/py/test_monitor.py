@@ -22,7 +22,7 @@ from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.model import Model
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import AxisReport, Decoder, Link, names_of, open_bus
+from selfcal.wire import REASONS, AxisReport, Decoder, Link, names_of, open_bus
 
 from wire_stream import lines, message, serial_line, stream
 
@@ -229,6 +229,22 @@ def test_view_tells_the_status_by_its_names() -> None:
     for said in ("state failed", "fault absent", "fault_count 3", "axes_retired gy,az", "offset_gx 0.25 deg/s"):
         assert said in picture
     assert "bus_off_count" not in picture
+
+
+def test_view_tells_why_an_axis_has_no_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the next step: of axes without a report in one line, of one with a report beside it. Of a reason that is
+    none nothing is said."""
+    monkeypatch.setenv("COLUMNS", "200")
+    decoder = Decoder()
+    decoder.status.update(state=1.0, reason_gx=8.0, reason_gy=6.0, reason_gz=6.0, reason_ax=0.0)
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        view = View(decoder, Link(bus), "test")
+        view.show([AxisReport("gx", 1.0, True, {"count": 5.0, "bias_mean": 0.25})])
+        picture = shown(view)
+    assert f"gy, gz: {REASONS['moving']}" in picture
+    assert REASONS["not_identified"] in picture
+    assert "reason_" not in picture
+    assert not re.search(r"\bax\b", picture)
 
 
 def test_view_of_a_module_that_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -483,12 +483,13 @@ def corrected_frame(counter: int, item: int, value: int) -> can.Message:
 
 def test_a_corrected_sample_holds_nothing_of_the_one_before() -> None:
     """Axis gx (items 1 and 7) is in the first set, not in the second: its value must not stand beside the new time."""
-    decoder = Decoder()
+    decoder, no_reasons = Decoder(), {f"reason_{axis}": 0.0 for axis in AXES}
     for counter, (item, value) in enumerate([(0, 2000), (1, 0x3F800000), (7, 0x3F000000), (13, 2), (0, 2100), (13, 1)]):
         decoder.feed(corrected_frame(counter, item, value))
         if counter == 3:
-            assert decoder.corrected == {"time_ms": 2000.0, "corrected_gx": 1.0, "sd_gx": 0.5, "motion": 2.0}
-    assert decoder.corrected == {"time_ms": 2100.0, "motion": 1.0}
+            sample = {"time_ms": 2000.0, "corrected_gx": 1.0, "sd_gx": 0.5, "motion": 2.0}
+            assert decoder.corrected == sample | no_reasons
+    assert decoder.corrected == {"time_ms": 2100.0, "motion": 1.0} | no_reasons
     assert (decoder.statistics.received, decoder.statistics.refused) == (6, 0)
 
 

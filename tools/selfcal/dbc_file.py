@@ -23,6 +23,8 @@ BASE, NODE_IDS, NODES = 0x200, 128, 12
 HYPOTHESES, PLACES, COLUMNS = 8, 3, 6
 #: Names of the places where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
+#: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
+REASON = "reason"
 #: Letters of a name in a DBC file, at most.
 LONGEST = 32
 
@@ -111,6 +113,12 @@ def _patterns(text: str) -> tuple[list[str], dict[str, Pattern], str]:
             change(match[1], match[2], is_float=True)
         elif line.startswith("CM_"):
             whole = line
+    words = next(signal.choices for message in messages.values() for signal in message.signals if signal.name == REASON)
+    for message in messages.values():
+        message.signals = [
+            replace(signal, choices=words) if signal.name.startswith(f"{REASON}_") else signal
+            for signal in message.signals
+        ]
     return head, {message.name: message for message in messages.values()}, whole
 
 

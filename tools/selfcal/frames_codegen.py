@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
-from selfcal.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, dbc
+from selfcal.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
 from selfcal.errors import UserError
 from selfcal.units import parameter_unit
 from selfcal.wire import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
@@ -61,6 +61,15 @@ class Field:
         return self.name.upper()
 
 
+def _as_elsewhere(signal: Signal) -> bool:
+    """Its words are those of the judgement's reason: selfcal_reason_t."""
+    return signal.name.startswith(f"{REASON}_")
+
+
+def _words(signal: Signal) -> str:
+    return ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+
+
 def _field(message: Message, signal: Signal) -> Field:
     where = f"{message.name}.{signal.name}"
     items = signal.multiplexer_ids
@@ -81,7 +90,7 @@ def _field(message: Message, signal: Signal) -> Field:
         scale=float(signal.conversion.scale),
         unit=signal.unit or "",
         comment=(signal.comment or "").rstrip("."),
-        choices=", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items()),
+        choices="" if _as_elsewhere(signal) else _words(signal),
     )
 
 
@@ -221,7 +230,7 @@ def _of_message(message: Message, name: str) -> list[str]:
     more = "" if len(members) == len(fields(message)) else f" Each later column's are {len(members)} higher."
     lines = [f"/* Items of the message {message.name}.{more} */", *_items(f"SELFCAL_{name}", members)]
     for signal in message.signals:
-        for number, word in (signal.choices or {}).items():
+        for number, word in ({} if _as_elsewhere(signal) else signal.choices or {}).items():
             lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
     return lines if lines[-1] == "" else [*lines, ""]
 
@@ -265,7 +274,7 @@ def table(database: Database) -> str:
     command = database.get_message_by_name(COMMAND)
     lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
     for signal in command.signals:
-        choices = ", ".join(f"{number} {word}" for number, word in (signal.choices or {}).items())
+        choices = _words(signal)
         meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
         lines.append(_entry(f"bits {signal.start} to {signal.start + signal.length - 1}, `{signal.name}`", meaning))
     return "\n".join(lines) + "\n"

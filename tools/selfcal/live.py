@@ -16,10 +16,22 @@ from rich.text import Text
 
 from selfcal.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.units import parameter_unit, typeset
-from selfcal.wire import OFF_GRID, AxisReport, Decoder, Statistics, Streams, axis_unit, status_text
+from selfcal.wire import (
+    AXES,
+    OFF_GRID,
+    REASONS,
+    AxisReport,
+    Decoder,
+    Statistics,
+    Streams,
+    axis_unit,
+    reasons,
+    status_text,
+)
 
 #: Of the status, what is told elsewhere or to programs alone.
-UNTOLD = ("time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent")
+UNTOLD = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
+UNTOLD |= {f"reason_{axis}" for axis in AXES}
 #: What the user has to do something about.
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
@@ -93,6 +105,11 @@ class Module:
     decoder: Decoder
     last: dict[str, tuple[AxisReport, deque[float]]] = field(default_factory=dict)
     time_s: float = 0.0
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why axes have no calibration to rely on, as it was told last."""
+        return reasons(dict(self.decoder.status), dict(self.decoder.corrected))
 
     def now(self) -> float:
         """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
@@ -206,6 +223,7 @@ class View:
         if advice:
             lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
         last = dict(module.last)  # Live asks from a thread of its own
+        lines += self._unreported(module, last, width)
         if last:
             names = self._names(module.decoder.status)
             count = max((report.hypotheses or told_of(report) for report, _ in last.values()), default=0)
@@ -214,6 +232,20 @@ class View:
             blocks = self._blocks(module, last, names, len(named), width)
             lines += _fitted(blocks, None if height is None else height - len(lines))
         return lines
+
+    def _unreported(self, module: Module, last: Mapping[str, object], width: int) -> list[Text]:
+        """Why axes have no report, a line for each reason."""
+        axes: dict[str, list[str]] = {}
+        for axis, word in module.reasons.items():
+            if axis not in last and (not self._axes or axis in self._axes):
+                axes.setdefault(word, []).append(axis)
+        return [
+            line
+            for word, names in axes.items()
+            for line in _flow(
+                [Text(said, "yellow") for said in f"{', '.join(names)}: {REASONS.get(word, word)}".split()], width, 1
+            )
+        ]
 
     def _counts(self, module: Module) -> Text:
         """The frames of one module, and, if it is the only one, of strangers."""
@@ -265,7 +297,7 @@ class View:
         parameters = {axis: _parameters(report, names, named=not cells) for axis, (report, _) in last.items()}
         bias_width = max(map(len, bias.values()))
         spark = min(SPARK[1], width - INDENT - bias_width - 2 - max(len(texts[0]) for texts in parameters.values()))
-        blocks = []
+        blocks, why = [], module.reasons
         for axis, (report, trend) in last.items():
             age_s = max(0.0, module.time_s - report.time_s)
             age_s += contact.silent_s if contact is not None else 0.0
@@ -280,6 +312,8 @@ class View:
             chunks += [Text(text) for text in _coefficients(report, names)]
             if report.adequacy is not None:
                 chunks.append(Text(str(report.adequacy), ADEQUACY.get(report.adequacy.state, "dim")))
+            if axis in why:
+                chunks.append(Text(REASONS.get(why[axis], why[axis]), "yellow"))
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks

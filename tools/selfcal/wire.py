@@ -85,6 +85,33 @@ def choices(message: str, signal: str) -> dict[int, str]:
     return {number: str(name) for number, name in named.items()}
 
 
+#: What the words of a reason mean (selfcal_reason_t), and what to do. Those of a judgement alone are not among them.
+REASONS = {
+    "no_report": "no report yet: leave it at rest for three bank samples; none come: see the sensor's state",
+    "moving": "moving: a report needs rest",
+    "retired": "retired: exchange the sensor, then reset forget",
+    "outside_priors": "outside the priors: widen them in the model file",
+    "inadequate": "not adequate: record, and run selfcal diagnose",
+    "not_identified": "not yet identified: leave it at rest for longer",
+    "bad_sample": "bad sample, not finite or saturated on some axis: look at the sensor",
+    "stuck": "stuck at one reading: exchange the sensor",
+}
+
+
+def reasons(*told: Mapping[str, float]) -> dict[str, str]:
+    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `told`:
+    status and corrected sample, as far as they came; of two the later one counts."""
+    found: dict[str, str] = {}
+    latest = -math.inf
+    for values in told:
+        said = {axis: values[f"reason_{axis}"] for axis in AXES if f"reason_{axis}" in values}
+        if said and values.get("time_ms", -math.inf) >= latest:
+            latest = values.get("time_ms", -math.inf)
+            words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
+            found = {axis: word for axis, word in words.items() if word != "none"}
+    return found
+
+
 def status_text(signal: str, value: float) -> str:
     """A value of the status as the DBC names it, else the number with its unit; axes for a mask of them."""
     entry = load_dbc().get_message_by_name("STATUS").get_signal_by_name(signal)

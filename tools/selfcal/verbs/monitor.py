@@ -22,7 +22,20 @@ from selfcal.framelog import WRITTEN, FrameLog
 from selfcal.known_models import KnownModels
 from selfcal.live import SILENT_S, Contact, View
 from selfcal.plot import check_picture, plot_run
-from selfcal.wire import AXES, AxisReport, Link, Statistics, Streams, axis_unit, node_of, open_bus, serial_ports
+from selfcal.wire import (
+    AXES,
+    REASONS,
+    AxisReport,
+    Decoder,
+    Link,
+    Statistics,
+    Streams,
+    axis_unit,
+    node_of,
+    open_bus,
+    reasons,
+    serial_ports,
+)
 
 if TYPE_CHECKING:
     import can
@@ -175,11 +188,13 @@ def monitor(
         if number in known and histories[number]
     }
     if (json is not None or plot is not None) and not reported:
-        raise UserError(f"{name}: no complete report came, so there is nothing to write")
+        why = {axis: word for one in known.values() for axis, word in reasons(one.status, one.corrected).items()}
+        said = "".join(f"; {axis}: {REASONS.get(word, word)}" for axis, word in why.items())
+        raise UserError(f"{name}: no complete report came, so there is nothing to write{said}")
     names = {number: models.names(known[number].status) for number in reported}
     if json is not None:
         documents = {
-            number: _document(history, known[number].status, name, names[number], number)
+            number: _document(history, known[number], name, names[number], number)
             for number, history in reported.items()
         }
         several = {"schema": MODULES, "modules": {str(number): one for number, one in documents.items()}}
@@ -247,9 +262,10 @@ def _farewell(
 
 
 def _document(
-    history: Mapping[str, Sequence[AxisReport]], status: Mapping[str, float], name: str, names: Names, node: int
+    history: Mapping[str, Sequence[AxisReport]], decoder: Decoder, name: str, names: Names, node: int
 ) -> dict[str, Any]:
     """The last complete reports as `identify` gives its results. Checks need the samples, which are not here."""
+    status, why = decoder.status, reasons(decoder.status, decoder.corrected)
     interval, block = status.get("bank_interval", math.nan), status.get("bank_block", math.nan)
     run = SimpleNamespace(
         path=name,
@@ -265,6 +281,7 @@ def _document(
     document["node"] = node
     for axis, entry in document["axes"].items():
         entry["adequate"] = None
+        entry["module_reason"] = why.get(axis)
         told = history[axis][-1].coefficients(names)
         if told:
             units = dict(names.columns)

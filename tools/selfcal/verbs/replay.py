@@ -48,7 +48,7 @@ from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
-from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus
+from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus, reasons
 
 MAGIC = b"SELFCAL1"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
@@ -144,8 +144,8 @@ def replay(
             f"samples or more a bank interval ({loaded_model.bank_rate_hz:g} Hz)"
         )
     firmware = build(loaded_model, recording.rate_hz, names, target)
-    history = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
-    document = _document(recording, loaded_model, history, gate)
+    history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
+    document = _document(recording, loaded_model, history, why, gate)
     if json is not None:
         write_json(document, json)
     if plot is not None:
@@ -251,9 +251,9 @@ def run(
     gate: bool = False,
     transport: str = "slcan",
     channel: str = "",
-) -> dict[str, list[AxisReport]]:
-    """Play the recording through the firmware; the complete reports of each axis. Prints the frame counts, and the
-    gate's."""
+) -> tuple[dict[str, list[AxisReport]], dict[str, str]]:
+    """Play the recording through the firmware; the complete reports of each axis, and why axes have no calibration to
+    rely on at the end. Prints the frame counts, and the gate's."""
     bank_s = bank_block(recording.rate_hz, model.bank_rate_hz) / recording.rate_hz
     wanted_s = report_every or min(recording.duration_s / TARGETS[target].reports, LONGEST_PERIOD_S)
     period_s = max(wanted_s, bank_s)  # between two bank samples nothing changes
@@ -261,7 +261,7 @@ def run(
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
         write_rows(recording, model, axes, rows)
-        finished = False
+        decoder = Decoder(from_start=True)
         with ExitStack() as stack:
             link, more = None, ["--timeout", f"{TIMEOUT_S:g}"]
             if transport == "can":  # listening first: on a bus nobody waits for a listener
@@ -273,13 +273,13 @@ def run(
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
                 link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
             if link is not None and wire:
-                finished = _watch(link, recording, model, history, target, module)
+                _watch(link, decoder, recording, model, history, target, module)
                 link.close_channel()  # the emulator forgets what it holds of a line that is closed
             said = before + _ending(module)
-        if module.returncode != 0 or not finished:
+        if module.returncode != 0 or not decoder.finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
             raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
-    return history
+    return history, reasons(decoder.status, decoder.corrected)
 
 
 def can_bus(channel: str, port: int | None = None) -> tuple[str, Link]:
@@ -369,17 +369,17 @@ def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str,
 
 def _watch(
     link: Link,
+    decoder: Decoder,
     recording: Recording,
     model: Model,
     history: dict[str, list[AxisReport]],
     target: str,
     module: subprocess.Popen[str],
-) -> bool:
-    """Follow the telemetry until the module has finished; false if it fell silent before. Of `history` retired axes
-    without a report are taken out."""
+) -> None:
+    """Follow the telemetry until the module has finished, or fallen silent. Of `history` retired axes without a report
+    are taken out."""
     patience_s = EMULATED_TIMEOUT_S if TARGETS[target].board else TIMEOUT_S
     whole: dict[str, bool] = {}  # the axis's last report
-    decoder = Decoder(from_start=True)
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s, names=lambda status: names_of(model)) as view:
         heard = time.monotonic()
@@ -414,11 +414,14 @@ def _watch(
             said += "left out: it has no report from before"
             del history[name]
     Console(stderr=True).print(said, highlight=False, soft_wrap=True)
-    return decoder.finished
 
 
 def _document(
-    recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], gate: bool
+    recording: Recording,
+    model: Model,
+    history: Mapping[str, Sequence[AxisReport]],
+    why: Mapping[str, str],
+    gate: bool,
 ) -> dict[str, Any]:
     found: dict[str, Identified | UserError] = {}
     for name, reports in history.items():
@@ -428,6 +431,7 @@ def _document(
             found[name] = error
     document = to_document(recording, found)
     for name, axis in document["axes"].items():
+        axis["module_reason"] = why.get(name)
         if "error" not in axis:
             told = history[name][-1].adequacy
             axis["module_says"] = asdict(told) if told is not None else None
