@@ -1,8 +1,8 @@
 /* Whether the model of the last report explains the readings after it: tests on the innovations of one filter an axis.
  *
  * Time is cut into epochs of half the record before them, within SELFCAL_EPOCH_MIN and SELFCAL_EPOCH_MAX bank samples.
- * At the start of an epoch each axis takes a law from its last report. A filter begins without a prior for the bias, and
- * goes on from epoch to epoch while the law has as many states; beside regressors it begins anew.
+ * At the start of an epoch each axis takes a law from its last report. A filter begins without a prior for the bias. It
+ * goes on from epoch to epoch where changes are looked for and the law has as many states; else it begins anew.
  * The report leaves the drift open, and this doubt must not look like a fault of the model. So the filter allows the
  * most drift that is plausible: the 95 % quantile of the drift parameter, under a law with a walk if one has 1 % of the
  * probability, else under one with a drift. Too much drift makes z negatively correlated: only positive correlation
@@ -142,7 +142,7 @@ static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
         selfcal_watch_t *watch = &self->watch[axis];
         watch->running = watch->known && !selfcal_retired(bank, axis);
         watch->begun = watch->begun && watch->running && watch->next.states == watch->law.states &&
-            regressors_of(bank->model) == 0U;
+            self->changes != NULL;
         if (watch->begun) {
             carry_over(watch);
         }
@@ -289,6 +289,12 @@ static void suspect(finding_t *found, selfcal_suspect_t suspect, selfcal_real_t 
     }
 }
 
+/* Of what looks like drift: while the drift is hardly known, a normal score is not normal enough. */
+static selfcal_real_t limit_of_drift(const selfcal_sums_t *sums) {
+    const bool early = sums->n < (selfcal_real_t)SELFCAL_ADEQUACY_EARLY;
+    return (selfcal_real_t)(early ? SELFCAL_ADEQUACY_LIMIT_EARLY : SELFCAL_ADEQUACY_LIMIT);
+}
+
 /* What names a cause: a channel, another axis. `known`: 1 / sqrt(1 + n / n_before). */
 static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, uint32_t others, selfcal_real_t known) {
     static const selfcal_suspect_t of_column[SELFCAL_ADEQUACY_COLUMNS] = {
@@ -296,7 +302,8 @@ static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, uint32_t 
     const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT, root = known / r_sqrt(sums->n);
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
         if (sums->weight[k] > R(0.0)) {
-            suspect(found, of_column[k], known * sums->along[k] / r_sqrt(sums->weight[k]), limit);
+            suspect(found, of_column[k], known * sums->along[k] / r_sqrt(sums->weight[k]),
+                    k == 0U ? limit_of_drift(sums) : limit);
         }
     }
     for (size_t other = 0; other < SELFCAL_AXES_MAX; other++) {
@@ -307,7 +314,7 @@ static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, uint32_t 
 }
 
 static void weigh_memory(finding_t *found, const selfcal_sums_t *sums, selfcal_real_t known) {
-    const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT, root = known / r_sqrt(sums->n);
+    const selfcal_real_t limit = limit_of_drift(sums), root = known / r_sqrt(sums->n);
     suspect(found, SELFCAL_SUSPECT_COLORED_NOISE, r_fmax(sums->lag * root, R(0.0)), limit);
     suspect(found, SELFCAL_SUSPECT_FLICKER, r_fmax(sums->slow * root / r_sqrt(SLOW / (R(2.0) - SLOW)), R(0.0)), limit);
 }

@@ -136,7 +136,7 @@ void selfcal_kernel_gap(selfcal_t *self, size_t j, selfcal_wide_t less);
 /* Forgetting: sums B and C of every axis of node `j`, times the part that is kept of each. */
 void selfcal_kernel_fade(selfcal_t *self, size_t j, selfcal_wide_t keep_b, selfcal_wide_t keep_c);
 
-/* The record begins anew for cell `k` = node * axes + axis, whose node is not level: C stands at `c`, B and the drift at
+/* The record begins anew for cell `k` = node * axes + axis, whose node is not level: C is `c`, B and the drift are
  * 0. */
 void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c);
 

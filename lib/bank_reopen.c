@@ -7,8 +7,8 @@
  * and its variance begin as at the first sample. The second bias has a prior N(mean, sd^2) by axis: what the likeliest
  * node says of the bias now, or what is known of the step. So the axes without a step keep what they know, though all
  * share A. A Gauss-Markov drift begins anew as well: its variance then counts twice until the readings tell.
- * The readings between a step and its detection have spoilt C of that axis: they look like more drift. It is put back to
- * what it was per sample before. Those samples then count as if they had been like the others.
+ * The readings between a step and its detection have spoilt C of that axis: they look like more drift. It is put back
+ * to what it was per sample before. Those samples then count as if they had been like the others.
  * Noise that has changed is forgotten: C, D and the weight of the samples keep the part `keep`. */
 #include "bank.h"
 
@@ -105,7 +105,7 @@ selfcal_status_t selfcal_reopen(selfcal_t *self, const selfcal_reopening_t at[],
     selfcal_bank_flush(self);
     self->batches++; /* a report under way is of other sums */
     const size_t axes = self->model->axes;
-    selfcal_wide_t mean[SELFCAL_AXES_MAX], sd[SELFCAL_AXES_MAX], c[SELFCAL_AXES_MAX];
+    selfcal_wide_t mean[SELFCAL_AXES_MAX] = {0.0}, sd[SELFCAL_AXES_MAX] = {0.0}, c[SELFCAL_AXES_MAX];
     for (uint8_t axis = 0; axis < axes; axis++) {
         bias_at(self, axis, &at[axis], &mean[axis], &sd[axis]);
     }

@@ -581,8 +581,10 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
 #define SELFCAL_EPOCH_MAX 4096U
 /* Scores beyond these make a model inadequate. One false flag in 1000 h over six axes at 1 Hz: tests/README.md. */
 #define SELFCAL_ADEQUACY_LIMIT 5.0F
+#define SELFCAL_ADEQUACY_LIMIT_EARLY 8.0F /* of ramp, colored_noise and flicker over fewer bank samples than that: */
+#define SELFCAL_ADEQUACY_EARLY 1024U
 #define SELFCAL_ADEQUACY_LIMIT_VARIANCE 6.0F
-#define SELFCAL_ADEQUACY_LIMIT_KURTOSIS 10.0F
+#define SELFCAL_ADEQUACY_LIMIT_KURTOSIS 13.0F
 
 typedef enum { SELFCAL_NOT_JUDGED = 0, SELFCAL_ADEQUATE = 1, SELFCAL_INADEQUATE = 2 } selfcal_adequacy_state_t;
 

@@ -250,7 +250,7 @@ static void the_format_is_the_one_described(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     TEST_ASSERT_EQUAL_MEMORY("SFCL", saved.bytes, 4);
     TEST_ASSERT_EQUAL(saved.length, number_at(&saved, OFFSET_LENGTH, 4));
-    TEST_ASSERT_EQUAL(2, number_at(&saved, OFFSET_VERSION, 2));
+    TEST_ASSERT_EQUAL(3, number_at(&saved, OFFSET_VERSION, 2));
     TEST_ASSERT_EQUAL(REAL_BYTES, number_at(&saved, OFFSET_REAL, 1));
     TEST_ASSERT_EQUAL(AXES, number_at(&saved, OFFSET_AXES, 1));
     TEST_ASSERT_EQUAL(model.nodes, number_at(&saved, OFFSET_NODES, 2));

@@ -28,7 +28,8 @@ from selfcal.wire import choices
 
 MODEL = Model.load(None)
 SUSPECTS = choices("GX_ADEQUACY", "suspicion")
-LIMITS = {"variance_change": 6.0, "outliers": 10.0}  # SELFCAL_ADEQUACY_LIMIT_*; of the others 5
+#: SELFCAL_ADEQUACY_LIMIT_*; of the others 5. Those of drift are for epochs below 1024 bank samples.
+LIMITS = {"variance_change": 6.0, "outliers": 13.0, "ramp": 8.0, "colored_noise": 8.0, "flicker": 8.0}
 EPOCH = 256
 
 

@@ -288,6 +288,7 @@ public:
         d["blocks_part"] = c->blocks_part;
         d["blocks_moving"] = c->blocks_moving;
         d["not_finite"] = list(c->not_finite);
+        d["outliers"] = std::vector<uint32_t>(c->outliers, c->outliers + axes);
         d["saturated"] = list(c->saturated);
         d["stuck"] = list(c->stuck);
         d["regressor_not_finite"] = c->regressor_not_finite;

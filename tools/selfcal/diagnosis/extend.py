@@ -20,6 +20,8 @@ from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
+#: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
+OUTLIER_SD = 6.0
 #: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
 NODES = [24, 20]
 #: ... on the Cortex-M0, whose RAM holds one such law beside the random walk.
@@ -50,6 +52,10 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
                 # A model file states one range for a group: not one that keeps another axis out that was looked at.
                 if all(_within(record, other, limit) for other in group["axes"] if other != name and other in found):
                     group["range"] = _digits(limit)
+            elif finding.look.cause == "outliers":
+                _handle(tree, "outlier_sd", OUTLIER_SD)
+            elif finding.look.cause == "variance_change" and not tree.get("regressors"):
+                _handle(tree, "variance_changes", True)
     _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
     colored = any(one.state.extras.color for one in found.values())
@@ -60,6 +66,11 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
+
+
+def _handle(tree: dict[str, Any], what: str, value: float | bool) -> None:
+    """Have the module handle something by itself, unless the model says already how."""
+    tree["handle"] = {what: value, **(tree.get("handle") or {})}
 
 
 def _within(record: Record, axis: str, limit: float) -> bool:

@@ -172,6 +172,8 @@ def identify_axis(
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
+    if engine == "reference" and model.handling.outlier_sd:
+        raise UserError("the reference bank takes outliers: take --engine library, or leave handle.outlier_sd out")
 
     def curve_of_samples(values: NDArray[np.floating[Any]]) -> Sampled:
         unused = np.logical_or.reduce(list(kept_out(samples, group).values()))
