@@ -105,7 +105,7 @@ selfcal_status_t selfcal_reopen(selfcal_t *self, const selfcal_reopening_t at[],
     selfcal_bank_flush(self);
     self->batches++; /* a report under way is of other sums */
     const size_t axes = self->model->axes;
-    selfcal_wide_t mean[SELFCAL_AXES_MAX] = {0.0}, sd[SELFCAL_AXES_MAX] = {0.0}, c[SELFCAL_AXES_MAX];
+    selfcal_wide_t mean[SELFCAL_AXES_MAX] = {0.0}, sd[SELFCAL_AXES_MAX] = {0.0}, c[SELFCAL_AXES_MAX] = {0.0};
     for (uint8_t axis = 0; axis < axes; axis++) {
         bias_at(self, axis, &at[axis], &mean[axis], &sd[axis]);
     }

@@ -73,7 +73,7 @@ def test_the_header_and_checksum_are_those_of_the_format() -> None:
         bank.push(samples, missing)
         snapshot = bank.save()
         magic, length, version, size, axes, nodes, zero, model, _ = HEADER.unpack_from(snapshot)
-        assert (magic, length, version, size) == (b"SFCL", len(snapshot), 2, real)
+        assert (magic, length, version, size) == (b"SFCL", len(snapshot), 3, real)
         assert (axes, nodes, zero, model) == (len(AXES), bank.raw.nodes, 0, made.id)
         assert struct.unpack("<I", snapshot[-4:])[0] == zlib.crc32(snapshot[:-4])
         (x,) = struct.unpack("<f" if real == 4 else "<d", snapshot[-4 - real : -4])

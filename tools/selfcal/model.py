@@ -131,6 +131,10 @@ class Handling:
         return self.outlier_sd, self.steps, self.variance_changes
 
 
+#: Of a model that says nothing of it.
+NOT_HANDLED = Handling()
+
+
 @dataclass(frozen=True)
 class GridNodes:
     """Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one."""
@@ -157,7 +161,7 @@ class Model:
     regressors: tuple[Regressor, ...] = ()
     half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
     gate: Gate | None = None
-    handling: Handling = Handling()
+    handling: Handling = NOT_HANDLED
 
     @property
     def axes(self) -> tuple[str, ...]:

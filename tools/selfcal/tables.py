@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
-from selfcal.model import Group, Handling, Model, Regressor
+from selfcal.model import NOT_HANDLED, Group, Handling, Model, Regressor
 from selfcal.regressors import channels_of, sources_of
 from selfcal.units import same_kind
 
@@ -125,7 +125,7 @@ class Tables:
     hypotheses: tuple[HypothesisTable, ...]
     regressors: tuple[RegressorTable, ...] = ()
     half_life_s: float = 0.0
-    handling: Handling = Handling()
+    handling: Handling = NOT_HANDLED
 
     @property
     def rate_hz(self) -> float:
@@ -166,7 +166,7 @@ class Tables:
         extras = (
             *self.regressors,
             *([self.half_life_s] if self.half_life_s else []),
-            *([self.handling] if self.handling != Handling() else []),
+            *([self.handling] if self.handling != NOT_HANDLED else []),
         )
         return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses, *extras)).encode())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.errors import UserError
-from selfcal.model import Handling, Model
+from selfcal.model import NOT_HANDLED, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import COLUMN_KINDS
@@ -207,7 +207,7 @@ def _source(model: Model, tables: Tables) -> str:
         code = f"{{&selfcal_forgetting_code, {_f(tables.half_life_s)}}}"
         parts += [f"static const selfcal_forgetting_t forgetting = {code};", ""]
     handling = tables.handling
-    if handling != Handling():
+    if handling != NOT_HANDLED:
         given = ", ".join([_f(handling.outlier_sd), *(str(b).lower() for b in handling.as_tuple[1:])])
         parts += [f"static const selfcal_handling_t handling = {{{given}}};", ""]
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
@@ -224,7 +224,7 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {'&regressors' if tables.regressors else 'NULL'},",
         f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
         f"    {'&selfcal_states_code' if tables.term_nodes else 'NULL'},",
-        f"    {'&handling' if handling != Handling() else 'NULL'},",
+        f"    {'&handling' if handling != NOT_HANDLED else 'NULL'},",
         "};",
         "",
     ]
