@@ -1,7 +1,7 @@
 /* Regressors beside the constant, and the normal equations of a node.
  *
  * A reading is y_i = x0 + c' z_i + x_i + v_i with known columns z (time, temperature, a step, ...) and coefficients
- * c ~ N(0, diag(sd^2)). As the constant does, every column goes through the node's zero-bias filter; with u = (u_0,
+ * c ~ N(m, diag(sd^2)). As the constant does, every column goes through the node's zero-bias filter; with u = (u_0,
  * u_1, ...) the innovations of "1" and of the columns, the sums A = sum u u'/s, B = sum u nu/s and C = sum nu^2/s give
  * the likelihood of every subset of columns (generalised least squares; de Jong, Biometrika 78 (1991) 143-151). A
  * belongs to the node, B to a node and an axis. Columns are taken about their first bank sample, as the readings are.
@@ -36,6 +36,9 @@ static bool valid_regressors(const selfcal_model_t *model) {
     }
     for (size_t k = 0; k < (size_t)model->axes * regressors->count; k++) {
         if (!(regressors->coefficient_sd[k] >= 0.0F) || !isfinite(regressors->coefficient_sd[k])) {
+            return false;
+        }
+        if (regressors->coefficient_mean != NULL && !isfinite(regressors->coefficient_mean[k])) {
             return false;
         }
     }
@@ -192,6 +195,7 @@ typedef struct {
     uint8_t regressor[UNKNOWNS_MAX]; /* of each, from 1 on */
     selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], b[UNKNOWNS_MAX]; /* sums A and B */
     selfcal_wide_t sd[UNKNOWNS_MAX];       /* of the priors of x0 and of the coefficients */
+    selfcal_wide_t prior_mean[UNKNOWNS_MAX]; /* of the coefficients; 0 of x0 */
     /* offset from the prior; first values of the regressors less their references */
     selfcal_wide_t first[UNKNOWNS_MAX];
     selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
@@ -309,6 +313,9 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
             normal->left[row] -= normal->lost[row][t];
         }
         normal->sd[row] = (selfcal_wide_t)self->model->regressors->coefficient_sd[axis * p + k];
+        normal->prior_mean[row] = self->model->regressors->coefficient_mean == NULL
+                                      ? 0.0
+                                      : (selfcal_wide_t)self->model->regressors->coefficient_mean[axis * p + k];
         normal->first[row] = (selfcal_wide_t)column->origin + (selfcal_wide_t)column->offset -
                              (selfcal_wide_t)self->model->regressors->reference[k];
     }
@@ -364,7 +371,8 @@ static void inverse_sums(const normal_t *normal, selfcal_wide_t variance, selfca
 /* Least squares about `estimate`, with the square completed: the residual does not feel the priors, what they pull at
  * is the sum of two squares (and of what `rest` is worth, where columns could not be told apart). Unknowns inside: c,
  * and the level x0 + c' first - offset of the readings about their first samples, so that the prior is (level + offset
- * - c' first)^2 / P0 + sum c^2 / sd^2. */
+ * - c' first)^2 / P0 + sum (c - m)^2 / sd^2. With d = c - m the first square is (level + offset - m' first -
+ * d' first)^2, so `from_prior` is level + offset - m' first, and then d. */
 static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit) {
     const uint8_t order = normal->order;
     const selfcal_wide_t p0 = normal->sd[0] * normal->sd[0];
@@ -387,7 +395,8 @@ static void make_fit(const normal_t *normal, selfcal_wide_t variance, fit_t *fit
     selfcal_wide_t from_prior[UNKNOWNS_MAX], shift[UNKNOWNS_MAX];
     for (uint8_t i = 0; i < order; i++) {
         fit->ln_det += log(g[i][i]);
-        from_prior[i] = normal->estimate[i] + (i == 0U ? normal->first[0] : 0.0);
+        from_prior[i] = normal->estimate[i] + (i == 0U ? normal->first[0] : -normal->prior_mean[i]);
+        from_prior[0] -= i == 0U ? 0.0 : normal->prior_mean[i] * normal->first[i];
     }
     for (uint8_t i = 0; i < order; i++) {
         shift[i] = normal->rest[i] / variance;

@@ -143,6 +143,7 @@ typedef enum {
 typedef struct {
     float ln_min, ln_max; /* ln of the parameter in the units above, within 46 of 0: 1e-20 to 1e20 */
     bool uniform;         /* false: log-uniform */
+    bool measured;        /* the limits are those of an earlier record: the parameter counts as identified at once */
 } selfcal_prior_t;
 
 typedef struct {
@@ -206,10 +207,11 @@ typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
     const float *reference;      /* [count] value at which x0 alone is the bias */
-    /* [axes][count] prior N(0, sd^2), unit per unit of the regressor; 0: not for this axis */
+    /* [axes][count] prior N(mean, sd^2), unit per unit of the regressor; sd 0: not for this axis; no means: all 0 */
     const float *coefficient_sd;
     const selfcal_source_t *source; /* [count] for selfcal_form(); NULL: the application makes the values by itself */
-    const float *ln_odds;           /* [count] ln of the prior odds that the regressor is in use; a cosine: 0 */
+    const float *ln_odds;          /* [axes][count] ln of the prior odds that it is in use; a cosine: 0 */
+    const float *coefficient_mean; /* [axes][count] or NULL */
 } selfcal_regressors_t;
 
 /* For parts whose parameters change. Each bank sample's weight halves every half_life_s. So does the penalty that the
@@ -485,7 +487,7 @@ selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, 
 #define SELFCAL_REPORT_MIN 3
 
 enum {
-    SELFCAL_IDENTIFIED = 1, /* sd of ln(parameter) is below half its prior's, and neither limit holds it */
+    SELFCAL_IDENTIFIED = 1, /* sd of ln(parameter) is below half its prior's, or this is measured; no limit holds it */
     SELFCAL_AT_MIN = 2,     /* more than 5 % of the posterior lies in the lowest 2 % of the prior's ln range */
     SELFCAL_AT_MAX = 4,     /* likewise at the top */
     /* The node grid does not support this estimate: treat it as rough.

@@ -24,12 +24,13 @@ static bool weigh(app_t *app)
 {
     const uint8_t axis = app->report.axis;
     const float *sd = &selfcal_model.regressors->coefficient_sd[(size_t)axis * SELFCAL_MODEL_REGRESSORS];
+    const float *ln_odds = &selfcal_model.regressors->ln_odds[(size_t)axis * SELFCAL_MODEL_REGRESSORS];
     uint8_t mask = 0;
     selfcal_wide_t odds = 0.0;
     for (uint8_t k = 0; k < SELFCAL_MODEL_REGRESSORS; k++) {
         if (sd[k] > 0.0F) {
             mask |= (uint8_t)(1U << k);
-            odds += (selfcal_wide_t)selfcal_model.regressors->ln_odds[k];
+            odds += (selfcal_wide_t)ln_odds[k];
         }
     }
     if (!app->with) {

@@ -83,7 +83,7 @@ static void measure(const char *name, const selfcal_model_t *model, bool fast, b
 static void measure_sum(const char *name, unsigned law, bool fast) {
     static const selfcal_real_t fit[SUM_GRID * SUM_GRID] = {0}; /* for reports, which there are none of */
     static const selfcal_grid_t grid = {SUM_GRID, fit};
-    static const selfcal_prior_t ratio = {-1.0F, 1.0F, false};
+    static const selfcal_prior_t ratio = {-1.0F, 1.0F, false, false};
     selfcal_prior_t prior[AXES][SELFCAL_PARAMETERS];
     selfcal_model_t model = record_narrow_model(fast, axis);
     for (unsigned a = 0; a < AXES; a++) {
@@ -159,7 +159,7 @@ static void measure_columns(const char *name, uint8_t columns, bool fast) {
         sd[k] = 1.0F;
     }
     selfcal_model_t model = record_narrow_model(fast, axis);
-    const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd, NULL, NULL};
+    const selfcal_regressors_t regressors = {&selfcal_regressors_code, columns, zero, sd, NULL, NULL, NULL};
     model.regressors = columns > 0U ? &regressors : NULL;
     while (model.hypothesis->law->terms == 0U || model.hypothesis->law->term[0].kind != SELFCAL_WALK) {
         model.hypothesis++;

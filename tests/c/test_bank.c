@@ -117,9 +117,10 @@ static void models_that_contradict_themselves_are_refused(void) {
         bad.dt_s = intervals[i];
         TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
     }
-    static const selfcal_prior_t priors[] =
-        {{-47.0F, 0.0F, false}, {0.0F, 47.0F, false}, {1.0F, 1.0F, false}, {NAN, 1.0F, false},
-                                             {0.0F, NAN, false},    {-INFINITY, 0.0F, true}, {0.0F, INFINITY, true}};
+    static const selfcal_prior_t priors[] = {
+        {-47.0F, 0.0F, false, false}, {0.0F, 47.0F, false, false}, {1.0F, 1.0F, false, false},
+        {NAN, 1.0F, false, false}, {0.0F, NAN, false, false}, {-INFINITY, 0.0F, true, false},
+        {0.0F, INFINITY, true, false}};
     for (unsigned i = 0; i < sizeof priors / sizeof priors[0]; i++) {
         selfcal_axis_t axis[AXES];
         memcpy(axis, model.axis, sizeof axis);

@@ -2,7 +2,7 @@
 #include "../../lib/report_integral.c"
 #include "unity.h"
 
-static const selfcal_prior_t x_prior = {-1.37F, 2.21F, false}, y_prior = {0.43F, 9.0F, false};
+static const selfcal_prior_t x_prior = {-1.37F, 2.21F, false, false}, y_prior = {0.43F, 9.0F, false, false};
 
 void setUp(void) {}
 

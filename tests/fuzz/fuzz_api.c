@@ -50,7 +50,10 @@ typedef struct {
 
 static selfcal_axis_t axis_table[SELFCAL_AXES_MAX];
 static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {
-    {-6.9F, -0.7F, false}, {-10.0F, -3.0F, false}, {-7.0F, -1.0F, false}, {-2.0F, 2.0F, false}};
+    {-6.9F, -0.7F, false, false},
+    {-10.0F, -3.0F, false, false},
+    {-7.0F, -1.0F, false, false},
+    {-2.0F, 2.0F, false, false}};
 static selfcal_prior_t of_ratio[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_law_t law_table[NAMED_LAWS];

@@ -21,13 +21,14 @@
 namespace nb = nanobind;
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
-using PriorTuple = std::tuple<double, double, bool>; // ln_min, ln_max, uniform
+using PriorTuple = std::tuple<double, double, bool, bool>; // ln_min, ln_max, uniform, measured
 using TermTuple = std::tuple<bool, double, double, bool, bool>; // walk, deviation, bandwidth, stated, by_ratio
 using LawTuple = std::tuple<std::vector<TermTuple>, bool>;      // terms, coloured_noise
 using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
                                    std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none
 
-using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>>; // reference[p], coefficient_sd[axes * p]
+// reference[p], coefficient_sd[axes * p], coefficient_mean[axes * p]
+using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>, std::vector<float>>;
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 // Not an anonymous namespace: two builds of one name in one process would be the same type to nanobind.
@@ -55,7 +56,7 @@ public:
                 uniform.size() != SELFCAL_PARAMETERS)
                 throw std::invalid_argument("an axis needs one prior a parameter");
             for (size_t p = 0; p < SELFCAL_PARAMETERS; p++)
-                axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]), uniform[p]};
+                axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]), uniform[p], false};
             axis.bias_sd = static_cast<float>(bias_sd);
             axis.range = static_cast<float>(range);
             axis.stuck_limit = stuck;
@@ -85,12 +86,13 @@ public:
         if (axes_.size() > SELFCAL_AXES_MAX || hypotheses_.size() > SELFCAL_HYPOTHESES_MAX || nodes > UINT16_MAX)
             throw std::invalid_argument("more axes, hypotheses or nodes than the library is built for");
         if (regressors) {
-            std::tie(reference_, coefficient_sd_) = *regressors;
+            std::tie(reference_, coefficient_sd_, coefficient_mean_) = *regressors;
             if (reference_.size() > SELFCAL_REGRESSORS_MAX ||
-                coefficient_sd_.size() != axes_.size() * reference_.size())
+                coefficient_sd_.size() != axes_.size() * reference_.size() ||
+                coefficient_mean_.size() != coefficient_sd_.size())
                 throw std::invalid_argument("regressors need a reference each and a prior for every axis");
             regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(),
-                           coefficient_sd_.data(), nullptr, nullptr};
+                           coefficient_sd_.data(), nullptr, nullptr, coefficient_mean_.data()};
             model_.regressors = &regressors_;
         }
         forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
@@ -371,8 +373,8 @@ private:
         for (const std::vector<PriorTuple> &axis : priors) {
             if (axis.size() != SELFCAL_PARAMETERS || priors.size() != axes_.size())
                 throw std::invalid_argument("a hypothesis needs one prior a parameter for every axis, or none");
-            for (const auto &[lo, hi, uniform] : axis)
-                table->push_back({static_cast<float>(lo), static_cast<float>(hi), uniform});
+            for (const auto &[lo, hi, uniform, measured] : axis)
+                table->push_back({static_cast<float>(lo), static_cast<float>(hi), uniform, measured});
         }
         return table->data();
     }
@@ -411,7 +413,7 @@ private:
     std::vector<std::unique_ptr<Grid>> grids_;
     std::vector<std::unique_ptr<std::vector<selfcal_prior_t>>> priors_;
     size_t term_nodes_ = 0;
-    std::vector<float> reference_, coefficient_sd_;
+    std::vector<float> reference_, coefficient_sd_, coefficient_mean_;
     selfcal_regressors_t regressors_{};
     selfcal_forgetting_t forgetting_{};
     selfcal_handling_t handling_{};

@@ -79,6 +79,9 @@ Log = Annotated[Path, typer.Argument(metavar="LOG", help=f"Recording: {READ}", s
 ModelFile = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
 ]
+From = Annotated[
+    Path | None, typer.Option("--from", metavar="DIAGNOSIS.json", help="Priors as `diagnose --json` measured them")
+]
 Axis = Annotated[
     list[str] | None, typer.Option("--axis", metavar="NAME", help="Axis to report (repeat for more); default: all")
 ]
@@ -320,6 +323,7 @@ def replay(
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
+    start: From = None,
     target: Annotated[Target, typer.Option(help="Where the firmware runs: here, or in QEMU")] = Target.host,
     transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
     channel: Annotated[
@@ -345,6 +349,7 @@ def replay(
         log,
         axes=axis or (),
         model=model,
+        start=start,
         target=target.value,
         transport=transport.value,
         channel=channel,
@@ -371,6 +376,7 @@ def monitor(
     model: Annotated[
         Path | None, typer.Option(metavar="MODEL.yaml", help="Model of a module, for names; default: the default one")
     ] = None,
+    start: From = None,
     log: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc)")
     ] = None,
@@ -391,6 +397,7 @@ def monitor(
         axes=axis or (),
         node=node,
         model=model,
+        start=start,
         log=log,
         duration=duration,
         bitrate=bitrate,
@@ -538,11 +545,12 @@ def codegen(
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Rate of the samples that are fed; default: the sensor's")
     ] = None,
+    start: From = None,
 ) -> None:
     """Write the C model tables for the firmware."""
     from selfcal.verbs import codegen as verb
 
-    print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate))}")
+    print(f"{output}: {verb.assumption(verb.codegen(model, output, target=target, rate=rate, start=start))}")
 
 
 @app.command()

@@ -77,31 +77,36 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
             else {
                 "hypotheses": dict(axis.result.probability),
                 "log_evidence": dict(axis.result.log_evidence),
-                "parameters": {
-                    law: {
-                        parameter: {
-                            "mean": e.mean,
-                            "median": e.median,
-                            "sd": e.sd,
-                            "q05": e.q05,
-                            "q95": e.q95,
-                            "unit": units.parameter_unit(parameter, axis.unit),
-                            "identified": e.identified,
-                            "off_grid": e.off_grid,
-                        }
-                        for parameter, e in estimates.items()
-                    }
-                    for law, estimates in axis.result.parameters.items()
-                },
+                "parameters": parameters_entry(axis),
                 "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
                 "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
                 "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
                 "allan": _allan(axis),
-                **_regressors(axis.scored),
+                **regressors_entry(axis.scored),
             }
             for name, axis in found.items()
         },
+    }
+
+
+def parameters_entry(axis: Identified) -> dict[str, Any]:
+    """Posterior of every parameter, by law."""
+    return {
+        law: {
+            parameter: {
+                "mean": e.mean,
+                "median": e.median,
+                "sd": e.sd,
+                "q05": e.q05,
+                "q95": e.q95,
+                "unit": units.parameter_unit(parameter, axis.unit),
+                "identified": e.identified,
+                "off_grid": e.off_grid,
+            }
+            for parameter, e in estimates.items()
+        }
+        for law, estimates in axis.result.parameters.items()
     }
 
 
@@ -133,7 +138,7 @@ def _allan(axis: Identified) -> dict[str, Any] | None:
     return found
 
 
-def _regressors(scored: Scored | None) -> dict[str, Any]:
+def regressors_entry(scored: Scored | None) -> dict[str, Any]:
     """The keys an axis has beyond the contract's if its model has regressors."""
     if scored is None:
         return {}

@@ -13,14 +13,20 @@ from selfcal.dbc_file import BY_PLACE, Names
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.tables import Tables, make_tables
+from selfcal.warm import Start, warmed
+from selfcal.warm import load as load_start
 from selfcal.wire import AXES, names_of
 
 
 class KnownModels:
-    """The default model, and those of the files `paths`. Raises UserError for a file that is no model."""
+    """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
+    UserError for a file that is no model, or a start that is not of it."""
 
-    def __init__(self, *paths: Path | str) -> None:
-        self.models = [*(Model.load(path) for path in paths), Model.load()]
+    def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
+        if start is not None and path is None:
+            raise UserError("--from goes with --model: it is of one model")
+        self.models = [*([] if path is None else [Model.load(path)]), Model.load()]
+        self._start = None if start is None else load_start(start, self.models[0])
         self._named = lru_cache(maxsize=32)(self._find)
 
     def names(self, status: Mapping[str, float]) -> Names:
@@ -36,12 +42,13 @@ class KnownModels:
 
     def _find(self, model_id: float, interval_s: float, block: float) -> Names:
         for model in self.models:
-            if int(model_id) in _ids(model, interval_s, int(block)):
+            start = self._start if model is self.models[0] else None
+            if int(model_id) in _ids(model, start, interval_s, int(block)):
                 return names_of(model)
         return BY_PLACE
 
 
-def _ids(model: Model, interval_s: float, block: int) -> Iterator[int]:
+def _ids(model: Model, start: Start | None, interval_s: float, block: int) -> Iterator[int]:
     """Of the model's tables for each target and each choice of axes that telemetry can carry, in the model's order."""
     if not 0.0 < interval_s < math.inf or block < 1:
         return
@@ -49,6 +56,7 @@ def _ids(model: Model, interval_s: float, block: int) -> Iterator[int]:
     for target in model.nodes:
         try:
             tables = make_tables(model, block / interval_s, tuple(sent), target, 1.0 / interval_s)
+            tables = warmed(tables, start)
         except UserError:  # an interval that the model has no tables for
             continue
         for count in range(len(sent), 0, -1):
@@ -65,6 +73,12 @@ def _chosen(tables: Tables, axes: tuple[int, ...]) -> Tables:
             replace(h, priors=tuple(h.priors[at] for at in axes)) if h.priors else h for h in tables.hypotheses
         ),
         regressors=tuple(
-            replace(one, coefficient_sd=tuple(one.coefficient_sd[at] for at in axes)) for one in tables.regressors
+            replace(
+                one,
+                coefficient_sd=tuple(one.coefficient_sd[at] for at in axes),
+                ln_odds=tuple(one.ln_odds[at] for at in axes),
+                coefficient_mean=tuple(one.coefficient_mean[at] for at in axes if one.coefficient_mean),
+            )
+            for one in tables.regressors
         ),
     )

@@ -180,6 +180,11 @@ class Model:
         """Read and check a model file; None is the default model. Raises UserError naming the file and the entry."""
         return _Reader(DEFAULT if path is None else Path(path)).model()
 
+    @staticmethod
+    def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
+        """The same of a tree that is read already, from the file `path`."""
+        return _Reader(path, tree).model()
+
 
 class _Loader(yaml.SafeLoader):
     """Safe loading of plain values: a date is text, a key given twice or an unknown tag is refused.
@@ -235,8 +240,9 @@ class _Loader(yaml.SafeLoader):
 class _Reader:
     """Walks the YAML tree; every complaint carries the file and the dotted name of the entry."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, tree: Mapping[str, Any] | None = None) -> None:
         self.path = path
+        self._tree = tree
 
     def fail(self, where: str, what: str) -> UserError:
         return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
@@ -565,7 +571,7 @@ class _Reader:
 
     def model(self) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
-        raw = self.tree()
+        raw = self.tree() if self._tree is None else self._tree
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
         tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "handle", "correlation_time_s"), "")

@@ -25,6 +25,10 @@ MOST_BLOCK = 1_000_000
 ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
 
 
+#: ln limits, whether uniform, whether measured: `selfcal_prior_t`.
+PriorRow = tuple[float, float, bool, bool]
+
+
 @dataclass(frozen=True)
 class Grid:
     """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
@@ -72,28 +76,29 @@ class AxisTable:
 class RegressorTable:
     """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
 
-    `source`: kind and number (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds`: prior
-    odds that the regressor is in use; 0 for a second column of it."""
+    `source`: kind and number (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds` [axes]:
+    prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]: none is 0."""
 
     name: str
     unit: str
     reference: float
     coefficient_sd: tuple[float, ...]
     source: tuple[int, float, str, str] = (0, 0.0, "", "")
-    ln_odds: float = 0.0
+    ln_odds: tuple[float, ...] = ()
+    coefficient_mean: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """One hypothesis: its law, prior probability and grids; of a sum also each axis's priors (ln limits, whether
-    uniform) in the order of PARAMETERS."""
+    """One hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors (ln
+    limits, whether uniform, whether measured) in the order of PARAMETERS."""
 
     name: str
     law: Law
     ln_probability: float
     rho: Grid | None
     alpha: Grid | None
-    priors: tuple[tuple[tuple[float, float, bool], ...], ...] = ()
+    priors: tuple[tuple[PriorRow, ...], ...] = ()
 
     @property
     def nodes(self) -> int:
@@ -275,7 +280,7 @@ def make_tables(
                 one.reference,
                 tuple(_coefficient_sd(model, one, name) for name in names),
                 _source(one, place),
-                math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0,
+                len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
             )
             for one in model.regressors
             for place, column in enumerate(one.columns)
@@ -285,11 +290,11 @@ def make_tables(
     )
 
 
-def _priors(group: Group, law: str) -> tuple[tuple[float, float, bool], ...]:
+def _priors(group: Group, law: str) -> tuple[PriorRow, ...]:
     """In each place the prior of the parameter that the law has there, else that of the axis."""
     of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
     chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
-    return tuple((math.log(p.min), math.log(p.max), p.law == "uniform") for p in chosen)
+    return tuple((math.log(p.min), math.log(p.max), p.law == "uniform", False) for p in chosen)
 
 
 def _source(regressor: Regressor, place: int) -> tuple[int, float, str, str]:

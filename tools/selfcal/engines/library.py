@@ -21,13 +21,15 @@ def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
     return (grid.nodes, grid.fit.ravel().tolist())
 
 
-def _regressors(tables: Tables) -> tuple[list[float], list[float]] | None:
-    """Reference [p] and prior sd [axes * p] of the columns."""
+def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] | None:
+    """Reference [p], prior sd and prior mean [axes * p] of the columns."""
     columns = tables.regressors
     if not columns:
         return None
-    sd = [column.coefficient_sd[axis] for axis in range(len(tables.axes)) for column in columns]
-    return [column.reference for column in columns], sd
+    places = [(axis, column) for axis in range(len(tables.axes)) for column in columns]
+    sd = [column.coefficient_sd[axis] for axis, column in places]
+    mean = [column.coefficient_mean[axis] if column.coefficient_mean else 0.0 for axis, column in places]
+    return [column.reference for column in columns], sd, mean
 
 
 class Bank:

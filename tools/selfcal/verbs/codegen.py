@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -13,7 +13,9 @@ from selfcal.model import NOT_HANDLED, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import COLUMN_KINDS
-from selfcal.tables import AxisTable, Grid, HypothesisTable, RegressorTable, Tables, gate_table, make_tables
+from selfcal.tables import AxisTable, Grid, HypothesisTable, PriorRow, RegressorTable, Tables, gate_table, make_tables
+from selfcal.warm import load as load_start
+from selfcal.warm import warmed
 from selfcal.wire import carries
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in bank_kernel_fixed.c.
@@ -40,16 +42,20 @@ def codegen(
     target: str = "host",
     rate: float | None = None,
     axes: Sequence[str] | None = None,
+    start: Path | str | None = None,
 ) -> Tables:
     """Write `selfcal_model.h`, `selfcal_model.c` and `selfcal_config.h` into the folder `output`; return the tables.
 
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
-    is a subset of the model's. Says so on stderr if the model's gate is left out.
+    is a subset of the model's. `start`: the file that `diagnose --json` wrote with the model; its posteriors become the
+    priors (warm.py). Says so on stderr if the model's gate is left out.
     Raises UserError for a bad model file or a folder that cannot be written.
     """
     loaded = Model.load(model)
+    known = None if start is None else load_start(start, loaded)
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
-    write_tables(loaded, tables, Path(output), target)
+    tables = warmed(tables, known)
+    write_tables(loaded, tables, Path(output), target, known.of if known is not None else "")
     if loaded.gate is not None and gate_table(loaded, tables) is None:
         said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
@@ -63,15 +69,16 @@ def assumption(tables: Tables) -> str:
     return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
 
 
-def write_tables(model: Model, tables: Tables, folder: Path, target: str) -> None:
-    """Write the files into `folder`, the sizes as for a core. Raises UserError if it cannot be written."""
+def write_tables(model: Model, tables: Tables, folder: Path, target: str, start: str = "") -> None:
+    """Write the files into `folder`, the sizes as for a core. `start`: where measured priors come from. Raises
+    UserError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
     for name, text in (
         ("selfcal_config.h", _config(model, tables, target)),
-        ("selfcal_model.h", _header(model, tables)),
+        ("selfcal_model.h", _header(model, tables, start)),
         ("selfcal_model.c", _source(model, tables)),
     ):
         with whole(folder / name) as file:
@@ -118,9 +125,10 @@ def _config(model: Model, tables: Tables, target: str) -> str:
 """
 
 
-def _header(model: Model, tables: Tables) -> str:
+def _header(model: Model, tables: Tables, start: str) -> str:
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
-    return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */
+    measured = f"\n * Priors of {start}, as `selfcal diagnose` measured them." if start else ""
+    return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit.{measured} */
 #ifndef SELFCAL_MODEL_H
 #define SELFCAL_MODEL_H
 
@@ -245,12 +253,13 @@ def _grid(grid: Grid) -> str:
     )
 
 
-def _priors(priors: Iterable[tuple[float, float, bool]]) -> str:
-    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, {'true' if uniform else 'false'}}}" for lo, hi, uniform in priors)
+def _priors(priors: Iterable[PriorRow]) -> str:
+    flag = ("false", "true")
+    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, {flag[uniform]}, {flag[known]}}}" for lo, hi, uniform, known in priors)
 
 
 def _axis(axis: AxisTable) -> str:
-    priors = _priors(zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True))
+    priors = _priors((*limits, False) for limits in zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True))
     readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
     return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
 
@@ -258,23 +267,26 @@ def _axis(axis: AxisTable) -> str:
 def _regressors(tables: Tables) -> list[str]:
     if not tables.regressors:
         return []
-    rows = (
-        ", ".join(_f(column.coefficient_sd[axis]) for column in tables.regressors) for axis in range(len(tables.axes))
-    )
     references = ", ".join(_f(column.reference) for column in tables.regressors)
-    odds = ", ".join(_f(column.ln_odds) for column in tables.regressors)
+
+    def by_axis(name: str, values: Callable[[RegressorTable], tuple[float, ...]]) -> list[str]:
+        rows = (", ".join(_f(values(column)[at]) for column in tables.regressors) for at in range(len(tables.axes)))
+        lines = (f"    {row}, /* {axis.name} */" for row, axis in zip(rows, tables.axes, strict=True))
+        return [f"static const float {name}[] = {{", *lines, "};"]
+
+    means = any(column.coefficient_mean for column in tables.regressors)
     return [
         "/* " + ", ".join(f"{column.name} [{column.unit}]" for column in tables.regressors) + " */",
         f"static const float reference[] = {{{references}}};",
-        "static const float coefficient_sd[] = {",
-        *(f"    {row}, /* {axis.name} */" for row, axis in zip(rows, tables.axes, strict=True)),
-        "};",
+        *by_axis("coefficient_sd", lambda column: column.coefficient_sd),
+        *(by_axis("coefficient_mean", lambda column: column.coefficient_mean) if means else ()),
         "static const selfcal_source_t source[] = {",
         *(f"    {_column_source(tables, column)}, /* {column.name} */" for column in tables.regressors),
         "};",
-        f"static const float ln_odds[] = {{{odds}}};",
+        *by_axis("ln_odds", lambda column: column.ln_odds),
         "static const selfcal_regressors_t regressors = {",
         f"    &selfcal_regressors_code, {len(tables.regressors)}U, reference, coefficient_sd, source, ln_odds,",
+        f"    {'coefficient_mean' if means else 'NULL'},",
         "};",
         "",
     ]

@@ -14,13 +14,13 @@ from selfcal.diagnosis.extend import as_text, extended
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording, why_left_out
 from selfcal.diagnosis.words import WORDS
-from selfcal.document import check_writable, write_json
+from selfcal.document import check_writable, parameters_entry, regressors_entry, write_json
 from selfcal.ending import Stopped, held
 from selfcal.errors import UserError, printable
 from selfcal.model import Model
 from selfcal.output import write_text
-from selfcal.recording import Scale, load
-from selfcal.verbs.identify import chosen_axes
+from selfcal.recording import Recording, Scale, load
+from selfcal.verbs.identify import chosen_axes, identify_axis
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
@@ -84,6 +84,8 @@ def diagnose(
         progress.update(task, description="held-out gain")
         tree = extended(loaded, record, found)
         document = to_document(recording, record, found, errors, tree)
+        progress.update(task, description="posterior")
+        _add_posteriors(document, recording, Model.of_tree(tree, loaded.path))
     if write_model is not None:
         write_text(write_model, as_text(tree, recording.path))
     if report is not None:
@@ -93,6 +95,27 @@ def diagnose(
     if json is not None:
         write_json(document, json)
     return document
+
+
+def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model) -> None:
+    """What the extended model knows of each axis, as `identify` tells it; null where the sensor moved, or where the
+    record bears no report."""
+    for name, axis in document["axes"].items():
+        if "error" not in axis:
+            moved = any(finding["cause"] == "motion" for finding in axis["findings"])
+            axis["posterior"] = None if moved else _posterior(recording, name, model)
+
+
+def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] | None:
+    try:
+        known = identify_axis(recording, name, model, "library", None)
+    except UserError:
+        return None
+    return {
+        "hypotheses": dict(known.result.probability),
+        "parameters": parameters_entry(known),
+        "regressors": regressors_entry(known.scored).get("regressors", {}),
+    }
 
 
 def _given(

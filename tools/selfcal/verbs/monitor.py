@@ -70,6 +70,7 @@ def monitor(
     axes: Sequence[str] = (),
     node: int | None = None,
     model: Path | str | None = None,
+    start: Path | str | None = None,
     log: Path | str | None = None,
     duration: float | None = None,
     bitrate: int | None = None,
@@ -81,7 +82,7 @@ def monitor(
     over.
 
     Several modules of a bus are shown one below the other; `node`: that one alone. `model`: file of a model beside the
-    default one, for the names of what a module sends.
+    default one, for the names of what a module sends; `start`: the diagnosis that its priors are from.
     A port that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played;
     default: as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
     python-can's format. `bitrate` of the CAN bus, bit/s, where the interface needs one. `json`: the last complete
@@ -109,7 +110,7 @@ def monitor(
         check_picture(plot)
     check_writable(json, plot)
     name = str(read if channel is None else channel)
-    models = KnownModels(*([] if model is None else [model]))
+    models = KnownModels(model, start)
     streams = Streams(node=node)
     contacts: dict[int, Contact] = {}
     histories: dict[int, dict[str, list[AxisReport]]] = {}

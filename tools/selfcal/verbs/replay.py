@@ -48,6 +48,8 @@ from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
 from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes
+from selfcal.warm import Start, warmed
+from selfcal.warm import load as load_start
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus, reasons
 
 MAGIC = b"SELFCAL1"
@@ -89,6 +91,7 @@ def replay(
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
+    start: Path | str | None = None,
     target: str = "host",
     transport: str = "slcan",
     channel: str = "",
@@ -103,7 +106,8 @@ def replay(
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
-    The firmware is built for the model and the recording's rate if it is not there yet. `target`: this machine, or a
+    The firmware is built for the model and the recording's rate if it is not there yet. `start`: the file that
+    `diagnose --json` wrote with the model; its posteriors are the module's priors. `target`: this machine, or a
     processor emulated by QEMU. `transport`: SLCAN over a pseudo-terminal, or `can`: frames over UDP within this machine
     at the pace of a bus of 500 kbit/s, or over the CAN device `channel`. `report_every`: seconds of the recording
     between reports, one bank interval at least (default: a hundredth of it on the host, a tenth on the cortex-m4f, all
@@ -123,8 +127,9 @@ def replay(
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
     if plot is not None:
         check_picture(plot)
-    check_writable(json, plot, inputs=(log, model))
+    check_writable(json, plot, inputs=(log, model, start))
     loaded_model = Model.load(model)
+    known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
@@ -143,7 +148,7 @@ def replay(
             f"{loaded_model.path}: no gate for samples at {recording.rate_hz:g} Hz: it wants an entry `gate`, and two "
             f"samples or more a bank interval ({loaded_model.bank_rate_hz:g} Hz)"
         )
-    firmware = build(loaded_model, recording.rate_hz, names, target)
+    firmware = build(loaded_model, recording.rate_hz, names, target, start=known)
     history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
     document = _document(recording, loaded_model, history, why, gate)
     if json is not None:
@@ -158,17 +163,25 @@ def replay(
     return document
 
 
-def build(model: Model, rate_hz: float, axes: Sequence[str], target: str = "host", nodes: str | None = None) -> Path:
+def build(
+    model: Model,
+    rate_hz: float,
+    axes: Sequence[str],
+    target: str = "host",
+    nodes: str | None = None,
+    start: Start | None = None,
+) -> Path:
     """The firmware of a target for a model, a sampling rate and a choice of axes; made only if it is not there.
 
-    `nodes`: whose node counts and sizes it gets (default: the target's own). Its folder is named by the content of all
-    that it is made of, and appears whole or not at all. Raises UserError if it cannot be made.
+    `nodes`: whose node counts and sizes it gets (default: the target's own). `start`: measured priors. Its folder is
+    named by the content of all that it is made of, and appears whole or not at all. Raises UserError if it cannot be
+    made.
     """
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         tables = Path(name)
-        made = make_tables(model, rate_hz, tuple(axes), nodes or target)
-        write_tables(model, made, tables, nodes or target)
+        made = warmed(make_tables(model, rate_hz, tuple(axes), nodes or target), start)
+        write_tables(model, made, tables, nodes or target, start.of if start is not None else "")
         key = _content(tables, made_by.make)
         folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
         folder.parent.mkdir(parents=True, exist_ok=True)
