@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import fft
+from scipy import fft, signal
+from scipy.stats import multivariate_normal
 
 from selfcal import methods as registry
 from selfcal.allan import relative_variance
 from selfcal.errors import UserError
 from selfcal.laws import NAMED
-from selfcal.methods import RIVALS
+from selfcal.methods import RIVALS, particles, rao_blackwell
+from selfcal.methods.autocorrelation import covariances
+from selfcal.methods.dual import transition
 from selfcal.methods.ensemble import summary
 from selfcal.methods.problem import Floats, Problem, weights
+from selfcal.methods.recursive import update
 from selfcal.methods.steady_state import ln_likelihood
 from selfcal.methods.wavelets import covariance
 from selfcal.model import Model
@@ -32,21 +37,28 @@ TRUTH = {
     "random_walk": {"N": 0.5, "K": 0.05, "bias": 1.0},
     "gauss_markov": {"N": 0.5, "sigma_m": 0.3, "alpha": 0.03, "bias": 1.0},
 }
+#: The middles of the priors are off by this factor: a method that stays where it began is seen.
+OFF = 6.0
 #: Joint filters do not see a noise variance (joint_filters.py), slopes are no Gauss-Markov fit.
 BLIND = {"ekf", "ukf"}
 
 
-def problem(law: str, n: int, seed: int = 1) -> Problem:
+def problem(law: str, n: int, seed: int = 1, off: float = 1.0) -> Problem:
     y, _ = simulate_bank_samples(law, TRUTH[law], 1.0, n, seed)
     group = Model.load(ENSEMBLE).group_of("gx")
+    moved = {
+        name: prior if name == "bias" else replace(prior, min=off * prior.min, max=off * prior.max)
+        for name, prior in group.priors.items()
+    }
+    group = replace(group, priors=moved)
     return Problem(y, 1.0, group, ("constant", "random_walk", "gauss_markov"))
 
 
 @pytest.mark.parametrize("law", list(TRUTH))
 def test_every_rival_finds_the_truth_of_a_long_record(law: str) -> None:
-    """3000 samples. The Cramer-Rao bound of ln K is 0.09 here, of ln sigma_m 0.1 and of ln alpha 0.25. A factor of 2.2
+    """3000 samples, priors off by six. The Cramer-Rao bound of ln K is 0.09 here, of ln sigma_m 0.1 and of ln alpha 0.25. A factor of 2.2
     is three of the largest; moments of differences are much rougher and get 5."""
-    posed = problem(law, 3000)
+    posed = problem(law, 3000, off=OFF)
     for name, rival in RIVALS.items():
         if rival.missing or name in BLIND:
             continue
@@ -77,6 +89,41 @@ def test_joint_filters_do_not_see_a_noise_variance() -> None:
         value = RIVALS[name].load()(posed).estimates["random_walk"]["N"].value
         # 1 %: the unscented transform has its rounding
         assert math.isclose(value, math.sqrt(prior.min * prior.max), rel_tol=0.01)
+
+
+def test_derivatives_of_the_dual_filter() -> None:
+    """What its sensitivity recursion begins with: the derivatives of each step, against central differences of it."""
+    for law, names in (("random_walk", 2), ("gauss_markov", 3)):
+        at = np.log([0.5, 0.3, 0.03][:names])
+        found = transition(law, at, 2.0)
+        for j, h in enumerate(1e-5 * np.eye(names)):
+            above, below = transition(law, at + h, 2.0), transition(law, at - h, 2.0)
+            for value in (0, 2, 4):  # the error of a central difference is below 1e-9 here
+                np.testing.assert_allclose(found[value + 1][j], (above[value] - below[value]) / 2e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("law", list(TRUTH))
+def test_a_kalman_filter_in_each_particle(law: str) -> None:
+    """One particle's likelihood of the readings after the first, against the normal density of their distances from the
+    first. The level is not in the distances, and their covariance matrix needs no filter."""
+    posed = problem(law, 300)
+    n, ln = 300, np.log([TRUTH[law][name] for name in NAMED[law].parameters])
+    ln_theta = np.repeat(ln[:, None], particles.PARTICLES, axis=1)
+    rng = np.random.default_rng(1)
+    state = rao_blackwell.begin(posed, law, ln_theta, rng)
+    total = 0.0
+    for value in posed.y[1:].tolist():
+        given, state = rao_blackwell.step(posed, law, ln_theta, state, value, rng)
+        total += float(given[0])
+    at = np.arange(n)
+    if law == "random_walk":
+        drift = TRUTH[law]["K"] ** 2 * np.minimum.outer(at, at)
+    else:
+        drift = TRUTH[law]["sigma_m"] ** 2 * np.exp(-TRUTH[law]["alpha"] * np.abs(np.subtract.outer(at, at)))
+    c = drift + TRUTH[law]["N"] ** 2 * np.eye(n)
+    distances = c[1:, 1:] + c[0, 0] - c[1:, :1] - c[:1, 1:]
+    exact = multivariate_normal(cov=distances).logpdf(posed.y[1:] - posed.y[0])
+    assert math.isclose(total, exact, abs_tol=1e-6)  # rounding of 300 steps
 
 
 def test_whittle_is_the_exact_likelihood_of_a_random_walk() -> None:
@@ -121,6 +168,61 @@ def test_covariance_of_wavelet_moments(law: str) -> None:
     apart = [relative_variance(terms, int(k), np.ones(500 - 2 * int(k) + 1, bool)) for k in m]
     # theirs leaves out lags beyond which a Gauss-Markov drift is forgotten, 1e-6
     np.testing.assert_allclose(found, apart, rtol=1e-5)
+
+
+def arx(y: Floats, u: Floats, *, output_error: bool) -> tuple[Floats, Floats]:
+    """a, b0, b1 of y[k] = -a y[k-1] + b0 u[k] + b1 u[k-1] and their covariance over the noise variance, by the rivals'
+    recursive least squares. With `output_error` the model's own output stands in the place of the last reading, and the
+    gradient is filtered by 1 + a z^-1."""
+    x, P, last, gradient = np.zeros(3), 1e6 * np.eye(3), 0.0, np.zeros(3)
+    for k in range(1, y.size):
+        row = np.array([-last, u[k], u[k - 1]])
+        gradient = row - float(np.clip(x[0], -0.99, 0.99)) * gradient if output_error else row
+        x, P = update(x, P, gradient, float(y[k] - row @ x))
+        last = float(row @ x) if output_error else float(y[k])
+    return x, P
+
+
+def test_recursive_least_squares_on_a_known_system() -> None:
+    """The estimation course's example, (1 - 0.4 z^-1) / (1 + 0.8 z^-1), driven by a known binary input.
+
+    The clean output has the variance 1 + 1.2^2 / 0.36 = 5, and 1 is its covariance with the input. White noise of sd 1
+    in the equation adds v = 1 / 0.36. The least squares then have the sd 1 / sqrt(n) over the roots of 4 + v (a), 1
+    (b0) and (4 + v) / (5 + v) (b1). White noise on the output instead makes them wrong by -0.8 / (4 + 1) in a, and
+    their noise is at most 1.8 times as large. The output error model is right there, with the sd of its covariance."""
+    n, truth = 4000, np.array([0.8, 1.0, -0.4])
+    rng = np.random.default_rng(1)
+    u, noise = rng.choice([-1.0, 1.0], n), rng.standard_normal(n)
+    clean = signal.lfilter([1.0, -0.4], [1.0, 0.8], u)
+    v = 1.0 / 0.36
+    tolerance = 4.0 / np.sqrt(n * np.array([4.0 + v, 1.0, (4.0 + v) / (5.0 + v)]))
+    found, _ = arx(clean + signal.lfilter([1.0], [1.0, 0.8], noise), u, output_error=False)
+    assert (np.abs(found - truth) < tolerance).all()
+    wrong, _ = arx(clean + noise, u, output_error=False)
+    assert abs(wrong[0] - (0.8 - 0.8 / 5.0)) < 1.8 * 4.0 / math.sqrt(5.0 * n)
+    right, P = arx(clean + noise, u, output_error=True)
+    assert (np.abs(right - truth) < 4.0 * np.sqrt(np.diag(P))).all()
+
+
+def test_correlation_and_spectrum_of_a_known_system() -> None:
+    """The course's other example, (z^-1 + 0.5 z^-2) / (1 - 1.5 z^-1 + 0.7 z^-2), driven by a PRBS of 2^16 - 1.
+
+    Wiener-Hopf: the correlation of output and input over the variance of the input, 1, is the impulse response. Its
+    error is the noise of the output over sqrt(n). The transform of the correlations at up to m lags to both sides, over
+    the same of the input, is the frequency response. Its error is the noise's spectrum times sqrt(2 m / n)."""
+    u = 2.0 * signal.max_len_seq(16)[0] - 1.0
+    b, a, sd, n, m = [0.0, 1.0, 0.5], [1.0, -1.5, 0.7], 0.5, u.size, 64
+    y = signal.lfilter(b, a, u) + signal.lfilter([1.0], a, sd * np.random.default_rng(1).standard_normal(n))
+    impulse = np.concatenate([[1.0], np.zeros(m)])
+    forward, backward, own = covariances(y, u, m + 1), covariances(u, y, m + 1), covariances(u, u, m + 1)
+    noise = sd * np.linalg.norm(signal.lfilter([1.0], a, impulse))
+    # of 65 lags, 4.5 sd are exceeded once in 2000 times
+    np.testing.assert_allclose(forward, signal.lfilter(b, a, impulse), atol=4.5 * noise / math.sqrt(n))
+    omega = np.linspace(0.0, math.pi, 33)
+    transform = np.exp(-1j * np.outer(omega, np.arange(-m, m + 1)))
+    both, alone = (transform @ np.concatenate([c[:0:-1], d]) for c, d in ((backward, forward), (own, own)))
+    error = np.abs(both / alone - signal.freqz(b, a, omega)[1])
+    assert (error < 4.5 * math.sqrt(2.0 * m / n) * sd * np.abs(signal.freqz([1.0], a, omega)[1])).all()
 
 
 def test_weights() -> None:

@@ -49,8 +49,13 @@ RIVALS = {
         Rival("ml", "maximum likelihood, statsmodels", "likelihood", "maximum_likelihood", "statsmodels"),
         Rival("steady_state", "steady-state Kalman likelihood", "steady_state", "steady_state"),
         Rival("arma", "ARMA prediction error, statsmodels", "prediction_error", "arma", "statsmodels"),
+        Rival("rls", "recursive least squares, ARMA form", "recursive", "recursive_least_squares"),
+        Rival("subspace", "subspace, stochastic realization", "subspace", "subspace", "statsmodels"),
         Rival("ekf", "joint EKF, filterpy", "joint_filters", "ekf", "filterpy"),
         Rival("ukf", "joint UKF, filterpy", "joint_filters", "ukf", "filterpy"),
+        Rival("dual_ekf", "dual EKF", "dual", "dual_ekf"),
         Rival("particles", "bootstrap particle filter", "particles", "particles"),
+        Rival("rbpf", "Rao-Blackwellised particle filter", "rao_blackwell", "rao_blackwell"),
+        Rival("mmae", "multiple models (MMAE), filterpy", "multiple_model", "mmae", "filterpy"),
     )
 }

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from selfcal.laws import NAMED
-from selfcal.methods.problem import Answer, Floats, Problem, Value
+from selfcal.methods.problem import Answer, Floats, Problem, Value, probabilities
 from selfcal.model import Prior
 
 #: Nodes: of the ratio for a walk, of the ratio and of alpha, and of the white noise within its likelihood's width.
@@ -36,25 +36,23 @@ def grid(problem: Problem) -> Answer:
             mass = np.bincount(place, weight)
             low, high = np.interp([0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)
             estimates[law][name] = Value(math.exp(float(weight @ ln_value)), math.exp(low), math.exp(high))
-    top = max(ln_evidence.values())
-    total = sum(math.exp(value - top) for value in ln_evidence.values())
-    return Answer(estimates, {"Bayes": {law: math.exp(value - top) / total for law, value in ln_evidence.items()}})
+    return Answer(estimates, probabilities(ln_evidence))
 
 
 def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     """ln parameters [d, m] and ln of likelihood times prior mass [m]."""
     dt, priors = problem.dt_s, problem.group.priors
-    noise = _limits(priors["N"])
+    noise = ln_limits(priors["N"])
     ln_alpha, alpha_mass = np.zeros(1), np.zeros(1)
     ln_ratio = np.full(1, -math.inf)
     if law != "constant":
         drift = priors[NAMED[law].parameters[1]]
-        low, high = _limits(drift)
+        low, high = ln_limits(drift)
         ln_ratio = np.linspace(low - noise[1], high - noise[0], WALK if law == "random_walk" else MARKOV[0])
     if law == "gauss_markov":
-        ln_alpha = np.linspace(*_limits(priors["alpha"]), MARKOV[1])
+        ln_alpha = np.linspace(*ln_limits(priors["alpha"]), MARKOV[1])
         ends = np.where((np.arange(MARKOV[1]) % (MARKOV[1] - 1)) == 0, 0.5, 1.0)
-        alpha_mass = np.log(ends * (ln_alpha[1] - ln_alpha[0])) + _density(priors["alpha"], ln_alpha)
+        alpha_mass = np.log(ends * (ln_alpha[1] - ln_alpha[0])) + ln_density(priors["alpha"], ln_alpha)
     ratio, alpha = (part.ravel() for part in np.meshgrid(np.exp(ln_ratio), np.exp(ln_alpha), indexing="ij"))
     phi = np.exp(-alpha * dt) if law == "gauss_markov" else np.ones_like(ratio)
     # In units of the white noise of a reading, N / sqrt(dt): a walk's step is K sqrt(dt).
@@ -70,11 +68,11 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     value = -n * ln_sigma - 0.5 * D[:, None] - 0.5 * (C[:, None] / variance + origin**2 / P0 - b**2 / a)
     value -= 0.5 * np.log(a * P0)
     ln_N = ln_sigma + 0.5 * math.log(dt)
-    value += _density(priors["N"], ln_N) + math.log(2.0 * REACH / math.sqrt(2.0 * n) / (NOISE - 1))
+    value += ln_density(priors["N"], ln_N) + math.log(2.0 * REACH / math.sqrt(2.0 * n) / (NOISE - 1))
     rows = [ln_N]
     if law != "constant":
         ln_drift = ln_N + np.repeat(ln_ratio, ln_alpha.size)[:, None]
-        value += _density(drift, ln_drift) + math.log(ln_ratio[1] - ln_ratio[0])
+        value += ln_density(drift, ln_drift) + math.log(ln_ratio[1] - ln_ratio[0])
         rows.append(ln_drift)
     if law == "gauss_markov":
         value += np.tile(alpha_mass, ln_ratio.size)[:, None]
@@ -103,13 +101,14 @@ def _sums(y: Floats, phi: Floats, step: Floats, start: Floats) -> tuple[Floats, 
     return A, B, C, D
 
 
-def _limits(prior: Prior) -> tuple[float, float]:
+def ln_limits(prior: Prior) -> tuple[float, float]:
+    """Limits of a parameter's logarithm."""
     return math.log(prior.min), math.log(prior.max)
 
 
-def _density(prior: Prior, ln_value: Floats) -> Floats:
+def ln_density(prior: Prior, ln_value: Floats) -> Floats:
     """ln of the prior density in the parameter's logarithm, -inf outside."""
-    low, high = _limits(prior)
+    low, high = ln_limits(prior)
     inside = (ln_value >= low - 1e-9) & (ln_value <= high + 1e-9)
     flat = -math.log(high - low) if prior.law == "log_uniform" else ln_value - math.log(prior.max - prior.min)
     return np.where(inside, flat, -np.inf)

@@ -13,11 +13,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from selfcal.laws import NAMED
-from selfcal.methods.problem import Answer, Floats, Problem, Value, logarithmic
-from selfcal.model import Prior
-
-#: The bias is fed as a level about the first reading with this many times the record's scatter.
-LEVEL_SD = 10.0
+from selfcal.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
 
 
 def ekf(problem: Problem) -> Answer:
@@ -30,15 +26,9 @@ def ukf(problem: Problem) -> Answer:
     return Answer({law: _run(problem, law, unscented=True) for law in problem.drifts})
 
 
-def _moments(prior: Prior) -> tuple[float, float]:
-    """Mean and sd of a parameter's logarithm under its prior."""
-    low, high = math.log(prior.min), math.log(prior.max)
-    return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
-
-
 def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
     y, dt = problem.y - problem.y[0], problem.dt_s
-    prior = [_moments(problem.group.priors[name]) for name in NAMED[law].parameters]
+    prior = [ln_moments(problem.group.priors[name]) for name in NAMED[law].parameters]
     mean = np.array([0.0, 0.0, *(m for m, _ in prior)])
     start = {"random_walk": 0.0, "gauss_markov": math.exp(prior[1][0])}[law]
     sd = np.array([LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])

@@ -4,57 +4,51 @@ kernel of Liu & West (2001)."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from selfcal.laws import NAMED
-from selfcal.methods.problem import Answer, Floats, Problem, Value
+from selfcal.methods.problem import Answer, Floats, Problem, Value, probabilities, weighted
 from selfcal.model import Prior
+
+#: The state [s, particles] after the first reading, from a record, a law and ln parameters [d, particles].
+Begin = Callable[[Problem, str, Floats, np.random.Generator], Floats]
+#: ln likelihood [particles] of a reading and the state after it, from the same, the state and the reading.
+Step = Callable[[Problem, str, Floats, Floats, float, np.random.Generator], tuple[Floats, Floats]]
 
 #: Particles a law; the seed of the draws.
 PARTICLES, SEED = 2000, 1
-#: Liu & West's discount: the kernel keeps the parameters' mean and variance.
-DISCOUNT = 0.99
+#: Liu & West's discount of 0.99: the kernel keeps the parameters' mean and variance.
+SHRINK = (3.0 * 0.99 - 1.0) / (2.0 * 0.99)
 
 
 def particles(problem: Problem) -> Answer:
     """Weighted medians and quantiles of the last particles, laws by their evidence."""
+    return answer(problem, begin, step)
+
+
+def answer(problem: Problem, begin: Begin, step: Step) -> Answer:
+    """What the particles find for each law, each with the same seed."""
     estimates: dict[str, dict[str, Value]] = {}
     ln_evidence: dict[str, float] = {}
     for law in problem.laws:
-        ln_theta, weight, ln_evidence[law] = filtered(problem, law, np.random.default_rng(SEED))
-        estimates[law] = {}
-        for name, column in zip(NAMED[law].parameters, ln_theta, strict=True):
-            order = np.argsort(column)
-            at = np.interp([0.5, 0.05, 0.95], np.cumsum(weight[order]), column[order])
-            estimates[law][name] = Value(*np.exp(at).tolist())
-    top = max(ln_evidence.values())
-    raw = {law: math.exp(value - top) for law, value in ln_evidence.items()}
-    return Answer(estimates, {"Bayes": {law: value / sum(raw.values()) for law, value in raw.items()}})
+        ln_theta, weight, ln_evidence[law] = filtered(problem, law, begin, step)
+        estimates[law] = weighted(NAMED[law].parameters, ln_theta, weight)
+    return Answer(estimates, probabilities(ln_evidence))
 
 
-def filtered(problem: Problem, law: str, rng: np.random.Generator) -> tuple[Floats, Floats, float]:
+def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Floats, Floats, float]:
     """ln parameters [d, particles], their weights, and the ln evidence of all samples but the first, which gives the
     level."""
-    y, dt = problem.y, problem.dt_s
+    rng = np.random.default_rng(SEED)
     ln_theta = np.array([_draw(problem.group.priors[name], rng) for name in NAMED[law].parameters])
-    level = y[0] + np.exp(ln_theta[0]) / math.sqrt(dt) * rng.standard_normal(PARTICLES)
-    drift = np.zeros(PARTICLES)
-    if law == "gauss_markov":
-        drift = np.exp(ln_theta[1]) * rng.standard_normal(PARTICLES)
-        level -= drift
+    state = begin(problem, law, ln_theta, rng)
     ln_weight = np.zeros(PARTICLES)
     evidence = 0.0
-    shrink = (3.0 * DISCOUNT - 1.0) / (2.0 * DISCOUNT)
-    for value in y[1:].tolist():
-        theta = np.exp(ln_theta)
-        if law == "random_walk":
-            drift += theta[1] * math.sqrt(dt) * rng.standard_normal(PARTICLES)
-        elif law == "gauss_markov":
-            phi = np.exp(-theta[2] * dt)
-            drift = phi * drift + theta[1] * np.sqrt(1.0 - phi**2) * rng.standard_normal(PARTICLES)
-        variance = theta[0] ** 2 / dt
-        ln_weight += -0.5 * ((value - level - drift) ** 2 / variance + np.log(2.0 * math.pi * variance))
+    for value in problem.y[1:].tolist():
+        ln_likelihood, state = step(problem, law, ln_theta, state, value, rng)
+        ln_weight += ln_likelihood
         top = float(ln_weight.max())
         weight = np.exp(ln_weight - top)
         total = float(weight.sum())
@@ -65,13 +59,44 @@ def filtered(problem: Problem, law: str, rng: np.random.Generator) -> tuple[Floa
             spread = np.sqrt(np.maximum(((ln_theta - mean[:, None]) ** 2) @ weight, 0.0))
             chosen = np.searchsorted(np.cumsum(weight), (np.arange(PARTICLES) + rng.random()) / PARTICLES)
             chosen = np.minimum(chosen, PARTICLES - 1)
-            jitter = math.sqrt(1.0 - shrink**2) * spread[:, None] * rng.standard_normal(ln_theta.shape)
-            ln_theta = shrink * ln_theta[:, chosen] + (1.0 - shrink) * mean[:, None] + jitter
-            level, drift, ln_weight = level[chosen], drift[chosen], np.zeros(PARTICLES)
+            jitter = math.sqrt(1.0 - SHRINK**2) * spread[:, None] * rng.standard_normal(ln_theta.shape)
+            ln_theta = SHRINK * ln_theta[:, chosen] + (1.0 - SHRINK) * mean[:, None] + jitter
+            state, ln_weight = state[:, chosen], np.zeros(PARTICLES)
     top = float(ln_weight.max())
     weight = np.exp(ln_weight - top)
     evidence += top + math.log(float(weight.sum()) / PARTICLES)
     return ln_theta, weight / weight.sum(), evidence
+
+
+def begin(problem: Problem, law: str, ln_theta: Floats, rng: np.random.Generator) -> Floats:
+    """Level and drift [2, particles] after the first reading."""
+    level = problem.y[0] + np.exp(ln_theta[0]) / math.sqrt(problem.dt_s) * rng.standard_normal(PARTICLES)
+    drift = np.zeros(PARTICLES)
+    if law == "gauss_markov":
+        drift = np.exp(ln_theta[1]) * rng.standard_normal(PARTICLES)
+    return np.stack([level - drift, drift])
+
+
+def step(
+    problem: Problem, law: str, ln_theta: Floats, state: Floats, value: float, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """ln likelihood of a reading [particles], and the state, whose drift is drawn."""
+    level, drift = state
+    phi, variance = transition(problem, law, ln_theta)
+    drift = phi * drift + np.sqrt(variance) * rng.standard_normal(PARTICLES)
+    noise = np.exp(2.0 * ln_theta[0]) / problem.dt_s
+    return -0.5 * ((value - level - drift) ** 2 / noise + np.log(2.0 * math.pi * noise)), np.stack([level, drift])
+
+
+def transition(problem: Problem, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
+    """What remains of the drift after a sample, and the variance of what is added, at parameters [d, m]."""
+    one = np.ones(ln_theta.shape[1:])
+    if law == "random_walk":
+        return one, np.exp(2.0 * ln_theta[1]) * problem.dt_s
+    if law == "gauss_markov":
+        rate = np.exp(ln_theta[2]) * problem.dt_s
+        return np.exp(-rate), np.exp(2.0 * ln_theta[1]) * -np.expm1(-2.0 * rate)
+    return one, 0.0 * one
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> Floats:

@@ -12,7 +12,7 @@ from scipy import optimize
 
 from selfcal.allan import Terms, overlapping, terms_of
 from selfcal.laws import NAMED
-from selfcal.model import Group
+from selfcal.model import Group, Prior
 from selfcal.result import HALF_90
 
 Floats = NDArray[np.float64]
@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 REACH = 1e5
 #: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.
 STEP = 1e-3
+#: A Kalman filter with a level begins at the first reading, with an sd of this many times the record's.
+LEVEL_SD = 10.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,27 @@ def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> d
     return found
 
 
+def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str, Value]:
+    """Weighted medians with 5 % and 95 % points of ln parameters [d, m]; `weight` [m] sums to 1."""
+    found = {}
+    for name, column in zip(names, ln_theta, strict=True):
+        values, place = np.unique(column, return_inverse=True)
+        mass = np.bincount(place, weight)
+        found[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)).tolist())
+    return found
+
+
+def ln_moments(prior: Prior) -> tuple[float, float]:
+    """Mean and sd of a parameter's logarithm between the limits of its prior."""
+    low, high = math.log(prior.min), math.log(prior.max)
+    return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
+
+
+def root(square: float) -> Value:
+    """NaN of a negative square: the method has no answer then."""
+    return Value(math.sqrt(float(square)) if square > 0.0 else math.nan)
+
+
 def _exp(ln: float) -> float:
     return math.exp(ln) if ln < 700.0 else math.inf
 
@@ -153,6 +176,11 @@ def weights(criterion: Mapping[str, float]) -> dict[str, float]:
     raw = {law: math.exp(-0.5 * (finite[law] - least)) if law in finite else 0.0 for law in criterion}
     total = sum(raw.values())
     return {law: value / total if total else math.nan for law, value in raw.items()}
+
+
+def probabilities(ln_evidence: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Equally likely laws weighed by Bayes' rule."""
+    return {"Bayes": weights({law: -2.0 * value for law, value in ln_evidence.items()})}
 
 
 def information_criteria(ln_likelihood: Mapping[str, float], n: int) -> dict[str, dict[str, float]]:
