@@ -56,8 +56,8 @@ def problem(law: str, n: int, seed: int = 1, off: float = 1.0) -> Problem:
 
 @pytest.mark.parametrize("law", list(TRUTH))
 def test_every_rival_finds_the_truth_of_a_long_record(law: str) -> None:
-    """3000 samples, priors off by six. The Cramer-Rao bound of ln K is 0.09 here, of ln sigma_m 0.1 and of ln alpha 0.25. A factor of 2.2
-    is three of the largest; moments of differences are much rougher and get 5."""
+    """3000 samples, priors off by six. The Cramer-Rao bound of ln K is 0.09 here, of ln sigma_m 0.1 and of ln alpha
+    0.25. A factor of 2.2 is three of the largest; moments of differences are much rougher and get 5."""
     posed = problem(law, 3000, off=OFF)
     for name, rival in RIVALS.items():
         if rival.missing or name in BLIND:

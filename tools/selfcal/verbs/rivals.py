@@ -43,7 +43,7 @@ ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
 #: The model of the ensemble, and the numbers of samples that it has unless told otherwise.
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
-#: Samples of a record of the ensemble at most: the slowest method takes seconds then.
+#: Samples of a record of the ensemble at most: the slowest method takes eight minutes then.
 MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
