@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -19,34 +18,26 @@ from scipy import signal
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError, printable
 from selfcal.model import Group, Model
-from selfcal.recording import as_float, load
+from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.recording import Recording, as_float, load
 from selfcal.spread import Row, spread
 from selfcal.tables import make_tables
-from selfcal.units import same_kind
-
-Floats = NDArray[np.float64]
+from selfcal.units import STANDARD_GRAVITY, convert, same_kind
 
 SCHEMA = "selfcal.worth/1"
 #: s of rest, and s after its end at which the bias is wanted.
 RESTS_S, HORIZONS_S = (60, 300, 1800), (1, 10, 60, 300, 1000)
-#: The truths of simulated records: what `identify` finds on an ADIS16405's gyros (README), deg/s and s.
-TRUTHS: dict[str, dict[str, float]] = {
-    "constant": {"N": 0.04},
-    "random_walk": {"N": 0.04, "K": 1.4e-3},
-    "gauss_markov": {"N": 0.04, "sigma_m": 0.02, "alpha": 1.0 / 200.0},
-}
-#: sd of a simulated part's turn-on bias: the data sheet's initial bias error, deg/s.
-TURN_ON = 3.0
 #: s of "the last seconds".
 LAST_S = 10
 #: Corner of x-io Fusion's bias filter, Hz.
 CORNER_HZ = 0.02
-#: The ADIS16405's data sheet: random walk 2 deg/sqrt(h) and 0.2 m/s/sqrt(h), in-run bias stability 0.007 deg/s and 0.2
-#: mg. In the units of the default model.
-SHEET_N = {"rad/s": 2.0 / 60.0, "m/s^2": 0.2 / 60.0}
-SHEET_STABILITY = {"rad/s": 0.007, "m/s^2": 0.2e-3 * 9.80665}
-#: s over which a filter designer lets the bias walk by its stability.
-SHEET_TIME_S = 100.0
+#: s of dead reckoning, and the seconds after a rest at which the bias is predicted.
+RECKONED_S = 60
+SECONDS = (*range(1, RECKONED_S + 1), *(h for h in HORIZONS_S if h > RECKONED_S))
+#: Its errors in the document, and in the table.
+RECKONED = {"heading_deg": "heading, deg", "position_m": "position, m"}
+#: The gyro that turns each horizontal accelerometer out of the level.
+ACROSS = {"ax": "gy", "ay": "gx"}
 #: s of real readings whose mean stands for the bias then.
 REFERENCE_S = 30
 #: The methods, in the order of the table.
@@ -58,6 +49,8 @@ TITLES = {
     "kalman": "fixed-gain Kalman, data-sheet numbers",
     "none": "no correction",
 }
+#: Beside them, of simulated parts: dead reckoning with the bias known throughout has the white noise alone.
+KNOWN = "known"
 
 
 @dataclass(frozen=True)
@@ -84,7 +77,8 @@ def worth(
 
     With `logs`: rests that do not overlap, from each recording's axes; the mean of the 30 s that follow stands for the
     truth. Without: `records` simulated parts of each law and rest, whose bias is known. The samples are means of 1 s.
-    Returns the document `selfcal.worth/1`: rms errors by case, rest, method and horizon.
+    Returns the document `selfcal.worth/1`: rms errors by case, rest, method and horizon, and of the minute of dead
+    reckoning that follows (heading_error(), position_error()).
     """
     check_writable(json)
     loaded = replace(Model.load(model), regressors=(), half_life_s=0.0)
@@ -96,7 +90,7 @@ def worth(
             span = RESTS_S[0] + HORIZONS_S[-1] + REFERENCE_S
             raise UserError(f"the recordings are too short: {span} s without a gap are needed; record longer")
     else:
-        jobs = [Job(law, rest, seed + 1_000_003 * k) for law in TRUTHS for rest in RESTS_S for k in range(records)]
+        jobs = [Job(law, rest, seed + 1_000_003 * k) for law in LAWS for rest in RESTS_S for k in range(records)]
         settings = {"schema": SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
         settings["records"] = str(records)  # the jobs' order has it
         rows = spread(
@@ -109,28 +103,13 @@ def worth(
     return document
 
 
-def simulate(law: str, samples: int, seed: int) -> tuple[Floats, Floats]:
-    """Readings of 1 s and the bias in them, both [samples]."""
-    rng, truth = np.random.default_rng([seed, list(TRUTHS).index(law)]), TRUTHS[law]
-    steps = rng.standard_normal(samples)
-    drift = np.zeros(samples)
-    if law == "random_walk":
-        drift = truth["K"] * np.cumsum(steps)
-    elif law == "gauss_markov":
-        phi = math.exp(-truth["alpha"])
-        steps[1:] *= math.sqrt(1.0 - phi**2)
-        drift = truth["sigma_m"] * signal.lfilter([1.0], [1.0, -phi], steps)
-    bias = TURN_ON * rng.standard_normal() + drift
-    return bias + truth["N"] * rng.standard_normal(samples), bias
-
-
-def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, list[float]], list[float]]:
-    """The bias at each horizon by each method, and the bank's own sd."""
+def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], Floats]:
+    """The bias at each of SECONDS by each method, and the bank's own sd."""
     from selfcal.engines.library import Bank
 
     bank = Bank(make_tables(model, 1.0, (axis,), bank_rate_hz=1.0))
     bank.push(y[:, None])
-    told = bank.raw.predict(0, [float(h) for h in HORIZONS_S])
+    told = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
     level: dict[str, Callable[[Group, Floats], float]] = {
         "last": lambda _, seen: float(seen[-LAST_S:].mean()),
         "rest": lambda _, seen: float(seen.mean()),
@@ -139,8 +118,26 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, list[floa
         "none": lambda _, __: 0.0,
     }
     group = model.group_of(axis)
-    found = {name: [method(group, y)] * len(HORIZONS_S) for name, method in level.items()}
-    return {"bank": [bias for bias, _ in told], **found}, [sd for _, sd in told]
+    found = {name: np.full(len(SECONDS), method(group, y)) for name, method in level.items()}
+    return {"bank": told[:, 0], **found}, told[:, 1]
+
+
+def heading_error(rate: Floats) -> float:
+    """deg after the seconds of `rate` [seconds], the error of an upright gyro in deg/s: psi' = rate."""
+    return float(rate.sum())
+
+
+def position_error(rate: Floats, acceleration: Floats) -> float:
+    """m along one level axis after the seconds of `rate` and `acceleration` [seconds], the errors of the gyro across in
+    deg/s and of the accelerometer along in m/s^2.
+
+    tilt' = rate, v' = acceleration + g tilt, p' = v, from 0: a vehicle at rest or at constant velocity, small angles,
+    errors that stand still for a second each. At rest the accelerometer's bias has the share of gravity of the tilt, so
+    taking it off levels the vehicle too.
+    """
+    left = np.arange(rate.size)[::-1]
+    by_tilt = ((left + 1) ** 3 - left**3) @ np.radians(rate) / 6.0
+    return float(STANDARD_GRAVITY * by_tilt + ((left + 1) ** 2 - left**2) @ acceleration / 2.0)
 
 
 def _average(y: Floats, gain: float) -> float:
@@ -151,53 +148,106 @@ def _average(y: Floats, gain: float) -> float:
 
 def _gain(group: Group) -> float:
     """Steady gain of the Kalman filter of a random walk under white noise, by the data sheet."""
-    kind = "rad/s" if same_kind(group.unit, "rad/s") else "m/s^2"
-    r, q = SHEET_N[kind] ** 2, SHEET_STABILITY[kind] ** 2 / SHEET_TIME_S
+    unit = "deg/s" if same_kind(group.unit, "deg/s") else "m/s^2"
+    r, q = SHEET_N[unit] ** 2, SHEET_STABILITY[unit] ** 2 / SHEET_TIME_S
     p = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
     return p / (p + r)
 
 
-def _rows(
-    case: str, unit: str, rest: int, found: Mapping[str, Sequence[float]], sd: Sequence[float], truth: Floats
-) -> Row:
-    row: Row = {"case": case, "unit": unit, "rest_s": rest}
-    for k, horizon in enumerate(HORIZONS_S):
-        for name, values in found.items():
-            row[f"error.{name}.{horizon}"] = float(values[k] - truth[k])
-        row[f"sd.{horizon}"] = float(sd[k])
-    return row
+@dataclass(frozen=True)
+class After:
+    """An axis after a rest, in its unit: what each method predicts of the bias at SECONDS, the bank's sd, and the
+    readings of the minute."""
+
+    unit: str
+    predicted: Mapping[str, Floats]
+    sd: Floats
+    minute: Floats
+
+    @classmethod
+    def of(cls, model: Model, axis: str, y: Floats, rest: int) -> After:
+        """`y`: the rest and what follows."""
+        return cls(model.group_of(axis).unit, *predictions(model, axis, y[:rest]), y[rest : rest + RECKONED_S])
+
+    def errors(self, unit: str) -> dict[str, Floats]:
+        """Of the minute's corrected readings, by method."""
+        found = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
+        return {name: convert(error, self.unit, unit) for name, error in found.items()}
+
+    def row(self, case: str, rest: int, truth: Floats) -> Row:
+        """Errors of the bias, `truth` at HORIZONS_S."""
+        row: Row = {"case": case, "unit": self.unit, "rest_s": rest}
+        for horizon, true in zip(HORIZONS_S, truth, strict=True):
+            k = SECONDS.index(horizon)
+            row |= {f"error.{name}.{horizon}": float(bias[k] - true) for name, bias in self.predicted.items()}
+            row[f"sd.{horizon}"] = float(self.sd[k])
+        return row
+
+
+def _heading(gyro: After) -> Row:
+    return {f"heading_deg.{name}": heading_error(rate) for name, rate in gyro.errors("deg/s").items()}
+
+
+def _position(gyro: After, accelerometer: After) -> Row:
+    rate = gyro.errors("deg/s")
+    return {
+        f"position_m.{name}": position_error(rate[name], acceleration)
+        for name, acceleration in accelerometer.errors("m/s^2").items()
+    }
 
 
 def _simulated(model: Model, job: Job) -> list[Row]:
-    y, bias = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed)
-    axis = next(name for name in model.axes if model.group_of(name).unit == "deg/s")
-    found, sd = predictions(model, axis, y[: job.rest_s])
-    truth = bias[[job.rest_s - 1 + h for h in HORIZONS_S]]
-    return [_rows(job.law, "deg/s", job.rest_s, found, sd, truth)]
+    """One gyro stands for the upright one and for the one across: no figure has both."""
+    after, truth, noise = {}, {}, {}
+    for axis in ("gx", "ax"):
+        y, truth[axis] = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
+        noise[axis] = (y - truth[axis])[job.rest_s :][:RECKONED_S]
+        after[axis] = After.of(model, axis, convert(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
+    at = [job.rest_s - 1 + h for h in HORIZONS_S]
+    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][at], AXES["gx"], after["gx"].unit))
+    row |= _heading(after["gx"]) | _position(after["gx"], after["ax"])
+    row[f"heading_deg.{KNOWN}"] = heading_error(noise["gx"])
+    row[f"position_m.{KNOWN}"] = position_error(noise["gx"], noise["ax"])
+    return [row]
+
+
+def _means(recording: Recording, model: Model, name: str) -> Floats:
+    """Means of 1 s of a recorded axis, NaN where there is none."""
+    from selfcal.blocks import usable_blocks
+
+    group = model.group_of(name)
+    if not (same_kind(group.unit, "rad/s") or same_kind(group.unit, "m/s^2")):
+        raise UserError(f"{recording.path}: {name}: worth takes gyros and accelerometers; choose with --axis")
+    tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=1.0)
+    samples = as_float(recording.in_unit(name, group.unit))
+    return usable_blocks(samples, recording.missing_before, tables, group).mean
 
 
 def _recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
-    from selfcal.blocks import usable_blocks
     from selfcal.verbs.identify import chosen_axes
     from selfcal.verbs.rivals import longest_stretch
 
     recording = load(log)
+    means = {name: _means(recording, model, name) for name in chosen_axes(recording, model, wanted)}
     rows = []
-    for name in chosen_axes(recording, model, wanted):
-        group = model.group_of(name)
-        if not (same_kind(group.unit, "rad/s") or same_kind(group.unit, "m/s^2")):
-            raise UserError(f"{recording.path}: {name}: worth takes gyros and accelerometers; choose with --axis")
-        tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=1.0)
-        samples = as_float(recording.in_unit(name, group.unit))
-        y = longest_stretch(usable_blocks(samples, recording.missing_before, tables, group).mean)
-        kind = "gyros" if same_kind(group.unit, "rad/s") else "accelerometers"
+    for name, mean in means.items():
+        across = means.get(ACROSS.get(name, ""))
+        both = mean if across is None else mean + across
+        at = longest_stretch(np.where(np.isfinite(both), np.arange(both.size), np.nan)).astype(int)
+        gyro = same_kind(model.group_of(name).unit, "rad/s")
         for rest in RESTS_S:
             span = rest + HORIZONS_S[-1] + REFERENCE_S
-            for start in range(0, y.size - span + 1, span):
-                piece = y[start : start + span]
-                found, sd = predictions(model, name, piece[:rest])
+            for start in range(0, at.size - span + 1, span):
+                piece = mean[at[start : start + span]]
+                after = After.of(model, name, piece, rest)
                 truth = np.array([piece[rest + h - 1 : rest + h - 1 + REFERENCE_S].mean() for h in HORIZONS_S])
-                rows.append(_rows(f"recorded {kind}", group.unit, rest, found, sd, truth))
+                row = after.row(f"recorded {'gyros' if gyro else 'accelerometers'}", rest, truth)
+                if gyro:
+                    row |= _heading(after)
+                elif across is not None:
+                    turning = After.of(model, ACROSS[name], across[at[start : start + span]], rest)
+                    row |= _position(turning, after)
+                rows.append(row)
     return rows
 
 
@@ -208,19 +258,30 @@ def _summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
         entry: dict[str, Any] = {"case": case, "unit": mine[0]["unit"], "rest_s": rest, "rests": len(mine)}
         entry["rms_error"] = {name: {str(h): _rms(mine, f"error.{name}.{h}") for h in HORIZONS_S} for name in TITLES}
         entry["bank_stated_sd"] = {str(h): _rms(mine, f"sd.{h}") for h in HORIZONS_S}
+        entry["dead_reckoning"] = {
+            key: {name: _rms(having, f"{key}.{name}") for name in (*TITLES, KNOWN) if f"{key}.{name}" in having[0]}
+            for key in RECKONED
+            if (having := [row for row in mine if f"{key}.bank" in row])
+        }
         found.append(entry)
     return found
 
 
-def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """By method, its error over the least of all methods in the same case, rest and horizon: `worst` and `median`."""
-    found: dict[str, list[float]] = {name: [] for name in TITLES}
+def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """By method, its error over the least of all methods in the same case and rest: `worst` and `median` of the bias,
+    over all horizons, and of each of RECKONED."""
+    groups: dict[str, list[Mapping[str, float]]] = {"bias": [], **{key: [] for key in RECKONED}}
     for entry in cases:
         for horizon in map(str, HORIZONS_S):
-            errors = {name: entry["rms_error"][name][horizon] for name in TITLES}
-            for name, error in errors.items():
-                found[name].append(error / min(errors.values()))
-    return {name: {"worst": max(ratios), "median": float(np.median(ratios))} for name, ratios in found.items()}
+            groups["bias"].append({name: entry["rms_error"][name][horizon] for name in TITLES})
+        for key, errors in entry["dead_reckoning"].items():
+            groups[key].append({name: errors[name] for name in TITLES})
+    found: dict[str, dict[str, Any]] = {}
+    for name in TITLES:
+        ratios = {key: [one[name] / min(one.values()) for one in group] for key, group in groups.items() if group}
+        told = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
+        found[name] = {**told.pop("bias"), **told}
+    return found
 
 
 def _rms(rows: Sequence[Row], key: str) -> float:
@@ -230,38 +291,44 @@ def _rms(rows: Sequence[Row], key: str) -> float:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table a case; the least error of each column is bold."""
     console = Console(stderr=to_stderr)
-    console.width = max(console.width, 140)
+    console.width = max(console.width, 160)
     cases: dict[str, list[Mapping[str, Any]]] = {}
     for entry in document["cases"]:
         cases.setdefault(entry["case"], []).append(entry)
     for case, entries in cases.items():
-        unit = printable(entries[0]["unit"])
-        table = Table(box=box.SIMPLE_HEAD, title=f"{case}: rms error of the bias, {unit}", title_justify="left")
-        for heading in ("rest", "method", *(f"after {h} s" for h in HORIZONS_S)):
+        title = f"{case}: rms error of the bias after a rest, {printable(entries[0]['unit'])}"
+        reckoned = entries[0]["dead_reckoning"]
+        if reckoned:
+            title += f"; of {RECKONED_S} s of dead reckoning"
+        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+        for heading in ("rest", "method", *(f"after {h} s" for h in HORIZONS_S), *(RECKONED[key] for key in reckoned)):
             table.add_column(heading, no_wrap=True)
         for entry in entries:
-            errors = entry["rms_error"]
-            least = {h: min(one[h] for one in errors.values()) for h in map(str, HORIZONS_S)}
+            columns = [{name: errors[str(h)] for name, errors in entry["rms_error"].items()} for h in HORIZONS_S]
+            columns += entry["dead_reckoning"].values()
+            least = [min(column[name] for name in TITLES) for column in columns]
             first = f"{entry['rest_s'] // 60} min, {entry['rests']} rests"
-            for name, title in TITLES.items():
+            for name, method in TITLES.items():
                 cells = [
-                    f"[bold]{errors[name][h]:.3g}[/]" if errors[name][h] == least[h] else f"{errors[name][h]:.3g}"
-                    for h in map(str, HORIZONS_S)
+                    f"[bold]{column[name]:.3g}[/]" if column[name] == best else f"{column[name]:.3g}"
+                    for column, best in zip(columns, least, strict=True)
                 ]
-                table.add_row(first, title, *cells)
+                table.add_row(first, method, *cells)
                 first = ""
-            table.add_row(
-                "",
-                "  sd that the bank states",
-                *(f"{sd:.3g}" for sd in entry["bank_stated_sd"].values()),
-                end_section=True,
-            )
+            sds = [f"{sd:.3g}" for sd in entry["bank_stated_sd"].values()]
+            known = [f"{column[KNOWN]:.3g}" if KNOWN in column else "" for column in columns]
+            table.add_row("", "  sd that the bank states", *sds, end_section=not any(known))
+            if any(known):
+                table.add_row("", "  the white noise alone", *known, end_section=True)
         console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, title="error over the least of all methods", title_justify="left")
-    for heading in ("method", "median", "worst"):
+    table = Table(box=box.SIMPLE_HEAD, title="error over the least of all methods: median, worst", title_justify="left")
+    regrets = document["regret"]
+    reckoned = [key for key in RECKONED if key in regrets["bank"]]
+    for heading in ("method", "bias", *(RECKONED[key].partition(",")[0] for key in reckoned)):
         table.add_column(heading, no_wrap=True)
-    for name, ratio in document["regret"].items():
-        table.add_row(TITLES[name], f"{ratio['median']:.3g}", f"{ratio['worst']:.3g}")
+    for name, ratio in regrets.items():
+        shown = (f"{one['median']:.3g}, {one['worst']:.3g}" for one in (ratio, *(ratio[key] for key in reckoned)))
+        table.add_row(TITLES[name], *shown)
     console.print(table)
     if document["recordings"]:
         console.print(
