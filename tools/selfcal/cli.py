@@ -538,6 +538,21 @@ def worth(
 
 
 @app.command()
+def navigate(
+    records: Annotated[int, typer.Option(metavar="N", help="Simulated parts of each law")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same parts", min=0)] = 1,
+    scheduler: Scheduler = None,
+    results: Results = None,
+    json: Json = None,
+) -> None:
+    """Errors and consistency of a GPS/INS filter, by the noise that it is told."""
+    from selfcal.verbs import navigate as verb
+
+    result = verb.navigate(records=records, seed=seed, json=json, scheduler=scheduler, results=results)
+    verb.show(result, to_stderr=str(json) == "-")
+
+
+@app.command()
 def codegen(
     model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],

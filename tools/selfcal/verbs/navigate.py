@@ -1,0 +1,177 @@
+"""`selfcal navigate`: a GPS/INS filter that is told the data sheet's noise, ten times it, or what the bank finds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from selfcal.document import check_writable, write_json
+from selfcal.errors import UserError
+from selfcal.model import Model
+from selfcal.navigation import JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.spread import Row, spread
+from selfcal.table import TABLE_WIDTH
+from selfcal.tables import make_tables
+
+SCHEMA = "selfcal.navigate/1"
+#: What filter designers multiply a data sheet's noise by.
+INFLATION = 10.0
+#: The filters, in the order of the table.
+TITLES = {
+    "sheet": "the data sheet's",
+    "inflated": f"{INFLATION:g} times the data sheet's",
+    "identified": f"identified in {REST_S // 60} min of rest",
+    "true": "the true one",
+}
+#: When they are judged.
+TIMES = {"with_gps": "with GPS", "after_outage": f"{OUTAGE_S} s without"}
+#: What of: columns of the table.
+FIGURES = {
+    "position_m": "position, m",
+    "gyro_bias_deg_s": "gyro bias, deg/s",
+    "accelerometer_bias_m_s2": "acc. bias, m/s^2",
+    "nees": "NEES",
+}
+#: Parts whose filters run side by side.
+TOGETHER = 25
+
+
+@dataclass(frozen=True)
+class Job:
+    """Parts of one law, by their seeds."""
+
+    law: str
+    seeds: tuple[int, ...]
+
+
+def navigate(
+    *,
+    records: int = 200,
+    seed: int = 1,
+    json: Path | str | None = None,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
+) -> dict[str, Any]:
+    """Fly `records` simulated parts of each law after a rest, each with the four filters of `TITLES`, which differ in
+    the noise that they are told (navigation.py).
+
+    Returns the document `selfcal.navigate/1`: rms errors and the mean NEES by law, filter and time, and the 95 % band
+    of the NEES of filters that are consistent. A bias has the rms of its three axes.
+    """
+    check_writable(json)
+    if records < 2:
+        raise UserError("--records must be at least 2")
+    seeds = [seed + 1_000_003 * k for k in range(records)]
+    jobs = [Job(law, tuple(seeds[k : k + TOGETHER])) for law in LAWS for k in range(0, records, TOGETHER)]
+    settings = {"schema": SCHEMA, "seed": seed, "records": str(records)}  # the jobs have it
+    rows = spread(rows_of, jobs, settings=settings, piece=1, scheduler=scheduler, results=results)
+    band = stats.chi2.ppf([0.025, 0.975], JUDGED * records) / records
+    document = {
+        "schema": SCHEMA,
+        "parts": records,
+        "nees_expected": JUDGED,
+        "nees_band_95": band.tolist(),
+        "laws": {law: _summary([row for row in rows if row["law"] == law]) for law in LAWS},
+    }
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def sheet_noise(factor: float = 1.0) -> list[Mapping[str, float]]:
+    """By AXES: the data sheet's white noise and a bias that walks by its stability, times `factor`."""
+    return [
+        {"N": factor * SHEET_N[unit], "K": factor * SHEET_STABILITY[unit] / math.sqrt(SHEET_TIME_S)}
+        for unit in AXES.values()
+    ]
+
+
+def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
+    """By AXES: medians of the most probable law of a rest [REST_S, axes] in their units."""
+    from selfcal.engines.library import Bank
+
+    model = Model.load()
+    bank = Bank(make_tables(model, 1.0, tuple(AXES), bank_rate_hz=1.0))
+    bank.push(rest)
+    found: list[Mapping[str, float]] = []
+    for k in range(len(AXES)):
+        result = bank.report(k)
+        law = max(result.probability, key=lambda name: result.probability[name])
+        found.append({name: estimate.median for name, estimate in result.parameters[law].items()})
+    return found
+
+
+def rows_of(job: Job) -> list[Row]:
+    """A row a part: squared errors and the NEES by filter and time."""
+    part = Part.of(job.law, job.seeds)
+    told = {
+        "sheet": [sheet_noise()] * len(job.seeds),
+        "inflated": [sheet_noise(INFLATION)] * len(job.seeds),
+        "identified": [identified_noise(rest / SCALE) for rest in part.rest],
+        "true": [true_noise(job.law)] * len(job.seeds),
+    }
+    rows: list[Row] = [{"law": job.law, "seed": seed} for seed in job.seeds]
+    for name, noise in told.items():
+        filters = Filters(Noise.of(noise), part)
+        filters.rest()
+        for time, (errors, covariance) in zip(TIMES, filters.fly(), strict=True):
+            figures = {
+                "position_m": (errors[:, :3] ** 2).sum(axis=1),
+                "gyro_bias_deg_s": (np.degrees(errors[:, 9:12]) ** 2).mean(axis=1),
+                "accelerometer_bias_m_s2": (errors[:, 12:15] ** 2).mean(axis=1),
+                "nees": nees(errors, covariance),
+            }
+            for figure, values in figures.items():
+                for row, value in zip(rows, values, strict=True):
+                    row[f"{name}.{time}.{figure}"] = float(value)
+    return rows
+
+
+def _summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """By filter and time: the rms of each error, the mean of the NEES."""
+    found: dict[str, Any] = {}
+    for name in TITLES:
+        found[name] = {}
+        for time in TIMES:
+            means = {figure: float(np.mean([row[f"{name}.{time}.{figure}"] for row in rows])) for figure in FIGURES}
+            found[name][time] = {
+                figure: mean if figure == "nees" else math.sqrt(mean) for figure, mean in means.items()
+            }
+    return found
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """A table a time; a word on each NEES."""
+    console = Console(stderr=to_stderr)
+    console.width = max(console.width, TABLE_WIDTH)
+    low, high = document["nees_band_95"]
+    for time, when in TIMES.items():
+        title = f"{when}: rms errors, {document['parts']} parts of each law"
+        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+        for heading in ("law of the parts", "noise that the filter is told", *FIGURES.values(), "it is"):
+            table.add_column(heading, no_wrap=True)
+        for law, filters in document["laws"].items():
+            for name, times in filters.items():
+                figures = times[time]
+                cells = [f"{figures[figure]:.3g}" for figure in FIGURES]
+                word = (
+                    "too sure" if figures["nees"] > high else "too cautious" if figures["nees"] < low else "consistent"
+                )
+                last = name == list(filters)[-1]
+                table.add_row(law if name == "sheet" else "", TITLES[name], *cells, word, end_section=last)
+        console.print(table)
+    console.print(
+        f"NEES: squared error over what the filter states, {document['nees_expected']} of one that is consistent; its "
+        f"mean over {document['parts']} parts then lies between {low:.1f} and {high:.1f} in 95 % of cases",
+        highlight=False,
+    )
