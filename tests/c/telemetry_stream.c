@@ -216,6 +216,7 @@ int main(int argc, char **argv)
             (void)told_count(message[a], "not_finite", counters.not_finite[a]);
             (void)told_count(message[a], "saturated", counters.saturated[a]);
             (void)told_count(message[a], "stuck", counters.stuck[a]);
+            counters.outliers[a] = (uint16_t)told_count(message[a], "outliers", random32() & 0xFFFFU);
             (void)told_count(message[a], "gaps", counters.gaps);
             (void)told_count(message[a], "blocks_lost", counters.blocks_lost);
             report.bias_mean = told(message[a], "bias_mean", random_float());

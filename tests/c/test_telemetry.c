@@ -306,7 +306,9 @@ static void test_health_flags_are_the_axis_s_own(void)
 {
     counters.stuck[1] = 1;
     counters.gaps = 1;
-    const uint32_t want[2] = {0x308, 0x30C}; /* bit 2 stuck, bit 3 gaps; three hypotheses in bits 8 to 11 */
+    counters.outliers[1] = 5;
+    /* bit 2 stuck, bit 3 gaps; three hypotheses in bits 8 to 11; outliers in bits 16 to 31 */
+    const uint32_t want[2] = {0x308, 0x5030C};
     for (uint8_t axis = 0; axis < 2; axis++) {
         report.axis = axis;
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_report(&telemetry, &report, &counters, 0));
