@@ -65,7 +65,7 @@ def with_effect(
     if name == "periodic":
         return y + size * sigma * np.sin(2 * np.pi * t / 37.0)
     if name == "variance_change":
-        extra = math.sqrt(abs(size**2 - 1.0)) * sigma * rng.standard_normal(n)  # quieter: louder before
+        extra = math.sqrt(max(size, 1.0 / size) ** 2 - 1.0) * sigma * rng.standard_normal(n)  # quieter: louder before
         return y + np.where(late == (size > 1.0), extra, 0.0)
     if name == "outliers":
         return y + size * sigma * (rng.uniform(size=n) < 0.002) * rng.choice([-1.0, 1.0], n)

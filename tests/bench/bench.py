@@ -283,6 +283,7 @@ def table(bench: Bench) -> str:
         per("… varying", f"sums.{law}.varying", ".1f")
     per("judgement of the model, per (bank sample, axis): random walk", "adequacy.random_walk", ".0f")
     per("… Gauss-Markov", "adequacy.gauss_markov", ".0f")
+    per("… and the search for changes: random walk", "changes.random_walk", ".0f")
     shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}
     for target, figures in targets.items():
         seconds = RATE_HZ / MACHINES[target].systick_hz

@@ -110,17 +110,23 @@ static void measure_all(void) {
 
 #elif defined(BENCH_PLAIN)
 
-/* The judgement of the model, per (bank sample, axis), under a law of the default model. */
-static void measure_adequacy(const char *name, unsigned law) {
+/* The judgement of the model, per (bank sample, axis), under a law of the default model; and with it the search for
+ * changes. */
+static void measure_adequacy(const char *name, unsigned law, bool changes) {
+    static const selfcal_handling_t handling = {0.0F, true, true};
+    static selfcal_changes_t found;
+    static float learned[1];
     static selfcal_adequacy_t adequacy;
     static selfcal_report_t report;
     selfcal_model_t model = record_narrow_model(false, axis);
+    model.handling = changes ? &handling : NULL;
     record_init(&record);
     count_require(selfcal_init(&bank, &model, memory, sizeof memory) == SELFCAL_OK, "init");
     while (selfcal_count(&bank) < SELFCAL_EPOCH_MIN + WINDOW) { /* whole batches are known */
         (void)push_window();
     }
     (void)selfcal_adequacy_init(&adequacy, &bank);
+    (void)selfcal_changes_init(&found, &adequacy, &bank, learned);
     for (unsigned h = 0; h < model.hypotheses; h++) {
         report.hypothesis[h].probability = h == law ? 1.0F : 0.0F;
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
@@ -146,8 +152,9 @@ static void measure_adequacy(const char *name, unsigned law) {
 }
 
 static void measure_all(void) {
-    measure_adequacy("adequacy.random_walk", 1U);
-    measure_adequacy("adequacy.gauss_markov", 2U);
+    measure_adequacy("adequacy.random_walk", 1U, false);
+    measure_adequacy("adequacy.gauss_markov", 2U, false);
+    measure_adequacy("changes.random_walk", 1U, true);
 }
 
 #else
