@@ -338,7 +338,7 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
             table.add_row(
                 entry["rival"],
                 *(_ratio(p[name]) for name in names),
-                " ".join(f"{100 * p[name]['coverage_90']:.1f}" for name in names) if _covers(p, names) else "",
+                _covered([p[name]["coverage_90"] for name in names]),
                 f"{100 * max(p[name]['no_answer'] for name in names):.0f} %",
                 _seconds(entry["seconds"]),
             )
@@ -377,8 +377,11 @@ def _hit(document: Mapping[str, Any], choice: Mapping[str, Any], law: str) -> fl
     return math.nan
 
 
-def _covers(parameters: Mapping[str, Any], names: Sequence[str]) -> bool:
-    return any(math.isfinite(parameters[name]["coverage_90"]) for name in names)
+def _covered(shares: Sequence[float]) -> str:
+    """A share for each parameter; nothing if the method states no interval at all."""
+    if all(math.isnan(share) for share in shares):
+        return ""
+    return " ".join("none" if math.isnan(share) else f"{100 * share:.1f}" for share in shares)
 
 
 def _ratio(parameter: Mapping[str, Any]) -> str:
