@@ -1,0 +1,107 @@
+"""What an extended model gains on the module: the error of the bias predicted 10, 60 and 300 s ahead.
+
+    python tests/held_out_bias.py --records 5 --seed 1 [--target cortex-m4f] [--cause temperature]
+
+Each record has one effect on gx (random walk, N 0.04, K 1e-3 deg/s, 1 Hz). Its first 2400 s are diagnosed; the base
+model and the extended one then run over them in the firmware (`replay`). The truth is the same record without white
+noise. The prediction is the bias at the end, and with regressors what their coefficients make of the values to come.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from selfcal.model import DEFAULT, Model
+from selfcal.recording import as_float, load
+from selfcal.regressors import columns_of
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.replay import replay
+from selfcal.verbs.simulate import simulate
+
+LENGTH_S, HORIZONS_S = 2400, (10, 60, 300)
+EFFECTS = {
+    "temperature": ["temperature:coefficient=0.1,axis=gx"],
+    "supply": ["supply:coefficient=4,axis=gx"],
+    "cross_axis": ["cross_axis:other=gy,coefficient=0.5,axis=gx"],
+    "periodic": ["periodic:frequency_hz=0.003,amplitude=0.1,axis=gx"],
+    "step": ["step:time_s=900,amplitude=0.3,axis=gx"],
+    "flicker": ["flicker:B=0.05,axis=gx"],
+    "two": ["temperature:coefficient=0.1,axis=gx", "supply:coefficient=4,axis=gx"],
+}
+
+
+def model_file(path: Path, N: float, lsb: float) -> Path:
+    tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    tree["groups"]["gyro"]["lsb"] = lsb
+    axes = {name: {"hypothesis": "random_walk", "bias": 0.1, "N": N, "K": 1.0e-3} for name in ("gx", "gy")}
+    duration_s = float(LENGTH_S + HORIZONS_S[-1] + 10)
+    tree["simulate"] = {"rate_hz": 1.0, "duration_s": duration_s, "axes": axes}
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+def predicted(axis: dict[str, Any], model: Model, log: Path) -> NDArray[np.float64]:
+    """The bias, regressors and all, at each horizon."""
+    regressors = tuple(one for one in model.regressors if one.name in axis.get("regressors", {}))
+    ahead = np.full(len(HORIZONS_S), axis["bias_now"]["mean"])
+    if regressors:
+        values = as_float(columns_of(regressors, load(log)))
+        names = [column for one in regressors for column in one.columns]
+        for one in regressors:
+            told = axis["regressors"][one.name]
+            for column, coefficient in told["coefficients"].items():
+                z = values[:, names.index(column)]
+                change = np.array([z[LENGTH_S - 1 + h] for h in HORIZONS_S]) - z[LENGTH_S - 1]
+                ahead += told["probability"] * coefficient["mean"] * change
+    return ahead
+
+
+def errors(effects: Sequence[str], target: str, seed: int, folder: Path) -> NDArray[np.float64]:
+    """[base and extended model, horizon]: error of the predicted bias, deg/s."""
+    base, clean = model_file(folder / "base.yaml", 0.04, 0.01), model_file(folder / "clean.yaml", 1e-6, 1e-5)
+    whole, log, truth = folder / "whole.npz", folder / "log.npz", folder / "truth.npz"
+    simulate(base, whole, seed=seed, effects=list(effects))
+    simulate(clean, truth, seed=seed, effects=list(effects))
+    with np.load(whole) as stored:
+        np.savez(log, **{name: stored[name][:LENGTH_S] if stored[name].ndim else stored[name] for name in stored.files})
+    recording = load(truth)
+    bias = as_float(recording.in_unit("gx", "deg/s"))[[LENGTH_S - 1 + h for h in HORIZONS_S]]
+    extended = folder / "extended.yaml"
+    diagnose(log, axes=["gx"], model=base, write_model=extended)
+    found = []
+    for path in (base, extended):
+        axis = replay(log, axes=["gx"], model=path, target=target)["axes"]["gx"]
+        found.append(predicted(axis, Model.load(path), whole) - bias)
+    return np.array(found)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--records", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--target", default="host")
+    parser.add_argument("--cause", action="append", choices=list(EFFECTS))
+    given = parser.parse_args()
+    print(f"rms error of the bias on {given.target}, {given.records} records, deg/s: base model -> extended one")
+    for cause in given.cause or EFFECTS:
+        all_errors = []
+        for k in range(given.records):
+            with tempfile.TemporaryDirectory() as folder:
+                all_errors.append(errors(EFFECTS[cause], given.target, given.seed + k, Path(folder)))
+        rms = np.sqrt(np.mean(np.square(all_errors), axis=0))
+        cells = (f"{h} s: {b:.4f} -> {e:.4f}" for h, b, e in zip(HORIZONS_S, *rms, strict=True))
+        print(f"{cause:12s} {', '.join(cells)}", flush=True)
+        assert all(math.isfinite(value) for value in rms.ravel())
+
+
+if __name__ == "__main__":
+    main()
