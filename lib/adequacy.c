@@ -35,6 +35,7 @@ selfcal_status_t selfcal_adequacy_init(selfcal_adequacy_t *self, const selfcal_t
     }
     memset(self, 0, sizeof *self);
     self->seen = selfcal_count(bank);
+    self->coldest = self->warmest = NAN;
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
         self->watch[axis].reason = SELFCAL_REASON_NO_REPORT;
     }
@@ -432,6 +433,11 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
     const uint32_t count = selfcal_count(bank);
     if (count != self->seen) { /* the push has ended a bank interval */
         self->seen = count;
+        if (channels != NULL && isfinite(channels[0])) {
+            const float now = (float)(self->first[0] + self->sum[0] / (selfcal_real_t)self->used);
+            self->coldest = fminf(self->coldest, now); /* of NAN and a number that is the number */
+            self->warmest = fmaxf(self->warmest, now);
+        }
         bool any = false;
         for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
             any = any || self->watch[axis].known;
@@ -453,6 +459,7 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
 selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis) {
     const selfcal_watch_t *watch = &self->watch[axis];
     selfcal_judgement_t told = self->judgement[axis];
+    told.temperature_span = self->warmest - self->coldest;
     if (selfcal_retired(bank, axis)) {
         told.state = SELFCAL_NOT_JUDGED;
         told.reason = SELFCAL_REASON_RETIRED;

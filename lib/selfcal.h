@@ -638,6 +638,7 @@ typedef struct {
     selfcal_suspect_t suspect; /* the strongest one, also of an adequate model */
     float score;               /* of the suspect, in standard deviations of its null law */
     uint32_t samples;          /* bank samples that it rests on */
+    float temperature_span;    /* how far the temperature has moved since the start; NAN: there is none */
     uint32_t changes;          /* found on this axis so far ... */
     selfcal_change_t change;   /* ... and the last of them */
 } selfcal_judgement_t;

@@ -515,6 +515,7 @@ struct selfcal_adequacy {
     bool any;
     selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], held[SELFCAL_ADEQUACY_INPUTS];
     selfcal_real_t base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
+    float coldest, warmest; /* of the bank intervals' temperatures; NAN: there has been none */
     selfcal_watch_t watch[SELFCAL_AXES_MAX];
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };

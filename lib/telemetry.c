@@ -160,7 +160,7 @@ static bool next_part(selfcal_telemetry_t *self)
     } else if (k <= hypotheses + 1U && self->judgement != NULL) {
         self->part = (uint8_t)(hypotheses + 2U);
         begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0, self->judgement->changes > 0U ?
-                      (uint8_t)SELFCAL_ADEQUACY_CHANGE_AGO : (uint8_t)SELFCAL_ADEQUACY_JUDGED);
+                      (uint8_t)SELFCAL_ADEQUACY_CHANGE_AGO : (uint8_t)SELFCAL_ADEQUACY_TEMPERATURE_SPAN);
     } else {
         self->part = (uint8_t)(hypotheses + 3U);
         begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
@@ -335,6 +335,7 @@ static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item)
     case SELFCAL_ADEQUACY_SUSPICION_SCORE: return float_bits(self->judgement->score);
     case SELFCAL_ADEQUACY_REASON: return (uint32_t)self->judgement->reason;
     case SELFCAL_ADEQUACY_JUDGED: return self->judgement->samples;
+    case SELFCAL_ADEQUACY_TEMPERATURE_SPAN: return float_bits(self->judgement->temperature_span);
     case SELFCAL_ADEQUACY_CHANGE_COUNT: return self->judgement->changes;
     case SELFCAL_ADEQUACY_CHANGE: return (uint32_t)self->judgement->change.cause;
     case SELFCAL_ADEQUACY_CHANGE_SIZE: return float_bits(self->judgement->change.size);

@@ -40,6 +40,17 @@ AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
 
 
+#: SELFCAL_EXTENDED=1 runs the suites with a model as `diagnose` extends it: two columns and the outlier gate.
+EXTENDED = os.environ.get("SELFCAL_EXTENDED", "") == "1"
+EXTENSION = {
+    "handle": {"outlier_sd": 6.0},
+    "regressors": [
+        {"name": "warmth", "kind": "column", "column": "temp", "unit": "degC", "reference": 25, "sd": {"gyro": 0.5}},
+        {"name": "supply", "kind": "column", "column": "supply", "unit": "V", "reference": 5, "sd": {"gyro": 10.0}},
+    ],
+}
+
+
 def often(trials: int) -> int:
     """`make test` runs half of a campaign's trials; `make campaigns` MANY times all of them."""
     return MANY * trials if MANY > 1 else (trials + 1) // 2
@@ -65,19 +76,18 @@ def image(
 ) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: at `rate_hz`, bank at
     `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds). `node`: its number on its bus."""
-    folder = ROOT / "build" / "firmware" / name
+    folder = ROOT / "build" / "firmware" / (f"{name}-extended" if EXTENDED else name)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        model = Model.load()
+        document = yaml.safe_load(Path(Model.load().path).read_text())
         if quiet:
-            document = yaml.safe_load(Path(model.path).read_text())
             document["bank_rate_hz"] = bank_hz
             document["hypotheses"] = dict.fromkeys(laws, 1)
-            (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-            codegen(folder / "model.yaml", folder / "new", target=CORES[target], rate=rate_hz)
-        else:
-            codegen(None, folder / "new", target=CORES[target])
+        if EXTENDED:
+            document |= EXTENSION
+        (folder / "model.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+        codegen(folder / "model.yaml", folder / "new", target=CORES[target], rate=rate_hz if quiet else None)
         for file in (folder / "new").iterdir():
             old = folder / file.name
             if not old.exists() or old.read_bytes() != file.read_bytes():

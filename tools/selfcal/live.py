@@ -33,6 +33,8 @@ from selfcal.wire import (
 UNTOLD = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
 UNTOLD |= {f"reason_{axis}" for axis in AXES}
 #: What the user has to do something about.
+#: degC that a temperature must move before its coefficient is worth having: ArduPilot's rule (TCAL).
+TEMPERATURE_NEEDED = 10.0
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 #: Cells of a probability bar and of the bias's sparkline, at least and at most. Many hypotheses leave no room for bars.
@@ -224,6 +226,7 @@ class View:
             lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
         last = dict(module.last)  # Live asks from a thread of its own
         lines += self._unreported(module, last, width)
+        lines += self._sufficiency(last)
         if last:
             names = self._names(module.decoder.status)
             count = max((report.hypotheses or told_of(report) for report, _ in last.values()), default=0)
@@ -232,6 +235,16 @@ class View:
             blocks = self._blocks(module, last, names, len(named), width)
             lines += _fitted(blocks, None if height is None else height - len(lines))
         return lines
+
+    @staticmethod
+    def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
+        """What the record cannot tell yet."""
+        told = [report.adequacy for report, _ in last.values()]
+        moved = max((one.temperature_moved for one in told if one and one.temperature_moved is not None), default=None)
+        if moved is None or moved >= TEMPERATURE_NEEDED:
+            return []
+        said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
+        return [_line(Text(said, "dim"))]
 
     def _unreported(self, module: Module, last: Mapping[str, object], width: int) -> list[Text]:
         """Why axes have no report, a line for each reason."""

@@ -217,7 +217,8 @@ class AxisReport:
     @property
     def adequacy(self) -> Adequacy | None:
         """What the module says of its model on this axis; None if it does not judge, or not all of it arrived."""
-        if not {"adequacy", "reason", "suspicion", "suspicion_score", "judged"} <= self.values.keys():
+        needed = {"adequacy", "reason", "suspicion", "suspicion_score", "judged", "temperature_span"}
+        if not needed <= self.values.keys():
             return None
 
         def word(signal: str) -> str:
@@ -229,7 +230,9 @@ class AxisReport:
         if {"change_count", "change", "change_size", "change_ago"} <= self.values.keys():
             count, size, ago_s = (self.values[f"change_{name}"] for name in ("count", "size", "ago"))
             change = Change(word("change"), size, ago_s, int(count))
-        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, change)
+        span = self.values["temperature_span"]
+        moved = span if math.isfinite(span) else None
+        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
 
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
         """Mean, sd and probability of use of each regressor column that was told."""
@@ -262,7 +265,7 @@ class Adequacy:
     """What a module says of its model on an axis (lib/adequacy.c): words as in the DBC.
 
     `state` is adequate, inadequate or not_judged, the last with a `reason`. `suspicion` is the strongest, `score` in
-    standard deviations of its null law, over `samples` bank samples.
+    standard deviations of its null law, over `samples` bank samples. `temperature_moved` is in degC, None without one.
     """
 
     state: str
@@ -270,6 +273,7 @@ class Adequacy:
     suspicion: str
     score: float
     samples: int
+    temperature_moved: float | None = None
     change: Change | None = None
 
     def __str__(self) -> str:
