@@ -63,6 +63,7 @@ static selfcal_model_t model;
 static selfcal_regressors_t regressors;
 static selfcal_forgetting_t forgetting;
 static float reference[SELFCAL_REGRESSORS_MAX], coefficient_sd[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
+static float coefficient_mean[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
 static float values[SELFCAL_REGRESSORS_MAX]; /* of the regressors, as they come with the next sample */
 
 static bank_t bank, twin;
@@ -201,12 +202,14 @@ static void make_model(input_t *in, bool any_sums) {
         regressors.count = (uint8_t)(1U + (shape >> 4 & 1U) % SELFCAL_REGRESSORS_MAX);
         regressors.reference = reference;
         regressors.coefficient_sd = coefficient_sd;
+        regressors.coefficient_mean = coefficient_mean;
         for (unsigned k = 0; k < SELFCAL_REGRESSORS_MAX; k++) {
             reference[k] = 20.0F;
             values[k] = 20.0F;
         }
         for (unsigned k = 0; k < LENGTH(coefficient_sd); k++) {
             coefficient_sd[k] = k % 4U == 3U ? 0.0F : 0.01F;
+            coefficient_mean[k] = k % 2U == 1U ? 0.0F : 0.02F;
         }
         model.regressors = &regressors;
     }
@@ -252,7 +255,7 @@ static void make_model(input_t *in, bool any_sums) {
     case 15: regressors.count = byte(in); break;
     case 16: regressors.reference = NULL; break;
     case 17: reference[0] = any_float(in); break;
-    case 18: coefficient_sd[0] = any_float(in); break;
+    case 18: *((byte(in) & 1U) != 0U ? coefficient_sd : coefficient_mean) = any_float(in); break;
     case 19: forgetting.half_life_s = any_float(in); break;
     case 20: forgetting.code = NULL; break;
     case 21: of_ratio[0][byte(in) % SELFCAL_PARAMETERS].ln_min = any_float(in); break;
