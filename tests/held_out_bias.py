@@ -80,7 +80,7 @@ def errors(effects: Sequence[str], target: str, seed: int, folder: Path) -> NDAr
     found = []
     for path in (base, extended):
         axis = replay(log, axes=["gx"], model=path, target=target)["axes"]["gx"]
-        found.append(predicted(axis, Model.load(path), whole) - bias)
+        found.append(predicted(axis, Model.load(path), truth) - bias)
     return np.array(found)
 
 
