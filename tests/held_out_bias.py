@@ -49,18 +49,18 @@ def model_file(path: Path, N: float, lsb: float) -> Path:
     return path
 
 
-def predicted(axis: dict[str, Any], model: Model, log: Path) -> NDArray[np.float64]:
-    """The bias, regressors and all, at each horizon."""
+def predicted(axis: dict[str, Any], model: Model, log: Path, truth: Path) -> NDArray[np.float64]:
+    """The bias, regressors and all, at each horizon: their values at the end as recorded, later ones without noise."""
     regressors = tuple(one for one in model.regressors if one.name in axis.get("regressors", {}))
     ahead = np.full(len(HORIZONS_S), axis["bias_now"]["mean"])
     if regressors:
-        values = as_float(columns_of(regressors, load(log)))
+        values, to_come = (as_float(columns_of(regressors, load(path))) for path in (log, truth))
         names = [column for one in regressors for column in one.columns]
         for one in regressors:
             told = axis["regressors"][one.name]
             for column, coefficient in told["coefficients"].items():
-                z = values[:, names.index(column)]
-                change = np.array([z[LENGTH_S - 1 + h] for h in HORIZONS_S]) - z[LENGTH_S - 1]
+                place = names.index(column)
+                change = np.array([to_come[LENGTH_S - 1 + h, place] for h in HORIZONS_S]) - values[LENGTH_S - 1, place]
                 ahead += told["probability"] * coefficient["mean"] * change
     return ahead
 
@@ -80,7 +80,7 @@ def errors(effects: Sequence[str], target: str, seed: int, folder: Path) -> NDAr
     found = []
     for path in (base, extended):
         axis = replay(log, axes=["gx"], model=path, target=target)["axes"]["gx"]
-        found.append(predicted(axis, Model.load(path), truth) - bias)
+        found.append(predicted(axis, Model.load(path), whole, truth) - bias)
     return np.array(found)
 
 
