@@ -125,6 +125,6 @@ selfcal_status_t selfcal_reopen(selfcal_t *self, const selfcal_reopening_t at[],
         }
     }
     self->weight *= self->keep;
-    self->keep = 1.0;
+    self->keep = self->beginning = 1.0;
     return SELFCAL_OK;
 }

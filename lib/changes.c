@@ -23,6 +23,7 @@
 #define HOLD 24U
 #define SETTLE 8U            /* of HOLD: what comes after them must bear the step out */
 #define LATE_LIMIT R(2.0)
+#define GAP_MAX 64U          /* bank intervals; a step after a longer gap begins with the first sample after it */
 #define WINDOW 64U
 #define LOUDER R(1.75) /* a window of normal z is so with probability 2e-6 ... */
 #define QUIETER R(0.55) /* ... and so with 4e-4 (4e6 windows simulated) */
@@ -51,11 +52,14 @@ static selfcal_real_t loudness(const selfcal_changes_t *self, const selfcal_chan
     return loud;
 }
 
-/* One bank sample of one axis into one onset; whether a step there is told. */
-static bool follow_onset(selfcal_onset_t *onset, const selfcal_watch_t *filter, selfcal_real_t z, selfcal_real_t loud) {
+/* One bank sample of one axis, `gap` intervals after the last one, into one onset; whether a step there is told. */
+static bool follow_onset(selfcal_onset_t *onset, const selfcal_watch_t *filter, selfcal_real_t z, uint32_t gap,
+                         selfcal_real_t loud) {
     selfcal_real_t innovation = R(1.0);
     for (size_t a = 0; a < filter->law.states; a++) {
-        onset->state[a] *= filter->law.pole[a];
+        for (uint32_t i = 0; i <= gap; i++) {
+            onset->state[a] *= filter->law.pole[a];
+        }
         innovation -= onset->state[a];
     }
     for (size_t a = 0; a < filter->law.states; a++) {
@@ -124,13 +128,14 @@ static void tell_step(selfcal_changes_t *self, const selfcal_watch_t *filter, ui
 }
 
 /* One bank sample of one axis; whether a step is told. */
-static bool look_for_step(selfcal_changes_t *self, const selfcal_watch_t *filter, uint8_t axis, selfcal_real_t z) {
+static bool look_for_step(selfcal_changes_t *self, const selfcal_watch_t *filter, uint8_t axis, selfcal_real_t z,
+                          uint32_t gap) {
     selfcal_change_watch_t *watch = &self->watch[axis];
     const selfcal_real_t loud = loudness(self, watch);
     bool told = false;
     for (size_t i = 0; i < SELFCAL_ONSETS; i++) {
         selfcal_onset_t *onset = &watch->onset[i];
-        if (onset->age > 0U && follow_onset(onset, filter, z, loud)) {
+        if (onset->age > 0U && follow_onset(onset, filter, z, gap, loud)) {
             told = true;
         }
     }
@@ -209,14 +214,15 @@ static void look(selfcal_adequacy_t *adequacy, const selfcal_t *bank, const self
     selfcal_changes_t *self = adequacy->changes;
     const selfcal_handling_t *handling = bank->model->handling;
     const uint8_t axes = bank->model->axes;
-    if (adequacy->count == 0U || gap > 0U) {
+    const bool apart = gap > GAP_MAX;
+    if (adequacy->count == 0U || apart) {
         clear_onsets(self);
     }
     if (adequacy->count == 0U) {
         return; /* its z is 0 */
     }
     uint32_t told = 0;
-    const bool begins = handling->steps && adequacy->count % SPACING == 1U;
+    const bool begins = handling->steps && (adequacy->count % SPACING == 1U || apart);
     const size_t next = adequacy->count / SPACING % SELFCAL_ONSETS;
     const bool settled = adequacy->count >= SPACING; /* before, S tells of an unknown level */
     const bool ends = settled && ++self->in_window == WINDOW;
@@ -236,7 +242,7 @@ static void look(selfcal_adequacy_t *adequacy, const selfcal_t *bank, const self
             watch->power += r_fmin(R(1.0), SQUARE_MAX / r_fmax(z[axis] * z[axis], R(1.0))) * square;
             watch->square += square;
         }
-        if (handling->steps && look_for_step(self, filter, axis, z[axis])) {
+        if (handling->steps && look_for_step(self, filter, axis, z[axis], gap)) {
             told |= 1U << axis;
         }
         if (ends && handling->variance_changes) {
