@@ -62,13 +62,14 @@ def sums(y: Floats, hypothesis: int, ln_rho: float, ln_alpha: float, dt_s: float
     return a, b, c, d
 
 
-@pytest.mark.parametrize(("double", "tolerance"), [(True, 1e-5), (False, 1e-3)])
-def test_a_reopened_bank_has_the_likelihood_of_two_records(double: bool, tolerance: float) -> None:
+@pytest.mark.parametrize(("build", "tolerance"), [("double", 1e-5), ("float", 1e-3), ("fixed", 1e-3)])
+def test_a_reopened_bank_has_the_likelihood_of_two_records(build: str, tolerance: float) -> None:
     """-2 ln p at each node is n ln C + D + ln A of the first part under a flat prior, with A and B of the second part
-    alone. In double the drift's gain stops at 1e-6 of itself (CONVERGED in bank.c); float adds 1e-4 nats here."""
+    alone. In double the drift's gain stops at 1e-6 of itself (CONVERGED in bank.c); float and integers add 1e-4 nats
+    here. A bank that is saved after it and restored goes on alike."""
     y = record("random_walk", 1200, 3).astype(np.float32).astype(float)
     tables = tables_of("gx")
-    bank = Bank(tables, double=double)
+    bank = Bank(tables, double=build == "double", fixed=build == "fixed")
     bank.push(y[:700, None])
     places = {j: bank.raw.node(0, j) for j in range(0, tables.nodes, 13)}
     bank.raw.reopen([(0, 0.0, 0.0, N, 0.0, 0.0)], 1.0)
@@ -82,7 +83,11 @@ def test_a_reopened_bank_has_the_likelihood_of_two_records(double: bool, toleran
         # the change of -2 ln p by the fold: n ln(1 + ln A / n), n ln(C - B^2/A) left as it is
         folded = 700 * math.log(now["c"] / (c - b * b / a))
         assert math.isclose(folded, 700 * math.log1p(math.log(a) / 700), abs_tol=tolerance)
-    bank.push(y[700:, None])
+    restored = Bank(tables, double=build == "double", fixed=build == "fixed")
+    restored.restore(bank.save())
+    for one in (bank, restored):
+        one.push(y[700:, None])
+    assert restored.report(0) == bank.report(0)
     for j, node in places.items():
         place = (node["hypothesis"], node["ln_rho"], node["ln_alpha"], tables.dt_s)
         a, b, _, d = sums(np.array(off[700:]), *place)
