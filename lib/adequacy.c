@@ -237,6 +237,7 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
         w[k] = innovate(watch->state[1U + k], states, channel[k], gain) * root;
     }
+    watch->z = z;
     return r_fmin(r_fmax(z, -LARGEST), LARGEST);
 }
 

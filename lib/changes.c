@@ -67,7 +67,7 @@ static bool follow_onset(selfcal_onset_t *onset, const selfcal_watch_t *filter, 
     }
     const selfcal_real_t w = innovation * filter->root;
     onset->along = r_fma(r_fmin(r_fmax(z, -HELD), HELD), w, onset->along);
-    onset->size = r_fma(z, w, onset->size);
+    onset->size = r_fma(filter->z, w, onset->size);
     onset->weight = r_fma(w, w, onset->weight);
     onset->age++;
     if (onset->along * onset->along <= STEP_LIMIT * STEP_LIMIT * loud * onset->weight) {
@@ -306,6 +306,9 @@ uint32_t selfcal_changes_handle(selfcal_adequacy_t *adequacy, selfcal_t *bank) {
             adequacy->judgement[axis].change = self->change[axis];
             adequacy->watch[axis].known = adequacy->watch[axis].known && step;
             memset(&adequacy->watch[axis].all, 0, sizeof adequacy->watch[axis].all); /* that has been told */
+            for (uint8_t other = 0; other < bank->model->axes; other++) {
+                adequacy->watch[other].all.product[axis] = R(0.0);
+            }
             self->found_at[axis] = selfcal_count(bank) + bank->counters.blocks_lost;
         }
     }
@@ -314,7 +317,8 @@ uint32_t selfcal_changes_handle(selfcal_adequacy_t *adequacy, selfcal_t *bank) {
         adequacy->watch[axis].begun = false;
     }
     self->found = 0;
-    self->due = self->keeps = false;
+    self->due = false;
+    self->keeps = self->keeps && step; /* a step leaves the noise as it was */
     self->in_window = 0U;
     memset(self->watch, 0, sizeof self->watch);
     return done ? found : 0U;

@@ -29,7 +29,8 @@ void selfcal_node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t 
     }
     const selfcal_node_view_t *v = &field->node;
     selfcal_bank_sums(bank, work->axis, index, &field->node);
-    const selfcal_wide_t mean = v->b / v->a;
+    /* without a sample since selfcal_reopen() the bias is what its prior says */
+    const selfcal_wide_t mean = v->a > 0.0 ? v->b / v->a : -selfcal_bank_from_prior(bank, work->axis);
     field->var = fmax((v->c - v->b * mean) * work->per_n, least); /* of the residual; the rest is in units of it */
     const selfcal_real_t miss =
         (selfcal_real_t)((mean + selfcal_bank_from_prior(bank, work->axis)) * work->per_bias_sd);

@@ -473,7 +473,7 @@ typedef struct {
     selfcal_reason_t reason; /* if not known */
     selfcal_filter_law_t next, law; /* of the last report; in use */
     selfcal_reopening_t likely;     /* where the likeliest law of the last report lies */
-    selfcal_real_t gain[SELFCAL_FILTER_STATES], root; /* of the last bank sample; root of 1/S */
+    selfcal_real_t gain[SELFCAL_FILTER_STATES], root, z; /* of the last bank sample; root of 1/S; z as it is */
     selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
     selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
     selfcal_real_t last, slow, fourth, square[2];

@@ -32,11 +32,11 @@ from image_sizes import FirmwareError, Image
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})
 #: Frames of a report of the default model; the Cortex-M0 does not judge it.
-REPORT = {"cortex-m4f": 51, "cortex-m0": 46}
+REPORT = {"cortex-m4f": 52, "cortex-m0": 46}
 CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
 APP = ("app.c", "app_frames.c", "app_reports.c", "app_samples.c", "app_state.c")
 #: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
-CALLS = {"intake.c": ["selfcal_regressors_code?"]} | {
+CALLS = {"intake.c": ["selfcal_regressors_code?"], "adequacy.c": ["look?"]} | {
     **{file: ["selfcal_regressors_code?", "selfcal_states_code?"] for file in ("check.c", "report_bias.c")},
     "report.c": ["selfcal_regressors_code?"],
     "report.c:selfcal_report_step": ["stages"],

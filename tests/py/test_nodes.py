@@ -112,7 +112,7 @@ def test_two_modules_on_one_bus_are_not_mixed(
         plot=tmp_path / "run.png",
     )
     assert [module.process.wait(30) for module in modules] == [0, 0]
-    frames = 6 * (46 + 2 * 51) + 46 + 6 * (46 + 7 + 8 + 13 + 4 * 18 + 5) + 46
+    frames = 6 * (46 + 2 * 52) + 46 + 6 * (46 + 7 + 8 + 13 + 4 * 18 + 6) + 46
     assert (outcome.received, outcome.lost, outcome.damaged, outcome.refused) == (frames, 0, 0, 0)
     assert not outcome.contact_lost
     said = capfd.readouterr().err

@@ -178,8 +178,8 @@ def test_replay_is_the_library_over_the_wire(
         assert len(checks) - ("lattice" in checks) == 4 + 6
         assert {check: outcome["value"] for check, outcome in axis["checks"].items()} == pytest.approx(checks, abs=0.02)
     said = capfd.readouterr().err
-    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 51 frames, and the last status
-    assert f"frames: {6 * (46 + 6 * 51) + 46} received, 0 lost" in said
+    # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 52 frames, and the last status
+    assert f"frames: {6 * (46 + 6 * 52) + 46} received, 0 lost" in said
     image = (tmp_path / "report.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert struct.unpack(">II", image[16:24]) >= (1000, 500)
@@ -400,7 +400,7 @@ def test_firmware_waits_for_open_and_for_close(tmp_path: Path) -> None:
     assert read_until(line, b"\r") == b"NSCAL\r"
     os.write(line, b"O\r")
     # the last frame is the number of frames sent: one report of status and axis, and the last status, less itself
-    frames = read_until(line, b"t2008" + struct.pack("<I", 46 + 51 + 45).hex().upper().encode())
+    frames = read_until(line, b"t2008" + struct.pack("<I", 46 + 52 + 45).hex().upper().encode())
     assert frames.startswith(b"\rt200860EA0000")  # its time: 60 000 ms
     time.sleep(0.3)
     assert module.process.poll() is None  # what it sent could still be unread
@@ -442,7 +442,7 @@ def test_firmware_keeps_to_the_wall_clock(tmp_path: Path) -> None:
     line = module.open()
     begun = time.monotonic()
     os.write(line, b"O\r")
-    read_until(line, b"t2008" + struct.pack("<I", 6 * (46 + 51) + 45).hex().upper().encode())
+    read_until(line, b"t2008" + struct.pack("<I", 6 * (46 + 52) + 45).hex().upper().encode())
     took = time.monotonic() - begun
     os.write(line, b"C\r")
     assert module.end()[0] == 0

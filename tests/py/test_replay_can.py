@@ -42,7 +42,7 @@ def test_replay_over_can_is_replay_over_slcan(tmp_path: Path, capfd: pytest.Capt
     over_slcan = replay(log, axes=("gx", "az"), report_every=60.0)
     capfd.readouterr()
     assert replay(log, axes=("gx", "az"), report_every=60.0, transport="can") == over_slcan
-    assert f"frames: {6 * (46 + 2 * 51) + 46} received, 0 lost" in capfd.readouterr().err
+    assert f"frames: {6 * (46 + 2 * 52) + 46} received, 0 lost" in capfd.readouterr().err
 
 
 @needs_multicast

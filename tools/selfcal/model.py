@@ -609,5 +609,5 @@ class _Reader:
             regressors=self.regressors(tree.get("regressors") or [], groups),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
-            handling=self.handling(tree.get("handle") or {}, bool(tree.get("regressors"))),
+            handling=self.handling({} if tree.get("handle") is None else tree["handle"], bool(tree.get("regressors"))),
         )

@@ -180,8 +180,14 @@ class _Reader:
             raise self.fail(f"{where}.parameters", f"must have the laws {', '.join(self.model.hypotheses)}")
         probability = self.mapping(posterior, "hypotheses", f"{where}.")
         limits: dict[str, dict[str, tuple[float, float]]] = {}
-        for law in laws:
-            if self.number(probability, law, f"{where}.hypotheses") < LEAST_PROBABILITY:
+        share = {law: self.number(probability, law, f"{where}.hypotheses") for law in laws}
+        if not all(-1e-9 <= one <= 1.0 + 1e-6 for one in share.values()):
+            raise self.fail(f"{where}.hypotheses", "must be probabilities, 0 to 1")
+        for law in sorted(laws, key=lambda law: -share[law]):
+            if share[law] < LEAST_PROBABILITY:
+                # What such a law says of N is wrong, and a wider prior would have it win where N has changed.
+                likeliest = next(iter(limits.values()), {})
+                limits[law] = {"N": likeliest["N"]} if "N" in likeliest else {}
                 continue
             inside = f"{where}.parameters.{law}"
             of_law = self.mapping(laws, law, f"{where}.parameters.")

@@ -448,6 +448,9 @@ def _document(
         if "error" not in axis:
             told = history[name][-1].adequacy
             axis["module_says"] = asdict(told) if told is not None else None
+            axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
+            if told is not None and told.change is not None and told.state != "inadequate":
+                note(f"{name}: the module says {told.change}; the checks here look at the record as one")
             if told is not None and told.state == "inadequate":
                 note(f"{name}: the module says {told}; why, and what mends it: selfcal diagnose {recording.path}")
     if gate:
