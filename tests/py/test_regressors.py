@@ -239,8 +239,6 @@ def test_identify_finds_what_is_in_the_record(tmp_path: Path) -> None:
             assert ours["sd"] == pytest.approx(exact["sd"], rel=0.03)
 
 
-
-
 def test_a_temperature_that_is_not_there_is_said(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     save(log, {"gx": ("deg/s", np.random.default_rng(1).normal(size=100))}, 1.0, {})

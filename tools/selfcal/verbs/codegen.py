@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -59,7 +59,17 @@ def codegen(
     if loaded.gate is not None and gate_table(loaded, tables) is None:
         said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
+    for said in _not_handled(loaded, tables, target):
+        Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables
+
+
+def _not_handled(model: Model, tables: Tables, target: str) -> Iterator[str]:
+    """What of `handle` comes to nothing."""
+    if tables.handling.outlier_sd and tables.block == 1:
+        yield f"{model.path}: `handle.outlier_sd` does nothing: a bank interval is one sample, and it wants two or more"
+    if core_of(target) in WITHOUT_FPU and (tables.handling.steps or tables.handling.variance_changes):
+        yield f"{model.path}: the images of {core_of(target)} find no steps and no variance changes: no room for it"
 
 
 def assumption(tables: Tables) -> str:
