@@ -125,6 +125,46 @@ def test_after_a_step_the_bias_is_as_if_it_were_a_new_part(law: str) -> None:
     assert blind.report(0).bias_sd > 3.0 * after.bias_sd, "without the detector the step is taken for drift"
 
 
+def test_a_report_right_after_a_reopening_has_the_prior_s_bias() -> None:
+    """No sample has come since: the bias is what the reopening was told, N what it was before."""
+    bank = Bank(tables_of("gx"))
+    bank.push(record("random_walk", 700, 3)[:, None])
+    before = bank.report(0)
+    bank.raw.reopen([(1, math.log(2e-4 / N), 0.0, N, 0.5, 0.02)], 1.0)
+    after = bank.report(0)
+    assert math.isclose(after.bias_mean, 0.5, rel_tol=1e-6)
+    assert after.bias_sd >= 0.02
+    noise = [one.parameters["random_walk"]["N"].median for one in (before, after)]
+    assert math.isclose(noise[0], noise[1], rel_tol=0.01)
+
+
+@pytest.mark.parametrize("size", [50.0, 400.0])
+def test_a_large_step_is_learned_as_well(size: float) -> None:
+    """In white-noise deviations: 2 and 16 deg/s. The bias afterwards is within 3 sd, and its sd is that of the record
+    without the step, within 1.3: the step is not taken for drift."""
+    y = record("random_walk", 3600, 41)
+    clean = Bank(tables_of("gx"))
+    clean.push(y[:, None])
+    y[1800:] += size * N
+    bank, found = watch(y[:, None], tables_of("gx"))
+    assert [cause for _, _, cause, _, _ in found] == ["step"] and 0.7 < found[0][3] / (size * N) < 1.1
+    now, usual = bank.report(0), clean.report(0)
+    assert now.bias_sd < 1.3 * usual.bias_sd
+    assert abs(now.bias_mean - size * N - usual.bias_mean) < 3.0 * now.bias_sd
+
+
+def test_a_second_step_soon_after_is_found_too() -> None:
+    """60 s apart. What was known of the noise before the first serves the second."""
+    y = record("constant", 3600, 42)
+    y[1800:] += 7.0 * N
+    y[1860:] += 7.0 * N
+    bank, found = watch(y[:, None], tables_of("gx"))
+    assert [cause for _, _, cause, _, _ in found] == ["step", "step"]
+    report = bank.report(0)
+    assert report.bias_sd < 0.003, "some 1.5 times N over the root of 1740 samples, and a doubt about the drift"
+    assert abs(report.bias_mean - 0.1 - 14.0 * N) < 3.0 * report.bias_sd
+
+
 def test_an_outlier_and_a_burst_are_no_step() -> None:
     """One reading 20 sigma_v off, eight of 5; and what begins on two axes at once is motion."""
     n = 2400
