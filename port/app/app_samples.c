@@ -83,11 +83,11 @@ static void handle_changes(app_t *app)
         return;
     }
     app->due_ms = app_now(app);
-#if APP_CORRECTED_MS
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        app->has_report[axis] = app->has_report[axis] && (changed >> axis & 1U) == 0U;
+        if ((changed >> axis & 1U) != 0U) {
+            app->reason[axis] = SELFCAL_REASON_NO_REPORT;
+        }
     }
-#endif
 }
 #endif
 

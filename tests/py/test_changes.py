@@ -8,6 +8,7 @@ false changes over 5000 h and the shares found are campaigns: tests/adequacy_rat
 from __future__ import annotations
 
 import math
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +21,13 @@ from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Handling, Model
 from selfcal.tables import Tables, make_tables
+from selfcal.verbs.codegen import codegen
 from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 from selfcal.wire import choices
+
+from conftest import ROOT
 
 Floats = NDArray[np.float64]
 MODEL = replace(Model.load(None), handling=Handling(6.0, steps=True, variance_changes=True))
@@ -247,6 +251,16 @@ def test_the_module_handles_a_step_and_tells_it(tmp_path: Path, target: str) -> 
     assert 0.7 * 0.2 < change["size"] < 1.2 * 0.2
     assert told["plain"]["module_says"]["change"] is None
     assert told["plain"]["bias_now"]["sd"] > 3.0 * told["handles"]["bias_now"]["sd"]
+
+
+def test_an_image_that_handles_changes_may_send_corrected_samples(tmp_path: Path) -> None:
+    """It compiles without a warning and keeps within the part: the setting meets code that no other image has."""
+    model = tmp_path / "model.yaml"
+    model.write_text(DEFAULT.read_text(encoding="utf-8") + "\nhandle: {outlier_sd: 6, steps: true}\n", encoding="utf-8")
+    codegen(model, tmp_path / "tables", target="cortex-m4f")
+    command = ["make", "-s", "-f", "port/stm32f405/stm32f405.mk", "stm32f405", f"MODEL_DIR={tmp_path / 'tables'}"]
+    subprocess.run([*command, f"OUT={tmp_path / 'image'}", "CFLAGS=-DAPP_CORRECTED_MS=100"], cwd=ROOT, check=True)
+    assert (tmp_path / "image" / "selfcal.elf").exists()
 
 
 @pytest.mark.parametrize(
