@@ -91,7 +91,9 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
     const selfcal_wide_t second = decays ? (selfcal_wide_t)parameter[SELFCAL_ALPHA].median : 1.0;
     const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0) / variance; /* rho^2 */
     watch->known = !law->coloured_noise && isfinite(square) && isfinite(second) && variance > 0.0 && second > 0.0;
-    watch->likely = likely_place(model, report);
+    if (self->changes != NULL) {
+        watch->likely = likely_place(model, report);
+    }
     watch->reason = law->coloured_noise ? SELFCAL_REASON_LAW_NOT_WATCHED : SELFCAL_REASON_OUTSIDE_PRIORS;
     if (!watch->known) {
         return;

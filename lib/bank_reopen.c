@@ -47,6 +47,11 @@ static uint16_t nearest(const selfcal_t *self, const selfcal_reopening_t *at) {
     return (uint16_t)(first + i * columns + k);
 }
 
+/* Variance of the residuals about their most likely bias. Without a sample since the last time there is none. */
+static selfcal_wide_t rest_about_bias(const selfcal_t *self, const selfcal_node_view_t *v) {
+    return fmax(v->a > 0.0 ? v->c - v->b * v->b / v->a : v->c, 0.0) / self->weight;
+}
+
 /* The bias now at the likeliest node, with its sd, unit. */
 static void bias_at(const selfcal_t *self, uint8_t axis, const selfcal_reopening_t *at, selfcal_wide_t *mean,
                     selfcal_wide_t *sd) {
@@ -58,8 +63,7 @@ static void bias_at(const selfcal_t *self, uint8_t axis, const selfcal_reopening
     selfcal_node_view_t v;
     selfcal_bank_view(self, axis, nearest(self, at), &v);
     const selfcal_wide_t sigma = (selfcal_wide_t)at->sigma_v, prior = (selfcal_wide_t)self->prior_sd[axis];
-    const selfcal_wide_t of_mean = v.a > 0.0 ? v.b * v.b / v.a : 0.0;
-    const selfcal_wide_t square = sigma > 0.0 ? sigma * sigma : fmax(v.c - of_mean, 0.0) / self->weight;
+    const selfcal_wide_t square = sigma > 0.0 ? sigma * sigma : rest_about_bias(self, &v);
     const selfcal_wide_t precision = square / (prior * prior);
     const selfcal_wide_t x0 = (v.b - selfcal_bank_from_prior(self, axis) * precision) / (v.a + precision);
     *mean = selfcal_offset(self, axis) + v.drift + x0 * v.bias_left;
@@ -76,15 +80,13 @@ static bool valid(const selfcal_t *self, const selfcal_reopening_t at[]) {
     return true;
 }
 
-/* Variance of the residuals, the bias integrated out. */
+/* The same, the bias integrated out. */
 static selfcal_wide_t rest_of(const selfcal_t *self, uint8_t axis, size_t j) {
     selfcal_node_view_t v;
     selfcal_bank_sums(self, axis, (uint16_t)j, &v);
-    if (!(v.a > 0.0)) { /* nothing since the last time */
-        return fmax(v.c, 0.0) / self->weight;
-    }
-    const selfcal_wide_t rest = fmax(v.c - v.b * v.b / v.a, 0.0) / self->weight;
-    return rest * fmax(1.0 + log(v.a) / self->weight, 0.5); /* of a handful of samples no less than that */
+    const selfcal_wide_t ln_a = v.a > 0.0 ? log(v.a) : 0.0;
+    /* of a handful of samples no less than half */
+    return rest_about_bias(self, &v) * fmax(1.0 + ln_a / self->weight, 0.5);
 }
 
 void selfcal_learned(selfcal_t *self, float learned[]) {
