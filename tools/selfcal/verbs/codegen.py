@@ -48,7 +48,7 @@ def codegen(
 
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
     is a subset of the model's. `start`: the file that `diagnose --json` wrote with the model; its posteriors become the
-    priors (warm.py). Says so on stderr if the model's gate is left out.
+    priors (warm.py). Says on stderr what of the model is left out.
     Raises UserError for a bad model file or a folder that cannot be written.
     """
     loaded = Model.load(model)
@@ -56,16 +56,15 @@ def codegen(
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     tables = warmed(tables, known)
     write_tables(loaded, tables, Path(output), target, known.of if known is not None else "")
-    if loaded.gate is not None and gate_table(loaded, tables) is None:
-        said = f"{loaded.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
-        Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
-    for said in _not_handled(loaded, tables, target):
+    for said in _left_out(loaded, tables, target):
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables
 
 
-def _not_handled(model: Model, tables: Tables, target: str) -> Iterator[str]:
-    """What of `handle` comes to nothing."""
+def _left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
+    """What of the model comes to nothing."""
+    if model.gate is not None and gate_table(model, tables) is None:
+        yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
     if tables.handling.outlier_sd and tables.block == 1:
         yield f"{model.path}: `handle.outlier_sd` does nothing: a bank interval is one sample, and it wants two or more"
     if core_of(target) in WITHOUT_FPU and (tables.handling.steps or tables.handling.variance_changes):
