@@ -29,6 +29,13 @@ Row = dict[str, Any]
 PATIENCE_S = 10.0
 
 
+def record_seeds(records: int, seed: int) -> list[int]:
+    """A seed for each record of an ensemble. Raises UserError for fewer than two, which have no scatter."""
+    if records < 2:
+        raise UserError("--records must be at least 2")
+    return [seed + 1_000_003 * k for k in range(records)]
+
+
 def spread(
     function: Callable[[Job], list[Row]],
     jobs: Sequence[Job],

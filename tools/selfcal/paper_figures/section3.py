@@ -66,9 +66,11 @@ def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
     return rows
 
 
-def ensemble(model: Model, records: int, seed: int, scheduler: str | None, results: Path | str | None) -> list[Row]:
-    """The rows of `records` records a law."""
-    jobs = [(law, seed + 1_000_003 * k) for k in range(records) for law in model.hypotheses]
+def ensemble(
+    model: Model, seeds: Sequence[int], seed: int, scheduler: str | None, results: Path | str | None
+) -> list[Row]:
+    """The rows of a record of each law and seed; `seed`: they follow from it."""
+    jobs = [(law, one) for one in seeds for law in model.hypotheses]
     settings = {"schema": "selfcal.paper/1", "model": settings_of(model), "seed": seed, "marks": MARKS}
     return spread(partial(rows_of, model), jobs, settings=settings, scheduler=scheduler, results=results)
 

@@ -24,7 +24,7 @@ from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.laws import Law, named
 from selfcal.model import Group, Model, Prior
-from selfcal.spread import Row, spread
+from selfcal.spread import Row, record_seeds, spread
 from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
 
@@ -59,8 +59,7 @@ def montecarlo(
     """
     check_writable(json)
     loaded = Model.load(model)
-    if records < 2:
-        raise UserError("--records must be at least 2")
+    seeds = record_seeds(records, seed)
     if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
         raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
     if not duration_s * loaded.bank_rate_hz <= MOST_SAMPLES:
@@ -68,7 +67,7 @@ def montecarlo(
     if loaded.regressors:
         raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)
-    jobs = [(law, seed + 1_000_003 * index) for index in range(records) for law in loaded.hypotheses]
+    jobs = [(law, one) for one in seeds for law in loaded.hypotheses]
     found = spread(
         partial(rows_of, loaded, axis, duration_s),
         jobs,

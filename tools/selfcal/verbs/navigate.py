@@ -15,11 +15,10 @@ from rich.table import Table
 from scipy import stats
 
 from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.navigation import JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
-from selfcal.spread import Row, spread
+from selfcal.spread import Row, record_seeds, spread
 from selfcal.table import TABLE_WIDTH
 from selfcal.tables import make_tables
 
@@ -69,9 +68,7 @@ def navigate(
     of the NEES of filters that are consistent. A bias has the rms of its three axes.
     """
     check_writable(json)
-    if records < 2:
-        raise UserError("--records must be at least 2")
-    seeds = [seed + 1_000_003 * k for k in range(records)]
+    seeds = record_seeds(records, seed)
     jobs = [Job(law, tuple(seeds[k : k + TOGETHER])) for law in LAWS for k in range(0, records, TOGETHER)]
     settings = {"schema": SCHEMA, "seed": seed, "records": str(records)}  # the jobs have it
     rows = spread(rows_of, jobs, settings=settings, piece=1, scheduler=scheduler, results=results)

@@ -21,6 +21,7 @@ from selfcal.model import Model
 from selfcal.output import write_text
 from selfcal.paper_figures import section3, section4
 from selfcal.paper_figures.told import Told
+from selfcal.spread import record_seeds
 
 #: Where the real recordings are looked for, beside the repository.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -46,13 +47,12 @@ def paper(
     `montecarlo`. All seeds follow from `seed`.
     """
     check_writable(output)
-    if records < 2:
-        raise UserError("--records must be at least 2")
+    seeds = record_seeds(records, seed)
     folder = DATA if data is None else Path(data)
     if data is not None and not folder.is_dir():
         raise UserError(f"--data {folder}: there is no such folder")
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
-    rows = section3.ensemble(priors, records, seed, scheduler, results)
+    rows = section3.ensemble(priors, seeds, seed, scheduler, results)
     told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

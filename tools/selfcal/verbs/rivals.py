@@ -33,7 +33,7 @@ from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import Recording, Scale, as_float, load
-from selfcal.spread import spread
+from selfcal.spread import record_seeds, spread
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
 from selfcal.verbs.montecarlo import settings_of
@@ -128,15 +128,14 @@ def ensemble(
         if rival.missing:
             note(f"left out: {rival.title}: {rival.missing}")
     chosen = [rival for rival in chosen if not rival.missing]
-    if records < 2:
-        raise UserError("--records must be at least 2")
+    seeds = record_seeds(records, seed)
     if truth not in ("middle", "prior"):
         raise UserError(f"--truth is middle or prior, not '{truth}'")
     if not all(FEWEST <= n <= MOST_ENSEMBLE for n in samples):
         raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
     if not set(loaded.hypotheses) <= set(PLAIN):
         raise UserError(f"{loaded.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
-    cells = [Cell(law, n, seed + 1_000_003 * k) for n in samples for k in range(records) for law in loaded.hypotheses]
+    cells = [Cell(law, n, one) for n in samples for one in seeds for law in loaded.hypotheses]
     rows = spread(
         partial(rows_of, loaded, axis, truth, chosen),
         cells,

@@ -20,7 +20,7 @@ from selfcal.errors import UserError, printable
 from selfcal.model import Group, Model
 from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
 from selfcal.recording import Recording, as_float, load
-from selfcal.spread import Row, spread
+from selfcal.spread import Row, record_seeds, spread
 from selfcal.tables import make_tables
 from selfcal.units import STANDARD_GRAVITY, convert, same_kind
 
@@ -82,15 +82,14 @@ def worth(
     """
     check_writable(json)
     loaded = replace(Model.load(model), regressors=(), half_life_s=0.0)
-    if records < 2:
-        raise UserError("--records must be at least 2")
+    seeds = record_seeds(records, seed)
     if logs:
         rows = [row for log in logs for row in _recorded(log, loaded, axes)]
         if not rows:
             span = RESTS_S[0] + HORIZONS_S[-1] + REFERENCE_S
             raise UserError(f"the recordings are too short: {span} s without a gap are needed; record longer")
     else:
-        jobs = [Job(law, rest, seed + 1_000_003 * k) for law in LAWS for rest in RESTS_S for k in range(records)]
+        jobs = [Job(law, rest, one) for law in LAWS for rest in RESTS_S for one in seeds]
         settings = {"schema": SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
         settings["records"] = str(records)  # the jobs' order has it
         rows = spread(
