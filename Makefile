@@ -9,6 +9,7 @@
 #   make tolerances             all that must agree, as one table; fails where a tolerance is not kept
 #   make calibration            ranks of the truth in the bank's posterior over thousands of records, every law
 #   make emulate                20 minutes of six axes through the emulated firmware
+#   make cases                  logs that went wrong, each kind on hundreds of records; half an hour
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed]
@@ -40,7 +41,7 @@ include port/boards.mk port/arm.mk
 
 .DELETE_ON_ERROR:
 .PHONY: all help setup system python lock run posix quick test hidden c-tests check clean
-.PHONY: soak tolerances emulate calibration campaigns
+.PHONY: soak tolerances emulate calibration campaigns cases
 
 all: setup
 
@@ -145,7 +146,7 @@ quick: setup
 	@$(BIN)/python tests/run.py --quick
 
 # The matrices are small: a BLAS with threads burns a core and is no faster.
-soak tolerances emulate campaigns calibration: export OPENBLAS_NUM_THREADS := 1
+soak tolerances emulate campaigns calibration cases: export OPENBLAS_NUM_THREADS := 1
 
 # What `make test` leaves out. When each last ran, and on which commit, stands in tests/long_runs.txt.
 LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
@@ -171,6 +172,11 @@ emulate: setup
 calibration: setup
 	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
 	    $(PYTEST) -s tests/py/test_calibration.py
+
+# Records of each kind of disturbed log; `make test` looks at a few.
+cases: setup
+	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
+	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt

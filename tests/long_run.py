@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RECORD = ROOT / "tests" / "long_runs.txt"
 HEAD = "# The last whole runs of what `make test` leaves out, by tests/long_run.py: name, UTC, commit, outcome.\n"
 #: Targets of the Makefile that run through here.
-NAMES = ("campaigns", "tolerances", "soak", "emulate", "calibration")
+NAMES = ("campaigns", "cases", "tolerances", "soak", "emulate", "calibration")
 
 
 @dataclass(frozen=True)

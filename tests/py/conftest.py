@@ -24,6 +24,10 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 ROOT = Path(__file__).resolve().parents[2]
 #: The recordings' licence keeps them out of this repository.
 SHARED_DATA = Path(os.environ.get("SELFCAL_DATA", ROOT.parent / "shared" / "data"))
+#: Small logs of the kinds that people report, each written by a script of its own.
+SHARED_CASES = Path(os.environ.get("SELFCAL_CASES_DIR", ROOT.parent / "shared" / "cases"))
+#: Records of each kind in `test_cases_*.py`. 0: `make test`, a few. 1: `make cases`, as many as each test wants.
+CASE_RECORDS = int(os.environ.get("SELFCAL_CASES", "0"))
 COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
 
 
@@ -53,6 +57,24 @@ def shared_recording(name: str) -> Recording:
     if not path.exists():
         pytest.skip(f"REAL DATA ABSENT: {path} (see README, 'Real recordings')")
     return load(path)
+
+
+def shared_case(name: str, folder: Path, *arguments: str) -> Path:
+    """The log of a case, written into `folder` where the case is a script, or a skip that says what is missing."""
+    path = SHARED_CASES / name
+    if not path.exists():
+        pytest.skip(f"CASES ABSENT: {path} (see tests/README.md, 'Logs that went wrong')")
+    if path.suffix != ".py":
+        return path
+    before = set(folder.iterdir())
+    subprocess.run([sys.executable, path, *arguments], cwd=folder, check=True, timeout=120)
+    (log,) = set(folder.iterdir()) - before
+    return log
+
+
+def case_records(few: int, many: int) -> int:
+    """Records of a kind: `few` in `make test`; in `make cases` `many`, or RECORDS where that is given."""
+    return few if not CASE_RECORDS else many if CASE_RECORDS == 1 else CASE_RECORDS
 
 
 def worst_difference(report: AxisResult, exact: AxisResult) -> tuple[float, float, float, float]:
