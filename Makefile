@@ -5,6 +5,8 @@
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]
 #                               effects hidden in recordings: are they named?
+#   make false-alarms [RECORDS=n] [SEED=n] [RATE=hz]
+#                               clean axes that diagnose calls inadequate, in the forms of people's logs
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             all that must agree, as one table; fails where a tolerance is not kept
 #   make calibration            ranks of the truth in the bank's posterior over thousands of records, every law
@@ -40,7 +42,7 @@ export RECORDING
 include port/boards.mk port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all help setup system python lock run posix quick test hidden c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden false-alarms c-tests check clean
 .PHONY: soak tolerances emulate calibration campaigns cases
 
 all: setup
@@ -156,6 +158,9 @@ PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdi
 hidden: setup
 	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) \
 	    $(SEED:%=--seed %) $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
+
+false-alarms: setup
+	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
 
 soak: setup
 	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
@@ -409,7 +414,7 @@ check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py
-	@cd tools && ../$(BIN)/mypy --no-error-summary $(addprefix ../tests/hidden/,generator.py judge.py rivals.py)
+	@cd tools && ../$(BIN)/mypy --no-error-summary $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:
