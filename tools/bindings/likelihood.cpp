@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstring>
+#include <memory>
 #include <stdexcept>
 #include <utility>
 #include <vector>
@@ -39,10 +40,14 @@ struct Stretch {
 constexpr Stretch stretches[] = {{1e-9, 10}, {1e-7, 6}};
 constexpr int stretch_count = 2;
 
-// Columns go through the filter side by side, so many at a time.
-constexpr int lanes = 4;
-constexpr int groups_max = columns_max / lanes;
-typedef double Lanes __attribute__((vector_size(lanes * sizeof(double))));
+// Samples that share one gain are cut into so many pieces of one length, and the pieces go through the filter side by
+// side: a chain of multiply-adds waits for its own results, and eight chains wait together.
+constexpr int width = 4, groups = 2, lanes = width * groups;
+typedef double Lanes __attribute__((vector_size(width * sizeof(double))));
+// Samples of a piece at most, and at least: shorter ones cost more to join than they save.
+constexpr std::size_t piece_most = 128, piece_least = 8;
+// States up to which the groups' chains are interleaved.
+constexpr int beside = 4;
 
 struct Input {
     const double *y, *z, *r; // z: [p, n]
@@ -63,9 +68,6 @@ struct Sums {
     double *white;   // [n, columns] or null: whitened innovations, NaN where y is missing
     double *s;       // [n] or null: variance of each innovation
 };
-
-// Sums are folded every so many samples: plain double would lose digits over 10^7.
-constexpr std::size_t fold = 256;
 
 template <int D> using Square = double[D][D];
 
@@ -169,26 +171,27 @@ template <int D> struct Jump {
     }
 };
 
-// F is block diagonal with blocks of one and two states: three diagonals hold it, and a step costs of the order of D.
-template <int D> struct Filter {
+// F is block diagonal, and a step costs of the order of D. PLAIN: F is diagonal. Else the last states are pairs, as far
+// as there are blocks of two.
+template <int D, bool PLAIN> struct Filter {
     const Input &in;
     const Sums &out;
-    const int groups;
     double h[D] = {}, below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
     double P[D][D], FK[D] = {};
     double s = 0.0, s_before = -1.0, r = -1.0, scale = 0.0, ln_now = 0.0;
     int quiet = 0, slowly[stretch_count] = {};
-    double since = 1.0;   // samples since s_before
-    std::size_t held = 0; // the gain stays until this sample
+    double since = 1.0;                 // samples since s_before
+    std::size_t held = 0;               // the gain stays until this sample
+    std::size_t even_from = 0, even_to; // samples known to be alike
     Jump<D> jumps[stretch_count];
-    Lanes x[groups_max][D] = {};
-    Lanes nu[groups_max][fold] = {}; // whitened innovations of the samples since `start`
-    std::size_t start = 0;
+    double x[columns_max][D] = {};
+    std::size_t joined = 0; // samples of a piece that `left` and `over` are for; 0: for another gain
+    double left[piece_most][D], over[D][D];
+    Lanes nu[columns_max][piece_most][groups];
     double G[columns_max][columns_max] = {}, ln_s = 0.0;
     std::size_t counted = 0;
 
-    Filter(const Input &input, const Sums &output)
-        : in(input), out(output), groups((input.columns + lanes - 1) / lanes) {
+    Filter(const Input &input, const Sums &output) : in(input), out(output), even_to(0) {
         for (int i = 0; i < D; i++) {
             h[i] = in.h[i];
             on[i] = in.F[i * D + i];
@@ -200,6 +203,8 @@ template <int D> struct Filter {
         if (in.driver >= 0 && in.n > 0)
             P[in.driver][in.driver] *= in.r[0];
     }
+
+    const double *column(int k) const { return k == 0 ? in.y : in.z + static_cast<std::size_t>(k - 1) * in.n; }
 
     // Whether the sample may be read with the last one's gain, once that has settled.
     bool alike(std::size_t i) const { return std::isfinite(in.y[i]) && in.r[i] == r; }
@@ -244,21 +249,26 @@ template <int D> struct Filter {
         since = 1.0;
         s_before = present ? s : -1.0;
         r = in.r[i];
+        joined = 0;
     }
 
-    // Whether the samples from i to `end` are alike.
-    bool even(std::size_t i, std::size_t end) const {
-        for (std::size_t j = i; j < end; j++)
-            if (!alike(j))
-                return false;
-        return true;
+    // The samples from i on that are alike, as far as `end`: each is looked at once.
+    std::size_t even(std::size_t i, std::size_t end) {
+        if (i < even_from || i > even_to || (i == even_to && !(i < in.n && alike(i)))) {
+            even_from = even_to = i;
+            if (!(i < in.n && alike(i)))
+                return i;
+        }
+        while (even_to < end && alike(even_to))
+            even_to++;
+        return std::min(even_to, end);
     }
 
     // Gain of sample i, for a stretch of alike samples where it moves slowly enough; the covariance goes beyond them.
     void gain(std::size_t i, std::size_t stop) {
         for (int k = 0; k < stretch_count; k++) {
             const std::size_t length = std::size_t{1} << stretches[k].doublings;
-            if (slowly[k] < settled_samples || stop - i < length || !even(i, i + length))
+            if (slowly[k] < settled_samples || stop - i < length || even(i, i + length) < i + length)
                 continue;
             Square<D> before;
             std::memcpy(before, P, sizeof before);
@@ -275,114 +285,210 @@ template <int D> struct Filter {
         held = i + 1;
     }
 
-    // The values of every column of a group, put where their innovations go. A missing reading is 0 and moves nothing,
-    // since its gain is 0.
-    void gather(int group, std::size_t from, std::size_t to) {
-        for (int k = 0; k < lanes && group * lanes + k < in.columns; k++) {
-            const int column = group * lanes + k;
-            const double *value = column == 0 ? in.y : in.z + static_cast<std::size_t>(column - 1) * in.n;
-            for (std::size_t i = from; i < to; i++)
-                nu[group][i - start][k] = value[i];
+    // X := F X + FK e
+    template <class T> void step(T (&X)[D], const T &e) const {
+        constexpr int paired = PLAIN ? D : D % 2; // the first state in a pair
+#pragma GCC unroll 24
+        for (int a = 0; a < paired; a++)
+            X[a] = on[a] * X[a] + FK[a] * e;
+#pragma GCC unroll 24
+        for (int a = paired; a + 1 < D; a += 2) {
+            const T first = X[a];
+            X[a] = on[a] * first + above[a] * X[a + 1] + FK[a] * e;
+            X[a + 1] = below[a + 1] * first + on[a + 1] * X[a + 1] + FK[a + 1] * e;
         }
-        if (group == 0 && !std::isfinite(in.y[from])) // alone: a stretch has none
-            nu[0][from - start][0] = 0.0;
     }
 
-    // Innovations of a group over the samples from `from` to `to`, all with one gain.
-    void advance(int group, std::size_t from, std::size_t to) {
-        gather(group, from, to);
-        Lanes X[D + 2] = {}; // a zero on either side: no edges in the loop
+    // e := value - h X
+    template <class T> void innovation(const T &value, const T (&X)[D], T &e) const {
+        T sum[4] = {value};
+#pragma GCC unroll 24
         for (int a = 0; a < D; a++)
-            X[a + 1] = x[group][a];
-        for (std::size_t i = from; i < to; i++) {
-            Lanes sum[4] = {};
-            for (int a = 0; a < D; a++)
-                sum[a % 4] += h[a] * X[a + 1];
-            const Lanes e = nu[group][i - start] - ((sum[0] + sum[1]) + (sum[2] + sum[3]));
-            nu[group][i - start] = e * scale;
-            Lanes left = {};
-            for (int a = 0; a < D; a++) {
-                const Lanes here = X[a + 1];
-                X[a + 1] = below[a] * left + on[a] * here + above[a] * X[a + 2] + FK[a] * e;
-                left = here;
-            }
-        }
-        for (int a = 0; a < D; a++) // no denormals: they cost a hundred times as much
-            for (int k = 0; k < lanes; k++)
-                x[group][a][k] = std::fabs(X[a + 1][k]) < 1e-250 ? 0.0 : X[a + 1][k];
+            sum[a % 4] -= h[a] * X[a];
+        e = (sum[0] + sum[1]) + (sum[2] + sum[3]);
     }
 
-    void flush(std::size_t end) {
-        for (int a = 0; a < in.columns; a++)
-            for (int group = 0; group <= a / lanes; group++) {
-                Lanes sum = {};
-                for (std::size_t i = 0; i < end - start; i++)
-                    sum += nu[a / lanes][i][a % lanes] * nu[group][i];
-                for (int k = 0; k < lanes && group * lanes + k <= a; k++) {
-                    G[a][group * lanes + k] += sum[k];
-                    G[group * lanes + k][a] = G[a][group * lanes + k];
-                }
+    // No denormals: they cost a hundred times as much.
+    static double plain(double value) { return std::fabs(value) < 1e-250 ? 0.0 : value; }
+
+    // One sample. A missing reading is 0 and moves nothing, since its gain is 0.
+    void one(std::size_t i) {
+        const bool present = std::isfinite(in.y[i]);
+        double e[columns_max];
+        for (int k = 0; k < in.columns; k++) {
+            const double value = k == 0 && !present ? 0.0 : column(k)[i];
+            innovation(value, x[k], e[k]);
+            step(x[k], e[k]);
+            for (int a = 0; a < D; a++)
+                x[k][a] = plain(x[k][a]);
+            e[k] *= scale;
+        }
+        if (out.white != nullptr)
+            for (int k = 0; k < in.columns; k++)
+                out.white[i * in.columns + k] = present ? e[k] : std::nan("");
+        if (present)
+            for (int a = 0; a < in.columns; a++)
+                for (int b = 0; b <= a; b++)
+                    G[a][b] += e[a] * e[b];
+    }
+
+    // How a state at the start of a piece of `length` samples acts on it, with M = F - FK h: left[i] = -h M^i on nu of
+    // sample i, over = M^length on the state at the end.
+    void join(std::size_t length) {
+        joined = length;
+        double row[D];
+        Square<D> power, next;
+        for (int a = 0; a < D; a++) {
+            row[a] = -h[a] * scale;
+            for (int b = 0; b < D; b++) {
+                power[a][b] = in.F[a * D + b] - FK[a] * h[b];
+                over[a][b] = a == b ? 1.0 : 0.0;
             }
-        start = end;
+        }
+        for (std::size_t i = 0; i < length; i++) {
+            double along = 0.0, last = 0.0;
+            for (int a = 0; a < D; a++) {
+                left[i][a] = row[a];
+                along += row[a] * FK[a];
+            }
+            for (int a = 0; a < D; a++) {
+                const double here = row[a], after = a < D - 1 ? below[a + 1] * row[a + 1] : 0.0;
+                row[a] = plain(on[a] * here + (a > 0 ? above[a - 1] : 0.0) * last + after - along * h[a]);
+                last = here;
+            }
+        }
+        for (std::size_t bits = length; bits != 0; bits >>= 1) {
+            if ((bits & 1) != 0) {
+                product<D>(power, over, next);
+                std::memcpy(over, next, sizeof over);
+            }
+            if (bits > 1) {
+                product<D>(power, power, next);
+                std::memcpy(power, next, sizeof power);
+            }
+        }
+    }
+
+    // The samples from `from` on, `lanes` pieces of `length`, all with one gain. Each piece begins with a state of 0.
+    // Its true one is known when the piece before has ended, and acts by superposition.
+    void many(std::size_t from, std::size_t length) {
+        if (joined != length)
+            join(length);
+        for (int k = 0; k < in.columns; k++) {
+            const double *value = column(k) + from;
+            Lanes X[groups][D] = {};
+            const auto read = [&](std::size_t i, int g) {
+                const double *v = value + i + static_cast<std::size_t>(g * width) * length;
+                const Lanes reading = {v[0], v[length], v[2 * length], v[3 * length]};
+                Lanes e;
+                innovation(reading, X[g], e);
+                nu[k][i][g] = e * scale;
+                step(X[g], e);
+            };
+            if (D <= beside) // all states of both groups in registers
+                for (std::size_t i = 0; i < length; i++)
+                    for (int g = 0; g < groups; g++)
+                        read(i, g);
+            else
+                for (int g = 0; g < groups; g++)
+                    for (std::size_t i = 0; i < length; i++)
+                        read(i, g);
+            Lanes begun[groups][D];
+            for (int lane = 0; lane < lanes; lane++) {
+                double next[D];
+                for (int a = 0; a < D; a++) {
+                    begun[lane / width][a][lane % width] = x[k][a];
+                    next[a] = X[lane / width][a][lane % width];
+                    for (int j = 0; j < D; j++)
+                        next[a] += over[a][j] * x[k][j];
+                }
+                for (int a = 0; a < D; a++)
+                    x[k][a] = plain(next[a]);
+            }
+            for (std::size_t i = 0; i < length; i++)
+                for (int g = 0; g < groups; g++) {
+                    Lanes sum[2] = {nu[k][i][g]};
+#pragma GCC unroll 24
+                    for (int j = 0; j < D; j++)
+                        sum[j % 2] += left[i][j] * begun[g][j];
+                    nu[k][i][g] = sum[0] + sum[1];
+                }
+        }
+        for (int a = 0; a < in.columns; a++)
+            for (int b = 0; b <= a; b++) {
+                Lanes sum[groups] = {};
+                for (std::size_t i = 0; i < length; i++)
+                    for (int g = 0; g < groups; g++)
+                        sum[g] += nu[a][i][g] * nu[b][i][g];
+                for (int lane = 0; lane < lanes; lane++)
+                    G[a][b] += sum[lane / width][lane % width];
+            }
+        if (out.white != nullptr)
+            for (int lane = 0; lane < lanes; lane++)
+                for (std::size_t i = 0; i < length; i++)
+                    for (int k = 0; k < in.columns; k++)
+                        out.white[(from + static_cast<std::size_t>(lane) * length + i) * in.columns + k] =
+                            nu[k][i][lane / width][lane % width];
+    }
+
+    // The samples from `from` to `to`, all with one gain.
+    void advance(std::size_t from, std::size_t to) {
+        while (to - from >= lanes * piece_least) {
+            const std::size_t length = std::min(piece_most, (to - from) / lanes);
+            many(from, length);
+            from += lanes * length;
+        }
+        for (; from < to; from++)
+            one(from);
+    }
+
+    void leave(std::size_t mark) const {
+        for (int a = 0; a < in.columns; a++)
+            for (int b = 0; b < in.columns; b++)
+                out.G[(mark * in.columns + a) * in.columns + b] = a >= b ? G[a][b] : G[b][a];
+        for (int k = 0; k < in.columns; k++)
+            for (int a = 0; a < D; a++)
+                out.x[(mark * in.columns + k) * D + a] = x[k][a];
+        out.D[mark] = ln_s;
+        out.counted[mark] = static_cast<double>(counted);
     }
 
     void run() {
         std::size_t mark = 0, i = 0;
         for (;;) {
-            while (mark < in.mark_count && in.marks[mark] == i) {
-                flush(i);
-                for (int a = 0; a < in.columns; a++)
-                    for (int b = 0; b < in.columns; b++)
-                        out.G[(mark * in.columns + a) * in.columns + b] = G[a][b];
-                for (int k = 0; k < in.columns; k++)
-                    for (int a = 0; a < D; a++)
-                        out.x[(mark * in.columns + k) * D + a] = x[k / lanes][a][k % lanes];
-                out.D[mark] = ln_s;
-                out.counted[mark++] = static_cast<double>(counted);
-            }
+            while (mark < in.mark_count && in.marks[mark] == i)
+                leave(mark++);
             if (i == in.n)
                 return;
             const bool present = std::isfinite(in.y[i]);
-            if (i >= held) {
-                const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
-                if (quiet >= settled_samples && alike(i))
-                    for (held = i + 1; held < stop && held < start + fold && alike(held); held++)
-                        ;
-                else
-                    gain(i, stop);
-                if (in.driver >= 0 && held < in.n)
-                    P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[held] - in.r[i]);
-            }
-            const std::size_t end = std::min(held, start + fold);
-            for (int group = 0; group < groups; group++)
-                advance(group, i, end);
-            if (out.white != nullptr)
-                for (std::size_t j = i; j < end; j++)
-                    for (int k = 0; k < in.columns; k++)
-                        out.white[j * in.columns + k] = present ? nu[k / lanes][j - start][k % lanes] : std::nan("");
-            if (!present)
-                for (int group = 0; group < groups; group++)
-                    nu[group][i - start] = Lanes{};
+            const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
+            if (quiet >= settled_samples && alike(i))
+                held = even(i, stop);
+            else
+                gain(i, stop);
+            if (in.driver >= 0 && held < in.n)
+                P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[held] - in.r[i]);
+            advance(i, held);
             if (out.s != nullptr)
-                for (std::size_t j = i; j < end; j++)
+                for (std::size_t j = i; j < held; j++)
                     out.s[j] = s;
             if (present) {
-                ln_s += ln_now * static_cast<double>(end - i);
-                counted += end - i;
+                ln_s += ln_now * static_cast<double>(held - i);
+                counted += held - i;
             }
-            i = end;
-            if (i == start + fold)
-                flush(i);
+            i = held;
         }
     }
 };
 
 // The filter of `states` states.
-template <int D> void filter(std::size_t states, const Input &in, const Sums &out) {
-    if (states == D)
-        Filter<D>(in, out).run();
+template <int D> void filter(std::size_t states, bool diagonal, const Input &in, const Sums &out) {
+    if (states == D && diagonal)
+        std::make_unique<Filter<D, true>>(in, out)->run();
+    else if (states == D)
+        std::make_unique<Filter<D, false>>(in, out)->run();
     else if constexpr (D < states_max)
-        filter<D + 1>(states, in, out);
+        filter<D + 1>(states, diagonal, in, out);
 }
 
 double *fresh(std::size_t size) { return new double[size > 0 ? size : 1]; }
@@ -405,10 +511,14 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
     for (std::size_t k = 0; k < marks.size(); k++)
         if (marks[k] > n || (k > 0 && marks[k] < marks[k - 1]))
             throw std::invalid_argument("marks must rise, up to the length of y");
+    bool diagonal = true;
     for (std::size_t a = 0; a < d; a++)
         for (std::size_t b = 0; b < d; b++)
-            if (F.data()[a * d + b] != 0.0 && (a > b + 1 || b > a + 1))
-                throw std::invalid_argument("F must be block diagonal with blocks of one or two states");
+            if (a != b && F.data()[a * d + b] != 0.0) {
+                diagonal = false;
+                if ((a + d) / 2 != (b + d) / 2) // pairs counted from the end
+                    throw std::invalid_argument("F must be diagonal, with blocks of two states at its end");
+            }
     const int c = static_cast<int>(p) + 1;
     const std::size_t m = marks.size();
     Sums out{fresh(m * c * c),
@@ -425,7 +535,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
                    h.data(), P0.data(), R,        driver, marks.data(), m};
     {
         nb::gil_scoped_release released;
-        filter<1>(d, in, out);
+        filter<1>(d, diagonal, in, out);
     }
     return nb::make_tuple(G, D, counted, x, white, s);
 }
