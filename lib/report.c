@@ -17,9 +17,10 @@ static selfcal_real_t ln_prior_density(const selfcal_prior_t *prior) {
     return prior->uniform ? -hi - r_log(-r_expm1(-width)) : -r_log(width);
 }
 
-static void finish_hypothesis(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
+static void finish_hypothesis(selfcal_work_t *work, selfcal_posterior_t *posterior) {
     if (!(work->sum.mass > 0.0)) {
-        return; /* the priors leave nothing of the likelihood */
+        work->lost = work->lost || !(work->sigma.drop[work->hypothesis] > SIGMA_DEPTH); /* else the priors exclude it */
+        return;
     }
     posterior->ln_evidence = work->top_profile + (selfcal_wide_t)work->peak + (selfcal_wide_t)work->search.best +
                              log(work->sum.mass);
@@ -53,6 +54,18 @@ static void know_nothing(const selfcal_work_t *work, selfcal_report_t *report) {
     }
 }
 
+/* Without the evidence of a law that the priors allow, no probability is right, nor is it sure that the priors exclude
+ * all laws. All estimates are flagged. */
+static void flag_all(const selfcal_model_t *model, selfcal_report_t *report) {
+    for (uint8_t h = 0; h < model->hypotheses; h++) {
+        for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
+            if (has_parameter(model->hypothesis[h].law, p)) {
+                report->hypothesis[h].parameter[p].flags |= (uint8_t)SELFCAL_OFF_GRID;
+            }
+        }
+    }
+}
+
 /* (13), and the bias over all hypotheses. */
 static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) {
     const selfcal_model_t *model = work->bank->model;
@@ -67,8 +80,13 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
         }
     }
     /* to that law too all the noise that the priors allow is as good as impossible */
+    bool lost = work->lost;
     if (work->sigma.drop[likeliest] > SIGMA_DEPTH) {
+        lost = lost || (report->hypothesis[likeliest].parameter[SELFCAL_N].flags & (unsigned)SELFCAL_OFF_GRID) != 0U;
         know_nothing(work, report);
+    }
+    if (lost) {
+        flag_all(model, report);
     }
     const selfcal_real_t about = (selfcal_real_t)report->hypothesis[likeliest].bias_mean;
     selfcal_real_t sum = R(0.0), mean = R(0.0), square = R(0.0);

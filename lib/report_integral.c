@@ -44,8 +44,9 @@ void selfcal_integral_begin(selfcal_work_t *work) {
     work->row = 0;
     work->sum.rows = (uint8_t)selfcal_cells_in(work, 1);
     work->sum.mass = work->sum.mass_sq = 0.0;
-    /* then all of the mass counts as off the grid */
-    work->sum.off_grid = too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0;
+    /* Then all of the mass counts as off the grid. So it does where no row of the last pass is as high as the best. */
+    const bool missed = work->sum.range_lo[SELFCAL_N] > work->sum.range_hi[SELFCAL_N];
+    work->sum.off_grid = missed || too_coarse(work) ? (selfcal_wide_t)INFINITY : 0.0;
     memset(work->sum.first, 0, sizeof work->sum.first);
     memset(work->sum.second, 0, sizeof work->sum.second);
     for (int which = 0; which < 2; which++) {
@@ -59,7 +60,7 @@ void selfcal_integral_begin(selfcal_work_t *work) {
         const selfcal_prior_t *prior = &prior_of(work)[p];
         work->sum.range_lo[p] = r_fmax(work->sum.range_lo[p], (selfcal_real_t)prior->ln_min);
         work->sum.range_hi[p] = r_fmin(work->sum.range_hi[p], (selfcal_real_t)prior->ln_max);
-        /* the last pass found no row as high as the best before: the priors cut nearly all */
+        /* the law lacks it, or no row is as high as the best before */
         if (!(work->sum.range_lo[p] <= work->sum.range_hi[p])) {
             work->sum.range_lo[p] = (selfcal_real_t)prior->ln_min;
             work->sum.range_hi[p] = (selfcal_real_t)prior->ln_max;

@@ -13,6 +13,9 @@
  * Else it grows there. */
 #define SHRINK R(0.7)
 #define GROWTH R(0.5)
+/* A row is looked for where the row before it was. Its peak may lie beyond, by many widths of a long record's. Then the
+ * range must outgrow its loss at the other end. */
+#define GROWTH_TO_PEAK R(2.0)
 #define PASSES_MAX 12U
 
 #define SAMPLES SELFCAL_SEARCH_SAMPLES
@@ -21,21 +24,27 @@ static selfcal_real_t sample_at(const selfcal_range_t *range, unsigned i) {
     return r_fma((range->hi - range->lo) / (selfcal_real_t)SAMPLES, (selfcal_real_t)i + R(0.5), range->lo);
 }
 
-/* The next range after a pass; false: it stays. */
+/* The next range after a pass; false: it stays. `open`: the peak may lie beyond it, until an inner sample is the
+ * highest. The highest sample always counts: another row may have been higher by an error of the splines. */
 static bool next_range(selfcal_range_t *range, const selfcal_real_t height[SAMPLES], selfcal_real_t least,
-                       const selfcal_range_t *limit) {
-    unsigned first = 0, last = SAMPLES - 1U;
-    while (first < last && !(height[first] > least)) {
+                       const selfcal_range_t *limit, bool *open) {
+    unsigned top = 0, first = 0, last = SAMPLES - 1U;
+    for (unsigned i = 1; i < SAMPLES; i++) {
+        top = height[i] > height[top] ? i : top;
+    }
+    while (first < top && !(height[first] > least)) {
         first++;
     }
-    while (last > first && !(height[last] > least)) {
+    while (last > top && !(height[last] > least)) {
         last--;
     }
+    *open = *open && (top == 0U || top == SAMPLES - 1U);
     const selfcal_real_t whole = range->hi - range->lo, step = whole / (selfcal_real_t)SAMPLES;
-    const selfcal_real_t lo =
-        r_fmax(first == 0U ? range->lo - GROWTH * whole : sample_at(range, first) - step, limit->lo);
+    const selfcal_real_t below = (*open && top == 0U ? GROWTH_TO_PEAK : GROWTH) * whole,
+        above = (*open && top > 0U ? GROWTH_TO_PEAK : GROWTH) * whole;
+    const selfcal_real_t lo = r_fmax(first == 0U ? range->lo - below : sample_at(range, first) - step, limit->lo);
     const selfcal_real_t hi =
-        r_fmin(last == SAMPLES - 1U ? range->hi + GROWTH * whole : sample_at(range, last) + step, limit->hi);
+        r_fmin(last == SAMPLES - 1U ? range->hi + above : sample_at(range, last) + step, limit->hi);
     if (!(lo < range->lo || hi > range->hi || hi - lo < SHRINK * whole)) {
         return false;
     }
@@ -53,6 +62,9 @@ static selfcal_real_t height_at(selfcal_work_t *work, selfcal_real_t ln_rho) {
     selfcal_cells_parameters(work, &cell, ln_value);
     const reach_t reach = selfcal_cells_reach(work, ln_value, half);
     const selfcal_real_t height = cell.profile - reach.drop;
+    if (work->search.best == (selfcal_real_t)-INFINITY) {
+        work->sigma.drop[work->hypothesis] = reach.drop; /* until a cell counts: whether the priors exclude it */
+    }
     if (work->stage == SEARCH && height > work->search.best) {
         work->search.best = height;
         work->sigma.drop[work->hypothesis] = reach.drop;
@@ -103,7 +115,7 @@ static bool find_row(selfcal_work_t *work) {
     }
     work->search.row_best = best;
     selfcal_range_t next = *range;
-    if (next_range(&next, height, best - work->search.depth, &limit) && work->at < PASSES_MAX) {
+    if (next_range(&next, height, best - work->search.depth, &limit, &work->search.open) && work->at < PASSES_MAX) {
         *range = next;
         return false;
     }
@@ -130,6 +142,7 @@ static bool find_row(selfcal_work_t *work) {
 static void widen_row(selfcal_work_t *work) {
     selfcal_range_t *range = &work->search.range[0];
     const selfcal_real_t more = R(0.5) * (range->hi - range->lo);
+    work->search.open = true;
     range->lo = r_fmax(range->lo - more, work->search.limit_lo[0]);
     range->hi = r_fmin(range->hi + more, work->search.limit_hi[0]);
 }
@@ -176,6 +189,7 @@ bool selfcal_search_step(selfcal_work_t *work) {
         if (work->search.pass == 0U) {
             work->search.range[0].lo = work->search.limit_lo[0]; /* nothing is known yet: a row may have two peaks */
             work->search.range[0].hi = work->search.limit_hi[0];
+            work->search.open = false;
         } else {
             widen_row(work);
         }
@@ -198,9 +212,10 @@ bool selfcal_search_step(selfcal_work_t *work) {
     }
     const selfcal_range_t limit = {work->search.limit_lo[1], work->search.limit_hi[1]};
     const selfcal_range_t before = *range;
+    bool open = false;
     /* After the last pass the range stays what the rows found belong to. */
     if (rows && work->search.pass < PASSES_MAX &&
-        next_range(range, work->scratch.grid.height, work->search.best - work->search.depth, &limit)) {
+        next_range(range, work->scratch.grid.height, work->search.best - work->search.depth, &limit, &open)) {
         work->search.pass++;
         /* It does not grow again beyond a row that did not count. */
         work->search.limit_lo[1] = range->lo > before.lo ? range->lo : work->search.limit_lo[1];

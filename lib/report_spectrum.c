@@ -30,6 +30,8 @@
 /* A float's digits of those nats, over the 0.01. */
 #define FAR_EVEN R(2e-4)
 
+/* Half of ln 0.1. */
+#define HALF_LN_LEAST R(-1.1512925)
 /* Lines are so far apart in ln omega, as far as there are so many. */
 #define LINE_STEP R(0.45)
 
@@ -148,8 +150,25 @@ void selfcal_spectrum_solve(selfcal_work_t *work) {
     truth->fitted = true;
 }
 
+/* A node that sees less than a tenth of the variance expected shows that the process is supposed too slow: lines cannot
+ * take off so much. Its pole is moved up, its drift at high frequencies kept. So a random walk may stand for a drift
+ * that is none, where no other node lies near enough to the drift. */
+static bool too_slow(const selfcal_work_t *work, const expectation_t *e, selfcal_real_t scatter) {
+    return (selfcal_wide_t)scatter - e->ln_sigma - work->ln_sigma_off < (selfcal_wide_t)HALF_LN_LEAST &&
+        work->truth.rate < R(0.5);
+}
+
+static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t scatter, expectation_t *e) {
+    while (too_slow(work, e, scatter)) {
+        work->truth.rate += work->truth.rate;
+        work->truth.variance *= R(0.5);
+        selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), e);
+    }
+}
+
 /* First the best node of all, for the process that made the data; then every node. Its row is its variance over the
- * expected one, less the best node's, by lines and edges of their prior deviations. */
+ * expected one, less the best node's, by lines and edges of their prior deviations. All begins anew where the process
+ * was too slow. */
 void selfcal_spectrum_step(selfcal_work_t *work) {
     selfcal_truth_t *truth = &work->truth;
     const uint16_t at = work->at++, k = at == 0U ? work->best_node : (uint16_t)(at - 1U);
@@ -158,18 +177,22 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
     if (!has_expectation(work)) {
         return;
     }
-    if (at == 0U) {
+    if (!(truth->rate > R(0.0))) {
         set_truth(work, place);
     }
+    const selfcal_real_t scatter = work->scratch.fit.scatter[k];
     expectation_t e;
     selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), &e);
     /* What the priors of bias and coefficients add is no function of psi. */
-    const selfcal_wide_t off = (selfcal_wide_t)work->scratch.fit.scatter[k] - e.ln_sigma;
+    const selfcal_wide_t off = (selfcal_wide_t)scatter - e.ln_sigma;
     if (at == 0U) {
         work->ln_sigma_off = off;
         truth->ln_v = e.ln_v; /* any that is near will do */
         truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)e.ln_v > WIDE_BEYOND;
         set_lines(work);
+    } else if (too_slow(work, &e, scatter)) {
+        speed_up(work, place, scatter, &e);
+        work->at = 0;
     } else {
         add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off),
                 work->field[0][work->best_node] - work->field[0][k]);

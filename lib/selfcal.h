@@ -495,6 +495,8 @@ enum {
      * wrong by more than 0.05 nat (evidence), 0.05 sd (mean) or 3 % (sd).
      * The second condition is a conservative bound. It grows with the length of the record, with scattered gaps, and
      * with changes of rate. Without a Gauss-Markov law in the model it does not see a record that no random walk makes.
+     * Set for all laws if the report lost one between the nodes: its ln_evidence is -INFINITY, its estimates are NaN,
+     * and no probability is right. Without the flag an ln_evidence of -INFINITY means that the priors exclude the law.
      * Remedy: more nodes in the model file. */
     SELFCAL_OFF_GRID = 8
 };

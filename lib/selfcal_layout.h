@@ -332,6 +332,7 @@ typedef struct {
 #define SELFCAL_SEARCH_SAMPLES 8 /* of one search pass */
 typedef struct {
     uint8_t pass;
+    bool open; /* the peak of the row in hand may lie beyond its range */
     selfcal_real_t limit_lo[2], limit_hi[2]; /* permitted by the priors: (ln rho, ln alpha) */
     selfcal_range_t range[2];                /* of these the row in hand, and the rows */
     uint8_t least[2];                        /* cells that its peak needs */
@@ -363,6 +364,7 @@ struct selfcal_work {
     uint16_t first_node;
     uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
     uint32_t batches; /* of the bank, when the sums came to rest */
+    bool lost;        /* a law that the priors allow has ended without an evidence */
     bool gathered;    /* the nodes run over the last batch: samples from now on come later than the report */
     uint8_t mask, unknowns;               /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
