@@ -149,7 +149,7 @@ class View:
         self._title = title
         self._total_s = total_s
         self._contact = contact
-        self._contacts = contacts or {}
+        self._contacts = {} if contacts is None else contacts
         self._axes = axes
         self._names = names
         self._advice = advice
@@ -334,7 +334,8 @@ class View:
 
 def counted(s: Statistics) -> str:
     """What became of the frames of one stream."""
-    return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused"
+    foreign = f", {s.foreign} of another wire version" if s.foreign else ""
+    return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 
 
 def frame_counts(streams: Streams | Decoder, source: Source) -> str:
