@@ -378,7 +378,9 @@ class Decoder:
         """
         if self._other is None or self._ours:
             return ""
-        older = "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        older = (
+            "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        )
         return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
 
     @property
