@@ -89,17 +89,16 @@ static bool batch_is_sound(const selfcal_t *self, const selfcal_batch_t *batch) 
     return true;
 }
 
-/* Weight of the samples: one each, or less where they are forgotten. */
+/* Weight of the samples: one each, or less where they are forgotten or selfcal_reopen() has kept a part. */
 static bool weight_is_sound(const selfcal_t *self) {
-    if (self->model->handling != NULL) {
-        return self->weight <= (selfcal_wide_t)self->n; /* selfcal_reopen() */
+    if (self->model->forgetting == NULL && (self->keep != 1.0 || self->beginning != 1.0)) {
+        return false; /* there is no code that fades */
     }
-    if (self->model->forgetting != NULL) {
+    if (self->model->forgetting != NULL || self->model->handling != NULL) {
         /* nothing to forget yet */
         return self->weight <= (selfcal_wide_t)self->n && (self->n > 0U || self->keep == 1.0);
     }
-    return self->keep == 1.0 && self->beginning == 1.0 && self->weight < 9e15 &&
-        (uint32_t)(uint64_t)self->weight == self->n;
+    return self->weight < 9e15 && (uint32_t)(uint64_t)self->weight == self->n;
 }
 
 /* One batch is gathered and never full: then it is handed over. The other waits for the nodes or is empty. */

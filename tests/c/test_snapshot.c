@@ -508,6 +508,138 @@ static void hostile_contents_are_refused_or_harmless(void) {
     TEST_ASSERT_TRUE(refusals > end / 3U);
 }
 
+/* The optional parts that a model may name, each with what it adds to a bank's state. */
+typedef struct {
+    const char *name;
+    const selfcal_handling_t *handling;
+    const selfcal_regressors_t *regressors;
+    const selfcal_forgetting_t *forgetting;
+} parts_t;
+
+enum { COLUMNS = 2 };
+static const float reference[COLUMNS] = {0.0F, 25.0F}, coefficient_sd[COLUMNS] = {1e-3F, 1e-2F};
+static const float ln_odds[COLUMNS] = {0.0F, -1.0F};
+static const selfcal_handling_t handles = {6.0F, true, true}, keeps_outliers_out = {6.0F, false, false};
+static const selfcal_regressors_t regressors = {
+    .code = &selfcal_regressors_code,
+    .count = COLUMNS,
+    .reference = reference,
+    .coefficient_sd = coefficient_sd,
+    .ln_odds = ln_odds,
+};
+static const selfcal_forgetting_t forgets = {&selfcal_forgetting_code, 4.0F * SELFCAL_BATCH};
+static const parts_t optional_parts[] = {
+    {"handling", &handles, NULL, NULL},
+    {"regressors", NULL, &regressors, NULL},
+    {"forgetting", NULL, NULL, &forgets},
+    {"handling and forgetting", &handles, NULL, &forgets},
+    {"outliers, regressors and forgetting", &keeps_outliers_out, &regressors, &forgets},
+};
+
+/* The model's adequacy and its changes beside the bank: they are no part of a snapshot, and watch the bank from the
+ * moment of its return. */
+static selfcal_adequacy_t adequacy;
+static selfcal_changes_t changes;
+static float learned[SELFCAL_MODEL_NODES];
+
+static void begin_watch(const bank_t *of) {
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_adequacy_init(&adequacy, &of->self));
+    if (model.handling != NULL && model.handling->steps) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_changes_init(&changes, &adequacy, &of->self, learned));
+    }
+}
+
+/* Samples and a gap through every optional part. */
+static void run_parts(bank_t *to, uint32_t from, uint32_t until) {
+    for (uint32_t i = from; i < until; i++) {
+        const float sample[1] = {0.25F + 0.02F * noise(i)}, values[COLUMNS] = {(float)i, 25.0F + 0.01F * (float)i};
+        const float *columns = model.regressors != NULL ? values : NULL;
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push_with(&to->self, sample, columns));
+        selfcal_adequacy_push(&adequacy, &to->self, NULL, columns);
+        if (adequacy.changes != NULL) {
+            (void)selfcal_changes_handle(&adequacy, &to->self);
+        }
+        if (i % 23U == 11U) {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_skip(&to->self, 2U * BLOCK));
+        }
+    }
+}
+
+/* What follows upon a restore: samples, a view of the sums and, where the model handles steps, a new bias. */
+static void use_parts(bank_t *of) {
+    begin_watch(of);
+    run_parts(of, 0, (SELFCAL_BATCH + 4U) * BLOCK);
+    selfcal_node_view_t view;
+    if (selfcal_node(&of->self, 0, (uint16_t)(model.nodes - 1U), &view) == SELFCAL_OK && model.handling != NULL &&
+        model.regressors == NULL) {
+        const selfcal_reopening_t at[1] = {{.hypothesis = 1}};
+        (void)selfcal_reopen(&of->self, at, 0.5F, NULL);
+        run_parts(of, 0, 2U * BLOCK);
+    }
+}
+
+/* Each word of the image in turn, a member or a part of one, becomes one half, no number, the least and the greatest
+ * integer, the greatest float, 2^1023. */
+static void hostile_members_of_every_optional_part_are_refused_or_harmless(void) {
+    static const uint32_t hostile[] = {0x3FE00000U, 0x7FC00000U, 0U, 0xFFFFFFFFU, 0x7F7FFFFFU, 0x7FE00000U};
+    for (size_t k = 0; k < sizeof optional_parts / sizeof optional_parts[0]; k++) {
+        model = selfcal_model;
+        model.block = BLOCK;
+        model.dt_s = 1.0F;
+        make_small();
+        model.handling = optional_parts[k].handling;
+        model.regressors = optional_parts[k].regressors;
+        model.forgetting = optional_parts[k].forgetting;
+        begin(&bank);
+        begin_watch(&bank);
+        run_parts(&bank, 0, (3U * SELFCAL_BATCH + 5U) * BLOCK + 1U);
+        TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
+        TEST_ASSERT_EQUAL(SELFCAL_OK, restore(&other, &saved));
+        use_parts(&other);
+        uint32_t refusals = 0U, trials = 0U;
+        for (size_t at = OFFSET_N; at + 8U <= saved.length; at += 4U) {
+            for (size_t h = 0; h < sizeof hostile / sizeof hostile[0]; h++) {
+                again = saved;
+                for (unsigned i = 0; i < 4U; i++) {
+                    again.bytes[at + i] = (uint8_t)(hostile[h] >> (8U * i));
+                }
+                mend_crc(&again);
+                trials++;
+                const selfcal_status_t status = restore(&other, &again);
+                if (status == SELFCAL_OK) {
+                    use_parts(&other);
+                } else {
+                    TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_CORRUPT, status, optional_parts[k].name);
+                    refusals++;
+                }
+            }
+        }
+        TEST_ASSERT_TRUE_MESSAGE(trials > 2000U && refusals > trials / 4U, optional_parts[k].name);
+    }
+}
+
+/* A model that forgets nothing has no code that fades: sums of which a part is kept are not its own. */
+static void a_part_kept_without_forgetting_is_refused(void) {
+    for (size_t k = 0; k < sizeof optional_parts / sizeof optional_parts[0]; k++) {
+        model = selfcal_model;
+        model.block = BLOCK;
+        model.dt_s = 1.0F;
+        make_small();
+        model.handling = optional_parts[k].handling;
+        model.regressors = optional_parts[k].regressors;
+        model.forgetting = optional_parts[k].forgetting;
+        const selfcal_status_t expected = model.forgetting != NULL ? SELFCAL_OK : SELFCAL_CORRUPT;
+        begin(&bank);
+        begin_watch(&bank);
+        run_parts(&bank, 0, (3U * SELFCAL_BATCH + 5U) * BLOCK + 1U);
+        bank.self.keep = 0.75;
+        TEST_ASSERT_EQUAL_MESSAGE(expected, selfcal_check(&bank.self), optional_parts[k].name);
+        bank.self.keep = 1.0;
+        bank.self.beginning = 0.75;
+        TEST_ASSERT_EQUAL_MESSAGE(expected, selfcal_check(&bank.self), optional_parts[k].name);
+    }
+}
+
 static void a_corrupt_bank_is_not_saved(void) {
     begin_small_pair();
     gathered(&bank)->count = SELFCAL_BATCH;
@@ -530,6 +662,8 @@ int main(void) {
     RUN_TEST(a_write_that_fails_ends_the_save);
     RUN_TEST(contents_that_no_bank_can_have_are_refused);
     RUN_TEST(hostile_contents_are_refused_or_harmless);
+    RUN_TEST(hostile_members_of_every_optional_part_are_refused_or_harmless);
+    RUN_TEST(a_part_kept_without_forgetting_is_refused);
     RUN_TEST(a_corrupt_bank_is_not_saved);
     return UNITY_END();
 }

@@ -145,7 +145,7 @@ def test_a_serial_line_has_one_reader() -> None:
         (["--channel", "x", "--plot", "x.gif"], "a plot is one of"),
         (["--channel", "x", "--log", "frames.db"], ".asc, .blf, .csv, .log, .trc"),
         (["--channel", "x", "--duration", "0"], "--duration"),
-        (["--interface", "virtual", "--channel", "x", "--log", "/no-such-folder/frames.asc"], "cannot write"),
+        (["--interface", "virtual", "--channel", "x", "--log", "/no-such-folder/frames.asc"], "cannot be written"),
     ],
 )
 def test_user_errors_are_one_line(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal import units
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.plot import save_picture
 
 #: The model's colour, and that of what does not fit.
@@ -42,8 +42,9 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
     outside = [name for name, axis in axes.items() if not axis["adequate"]]
     recording = document["recording"]
     verdict = f"not adequate: {', '.join(outside)}" if outside else "every axis is adequate"
+    name = printable(Path(recording["path"]).name)
     figure.suptitle(
-        f"{Path(recording['path']).name}, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s: {verdict}",
+        f"{name}, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s: {verdict}",
         fontweight="bold",
         color=OUTSIDE if outside else "black",
         parse_math=False,

@@ -6,7 +6,6 @@ Sizes are read before the arrays are, and no code of a file runs: there is no pi
 from __future__ import annotations
 
 import bz2
-import io
 import json
 import lzma
 import math
@@ -23,7 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.errors import UserError, short
-from selfcal.limits import BLOCK_BYTES, MOST_COLUMNS, MOST_META_BYTES, MOST_R_OBJECTS, MOST_UNPACKED_BYTES, reading
+from selfcal.limits import (
+    BLOCK_BYTES,
+    MOST_COLUMNS,
+    MOST_GROWTH,
+    MOST_META_BYTES,
+    MOST_R_OBJECTS,
+    MOST_UNPACKED_BYTES,
+    MOST_UNPACKED_SMALL,
+    reading,
+)
 
 
 @dataclass(frozen=True)
@@ -124,50 +132,121 @@ def _npz_meta(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> st
 # ------------------------------------------------------------------------------------------------------------ MATLAB
 
 
-#: MATLAB's classes of numbers.
-_MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)")
-_MAT_HEADER, _MAT_PACKED = 128, 15
+#: Of a file of version 5 to 7: its header, the kinds of its elements, and the flags of an array.
+_MAT_HEADER, _MAT_ARRAY, _MAT_PACKED, _MAT_COMPLEX, _MAT_LOGICAL, _MAT_CHAR = 128, 14, 15, 0x800, 0x200, 4
+#: Types of numbers by their class, by the kind of the element that holds them, and by the digit of version 4.
+_MAT_CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
+_MAT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_MAT_TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16-{}", 16: "utf-8", 17: "utf-16-{}", 18: "utf-32-{}"}
+_MAT4_TYPES = ("f8", "f4", "i4", "i2", "u2", "u1")
+
+#: Variables of a MATLAB file: arrays of numbers, and the text `meta`. Others are left out.
+_Variables = Iterator[tuple[str, "str | NDArray[Any]"]]
 
 
 def mat(path: Path) -> Members:
     """The vectors of a MATLAB file of version 4 to 7, and the columns of its matrices; a text `meta` is JSON."""
-    from scipy.io import loadmat, whosmat
-
     data = _content(path)
     if data.startswith(b"MATLAB 7.3") or data[512:516] == b"\x89HDF":
         raise UserError(f"{path}: MATLAB's format 7.3 is not read: save it with  save FILE -v7")
+    order = None if 0 in data[:4] else {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    arrays: dict[str, NDArray[Any]] = {}
+    meta = ""
     with reading(path, "not a whole MATLAB file"):
-        file = io.BytesIO(_unpacked(path, data))
-        listed = whosmat(file)
-        names = [name for name, _, _ in listed]
-        for name in names:
-            if names.count(name) > 1:
+        for name, value in _mat4(data) if order is None else _mat5(_unpacked(path, data, order), order):
+            if name in arrays or (name == "meta" and meta):
                 raise UserError(f"{path}: variable '{short(name)}' appears twice")
-        wanted = [name for name, _, kind in listed if _MAT_NUMBERS.fullmatch(kind)]
-        described = [(name, shape) for name, shape, kind in listed if name == "meta" and kind == "char"]
-        if any(math.prod(shape) > MOST_META_BYTES for _, shape in described):
+            if isinstance(value, str):
+                meta = value
+            else:
+                arrays[name] = value
+        if len(meta) > MOST_META_BYTES:
             raise UserError(f"{path}: meta: larger than {MOST_META_BYTES} characters")
-        file.seek(0)
-        found = loadmat(file, variable_names=[*wanted, *(name for name, _ in described)])
-        arrays = {name: np.asarray(found[name]) for name in wanted}
-        meta = "".join(found["meta"].ravel()) if described else ""
     return _members(path, arrays), parse_meta(path, meta) if meta else {}
 
 
-def _unpacked(path: Path, data: bytes) -> bytes:
+def _mat4(data: bytes) -> _Variables:
+    """Of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
+    at = 0
+    while at < len(data):
+        order = "<" if 0 <= struct.unpack_from("<i", data, at)[0] < 5000 else ">"
+        kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
+        place = kind // 10 % 10
+        if not 0 <= kind < 5000 or min(rows, columns, length) < 0 or place >= len(_MAT4_TYPES):
+            raise ValueError("a variable's header is none")
+        name = bytes(_piece(data, at + 20, length)).rstrip(b"\0").decode("latin-1")
+        dtype = np.dtype(order + _MAT4_TYPES[place])
+        size = rows * columns * dtype.itemsize
+        values = np.frombuffer(_piece(data, at + 20 + length, size), dtype).reshape((rows, columns), order="F")
+        at += 20 + length + size * (2 if imaginary else 1)
+        if kind % 10 == 0:
+            yield name, values.astype(np.complex128 if imaginary else dtype.newbyteorder("="), copy=False)
+        elif kind % 10 == 1 and name == "meta":
+            yield name, "".join(map(chr, values.astype("u2").ravel()))
+
+
+def _mat5(data: memoryview, order: str) -> _Variables:
+    """Of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
+    at = _MAT_HEADER
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        body = _piece(data, at + 8, size)
+        at += 8 + size
+        if kind == _MAT_ARRAY and size:
+            yield from _array(body, order)
+
+
+def _array(body: memoryview, order: str) -> _Variables:
+    """The variable of an array's element, if it is one of numbers, or `meta`."""
+    flags, at = _element(body, 0, order)[1:]
+    flag = struct.unpack_from(f"{order}I", flags)[0]
+    of = flag & 0xFF
+    if flag & _MAT_LOGICAL or (of != _MAT_CHAR and of not in _MAT_CLASSES):  # other classes have other parts
+        return
+    extents, at = _element(body, at, order)[1:]
+    letters, at = _element(body, at, order)[1:]
+    kind, content, _ = _element(body, at, order)
+    name = bytes(letters).decode("latin-1")
+    if of == _MAT_CHAR:
+        if name == "meta":
+            yield name, bytes(content).decode(_MAT_TEXTS[kind].format({"<": "le", ">": "be"}[order]))
+        return
+    if kind not in _MAT_KINDS:
+        raise ValueError(f"numbers of a kind {kind} that there is not")
+    values = np.frombuffer(content, order + _MAT_KINDS[kind])
+    shape = np.frombuffer(extents, f"{order}i4").tolist()
+    if min(shape, default=0) < 0 or math.prod(shape) != values.size:
+        raise ValueError("its length and its shape differ")
+    whole = np.complex128 if flag & _MAT_COMPLEX else np.dtype(_MAT_CLASSES[of])
+    yield name, values.astype(whole, copy=False).reshape(shape, order="F")
+
+
+def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
+    """Kind and content of the element at a place, and the place behind it. Small ones have both in eight bytes."""
+    kind = struct.unpack_from(f"{order}I", data, at)[0]
+    if kind >> 16:
+        return kind & 0xFFFF, _piece(data, at + 4, kind >> 16), at + 8
+    size = struct.unpack_from(f"{order}I", data, at + 4)[0]
+    return kind, _piece(data, at + 8, size), at + 8 + size + -size % 8
+
+
+def _piece(data: memoryview | bytes, at: int, size: int) -> memoryview:
+    if not 0 <= size <= len(data) - at:
+        raise EOFError("it is cut off")
+    return memoryview(data)[at : at + size]
+
+
+def _unpacked(path: Path, data: bytes, order: str) -> memoryview:
     """A MATLAB file with its packed variables unpacked, so that its size is known before it is read."""
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:  # version 4 packs nothing
-        return data
-    parts, size, at = [data[:_MAT_HEADER]], _MAT_HEADER, _MAT_HEADER
+    parts, size, at, most = [data[:_MAT_HEADER]], _MAT_HEADER, _MAT_HEADER, _room(data)
     while at + 8 <= len(data):
         kind, length = struct.unpack_from(f"{order}II", data, at)
         part = data[at : at + 8 + length]
         if kind == _MAT_PACKED:
-            part = _inflated(path, zlib.decompressobj(), part[8:], MOST_UNPACKED_BYTES - size)
+            part = _inflated(path, zlib.decompressobj(), part[8:], most, size)
         parts.append(part)
         size, at = size + len(part), at + 8 + length
-    return _bounded(path, b"".join(parts))
+    return memoryview(_bounded(path, b"".join(parts), most))
 
 
 def _content(path: Path) -> bytes:
@@ -177,20 +256,26 @@ def _content(path: Path) -> bytes:
         while (block := stream.read(BLOCK_BYTES)) and size <= MOST_UNPACKED_BYTES:
             blocks.append(block)
             size += len(block)
-    return _bounded(path, b"".join(blocks))
+    return _bounded(path, b"".join(blocks), MOST_UNPACKED_BYTES)
 
 
-def _inflated(path: Path, inflater: Any, data: bytes, room: int) -> bytes:
-    """`data` unpacked into at most `room` bytes. Raises UserError, EOFError and what `inflater` raises."""
-    unpacked: bytes = inflater.decompress(data, max(room, 0) + 1)
-    if len(unpacked) <= room and not inflater.eof:
+def _room(data: bytes) -> int:
+    """Bytes that a whole file may unpack to."""
+    return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
+
+
+def _inflated(path: Path, inflater: Any, data: bytes, most: int, before: int = 0) -> bytes:
+    """`data` unpacked; with the bytes `before` it makes at most `most`. Raises UserError, EOFError and what `inflater`
+    raises."""
+    unpacked: bytes = inflater.decompress(data, max(most - before, 0) + 1)
+    if before + len(unpacked) <= most and not inflater.eof:
         raise EOFError("it is cut off")
-    return _bounded(path, unpacked, room)
+    return _bounded(path, unpacked, most, before)
 
 
-def _bounded(path: Path, data: bytes, most: int | None = None) -> bytes:
-    if len(data) > (MOST_UNPACKED_BYTES if most is None else most):
-        raise UserError(f"{path}: it unpacks to more than {MOST_UNPACKED_BYTES >> 20} MiB: write it as .csv or .npz")
+def _bounded(path: Path, data: bytes, most: int, before: int = 0) -> bytes:
+    if before + len(data) > most:
+        raise UserError(f"{path}: it unpacks to more than {most >> 20} MiB: write it as .csv or .npz")
     return data
 
 
@@ -227,12 +312,13 @@ def r_data(path: Path) -> Members:
     Columns are called by their names, NAME:1, NAME:2, ... where a matrix has none; `Gyro. X` of an `imu` is gx.
     """
     with reading(path, "not a whole R file"):
-        data = _r_unpacked(path, _content(path))
+        packed = _content(path)
+        data = _r_unpacked(path, packed)
         for magic in (b"RDX2\n", b"RDX3\n"):
             data = data.removeprefix(magic)
         if not data.startswith(b"X\n"):
             raise UserError(f"{path}: not an R file in R's binary form: write it with save() or saveRDS(), ascii=FALSE")
-        root = _r_parse(path, memoryview(data)[2:])
+        root = _r_parse(path, memoryview(data)[2:], _room(packed) // 8)
         members: dict[str, Member] = {}
         meta: dict[str, Any] = {}
         objects = list(_r_pairs(root)) if root.info.type.name == "LIST" else [("x", root)]
@@ -248,12 +334,13 @@ def _r_unpacked(path: Path, data: bytes) -> bytes:
         (b"\xfd7zXZ", lambda: lzma.LZMADecompressor(memlimit=MOST_UNPACKED_BYTES)),
     ):
         if data.startswith(magic):
-            return _inflated(path, inflater(), data, MOST_UNPACKED_BYTES)
+            return _inflated(path, inflater(), data, _room(data))
     return data
 
 
-def _r_parse(path: Path, data: memoryview) -> Any:
-    """The tree of an R file, of no more objects than MOST_R_OBJECTS."""
+def _r_parse(path: Path, data: memoryview, room: int) -> Any:
+    """The tree of an R file, of no more objects than MOST_R_OBJECTS. `room`: numbers of all its sequences together,
+    which take no bytes of the file."""
     from rdata.parser import DEFAULT_ALTREP_MAP
     from rdata.parser._xdr import ParserXDR
 
@@ -276,8 +363,10 @@ def _r_parse(path: Path, data: memoryview) -> Any:
             raise UserError(f"{path}: it holds R functions: save the data alone")
 
     def sequence(state: Any) -> Any:
-        if not 0 <= state.value[0] <= MOST_UNPACKED_BYTES / 16:
-            raise UserError(f"{path}: a sequence of {state.value[0]:g} numbers")
+        nonlocal room
+        if not 0 <= state.value[0] <= room:
+            raise UserError(f"{path}: a sequence of {state.value[0]:g} numbers: save the numbers themselves")
+        room -= int(state.value[0])
         return DEFAULT_ALTREP_MAP[b"compact_realseq"](state)
 
     known = {name: made for name, made in DEFAULT_ALTREP_MAP.items() if name != b"deferred_string"}

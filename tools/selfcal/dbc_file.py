@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from selfcal.errors import remark
 from selfcal.units import parameter_unit
 
 PATTERN = Path(__file__).parent / "frames.dbc"
@@ -167,8 +168,8 @@ def _coefficients(names: Names, reading: str) -> Callable[[Signal], Signal | Non
         if int(match[1]) >= len(names.columns):
             return None
         name, of = names.columns[int(match[1])]
-        unit = f"{reading}/{of}" if of and match[2] != "probability" else ""
-        comment = signal.comment.replace(f"column {match[1]}", f"column {name}")
+        unit = f"{reading}/{remark(of)}" if of and match[2] != "probability" else ""
+        comment = signal.comment.replace(f"column {match[1]}", f"column {remark(name)}")
         return replace(signal, name=f"{symbols[int(match[1])]}_{match[2]}", unit=unit, comment=comment)
 
     return change
@@ -225,7 +226,9 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
         add("GX_ADEQUACY", offset("GX_ADEQUACY") + at, f"{big}_ADEQUACY", same, comment)
         for k, hypothesis in enumerate(names.hypotheses):
             comment = patterns["GX_H0"].comment.replace("gx", axis)
-            comment = comment.replace("hypothesis 0", f"hypothesis {k}{f', {hypothesis}' if names.known else ''}")
+            comment = comment.replace(
+                "hypothesis 0", f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
+            )
             where = offset("GX_H0") + HYPOTHESES * at + k
             add("GX_H0", where, f"{big}_{small[k].upper()}", _hypothesis(names, k, unit), comment)
     return "\n".join(_text([line.replace("MODULE", sender) for line in head], messages, whole, sender))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 import sys
 
@@ -19,6 +20,15 @@ def printable(text: str) -> str:
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii") for letter in text
     )
+
+
+def remark(text: str) -> str:
+    """`text` from outside, for a comment in an output: one line that ends no comment and no text of any form.
+
+    The forms are `#` to the line's end, `/* */`, `<!-- -->` and a DBC file's `"..."`.
+    """
+    apart = re.sub(r"\*(?=/)|/(?=\*)|-(?=-)", r"\g<0> ", printable(text))
+    return apart.replace('"', "'")
 
 
 def short(text: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal import units
-from selfcal.errors import UserError
+from selfcal.errors import UserError, remark
 from selfcal.output import write_text
 from selfcal.overbound import overbound, upper_limit
 
@@ -135,11 +135,10 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
 def _head(comment: str, gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     written = f"overbound {gyro.level:g}" if gyro.bounded else "medians"
     lines = [
-        f"Made by `selfcal identify --export` from {Path(recording['path']).name}: {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s.",
+        f"Made by `selfcal identify --export` from {remark(Path(recording['path']).name)}: "
+        f"{recording['rate_hz']:g} Hz, {recording['duration_s']:g} s.",
         f"Written: {written}. Continuous time, two-sided densities.",
-        *gyro.notes,
-        *accel.notes,
+        *map(remark, (*gyro.notes, *accel.notes)),
     ]
     return "".join(f"{comment} {line}".strip() + "\n" for line in lines)
 

@@ -1,14 +1,15 @@
-"""Logs of frames, as python-can's loggers write them: read back as if the module sent them now."""
+"""Logs of frames: written by python-can's loggers, and read back as if the module sent them now."""
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from selfcal.errors import UserError
 
@@ -23,6 +24,73 @@ BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL"), struct.Struct("<4s4xLL")
 BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
 #: Bytes that a container may unpack to; python-can and Vector write 128 KB.
 BLF_CONTAINER_MAX = 16 << 20
+
+#: s that a frame may wait on its way to the disk: what a killed monitor loses.
+FLUSH_S = 1.0
+
+#: A line of `candump` without -l, and the first line of the CSV files of GVRET and SavvyCAN.
+CANDUMP = re.compile(
+    r"\s*(?:\((?P<time>[^)]*)\)\s+)?\w+\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+"
+    r"\[(?P<length>\d+)\](?P<data>\s+remote request|(?:\s+[0-9A-F]{2})*)\s*(?:'.*'?)?\s*"
+)
+GVRET = "Time Stamp,ID,Extended,"
+
+
+class FrameWriter:
+    """A new log of frames; its name's suffix chooses python-can's format. An older log is never written over.
+
+    What a kill leaves is a log up to FLUSH_S before.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        import can
+
+        self.path = Path(path)
+        check_suffix(path)
+        try:
+            if self.path.is_file() and self.path.stat().st_size:
+                raise UserError(f"{path}: this log exists, and is not written over: delete it or give another name")
+            self._writer = cast(Any, can.Logger(str(path)))
+            self._writer.file.flush()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._flushed = time.monotonic()
+        self._due = False
+
+    def write(self, frame: can.Message) -> None:
+        """Add a frame. Raises UserError where the disk is full."""
+        self._do(lambda: self._writer(frame))
+        self._due = True
+
+    def keep(self) -> None:
+        """Bring the frames to the file once FLUSH_S has passed. To be called from time to time."""
+        if self._due and time.monotonic() - self._flushed >= FLUSH_S:
+            self._flushed, self._due = time.monotonic(), False
+            self._do(self._flush)
+
+    def _flush(self) -> None:
+        block = getattr(self._writer, "_flush", None)  # python-can gathers 128 KB of a .blf
+        if block is not None:
+            block()
+        self._writer.file.flush()
+
+    def _do(self, what: Callable[[], None]) -> None:
+        try:
+            what()
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def __enter__(self) -> FrameWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._do(self._writer.stop)
+
+
+def check_suffix(path: Path | str) -> None:
+    """Raise UserError for a name that chooses no format."""
+    if Path(path).suffix.lower() not in WRITTEN:
+        raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
 
 
 class FrameLog:
@@ -42,15 +110,14 @@ class FrameLog:
         self._waiting: can.Message | None = None
         self._due: float | None = None
         self._last_s = math.nan  # time stamp of the frame before
-        if self.path.suffix.lower() not in WRITTEN:
-            raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
+        check_suffix(path)
         if not self.path.is_file():
             missing = "there is no such file" if not self.path.exists() else "this is no file"
             raise UserError(f"{path}: cannot read the frame log: {missing}")
         if self.path.suffix.lower() == ".blf":
             _check_blf(self.path)
         try:
-            self._reader = can.LogReader(self.path)
+            self._reader: Any = _foreign_reader(self.path) or can.LogReader(self.path)
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = next(self._frames, None)
         except Exception as error:  # python-can's readers raise what they stumble over
@@ -77,6 +144,8 @@ class FrameLog:
         except Exception as error:
             self._waiting, self.damage = None, _said(error)
         self.closed = self._waiting is None
+        if self.closed and not self.damage and _is_cut(self.path):
+            self.damage = "its last line is cut off"
         return frame
 
     def _wait(self, stamp_s: float) -> float:
@@ -98,6 +167,83 @@ class FrameLog:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _is_cut(path: Path) -> bool:
+    """Whether a log of lines ends amid one: python-can may take the half of a frame for one, or pass it by."""
+    with path.open("rb") as file:
+        if path.suffix.lower() == ".blf" or not file.seek(0, 2):
+            return False
+        file.seek(-1, 2)
+        return file.read(1) not in b"\r\n"
+
+
+class _Lines:
+    """A reader of one frame a line, as python-can's are used. Raises ValueError for a line that is none."""
+
+    def __init__(self, path: Path, frame: Callable[[str], can.Message], skip: int) -> None:
+        self._file: TextIO = path.open(encoding="ascii", errors="replace")
+        self._frame = frame
+        self._skip = skip
+
+    def __iter__(self) -> Iterator[can.Message]:
+        for number, line in enumerate(self._file, start=1):
+            if number > self._skip and line.strip():
+                try:
+                    yield self._frame(line)
+                except (ValueError, IndexError) as error:
+                    raise ValueError(f"line {number} is no frame: {line.strip()[:60]}") from error
+
+    def stop(self) -> None:
+        self._file.close()
+
+
+def _foreign_reader(path: Path) -> _Lines | None:
+    """A reader for forms that python-can's readers of this suffix do not take; None for theirs."""
+    with path.open("rb") as file:
+        first = file.readline(200).decode("ascii", "replace")
+    if path.suffix.lower() == ".csv" and first.startswith(GVRET):
+        return _Lines(path, _of_gvret, skip=1)
+    if path.suffix.lower() == ".log" and CANDUMP.fullmatch(first):
+        return _Lines(path, _of_candump, skip=0)
+    return None
+
+
+def _of_candump(line: str) -> can.Message:
+    """A frame of a line such as ` (1700000000.000000)  can0  200   [8]  C0 27 09 00 00 80 B5 88`."""
+    match = CANDUMP.fullmatch(line)
+    if match is None:
+        raise ValueError
+    return _message(match["time"] or "", match["id"], len(match["id"]) > 3, int(match["length"]), match["data"].split())
+
+
+def _of_gvret(line: str) -> can.Message:
+    """A frame of a line such as `1000,00000200,false,Rx,0,8,04,00,00,00,41,80,B5,0E,`; its time is in us."""
+    time_us, identifier, extended, _, _, length, *data = line.strip().split(",")
+    frame = _message(time_us, identifier, extended == "true", int(length), data[: int(length)])
+    frame.timestamp *= 1e-6
+    return frame
+
+
+def _message(stamp: str, identifier: str, extended: bool, length: int, data: list[str]) -> can.Message:
+    import can
+
+    try:
+        time_s = float(stamp)
+    except ValueError:  # candump -tA writes a date
+        time_s = 0.0
+    remote = data == ["remote", "request"]
+    if not remote and len(data) != length:
+        raise ValueError
+    return can.Message(
+        timestamp=time_s,
+        arbitration_id=int(identifier, 16),
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        dlc=length,
+        data=None if remote else bytes(int(byte, 16) for byte in data),
+        check=True,
+    )
 
 
 def _check_blf(path: Path) -> None:

@@ -149,7 +149,7 @@ class View:
         self._title = title
         self._total_s = total_s
         self._contact = contact
-        self._contacts = contacts or {}
+        self._contacts = {} if contacts is None else contacts
         self._axes = axes
         self._names = names
         self._advice = advice
@@ -221,6 +221,8 @@ class View:
             return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
         lines = self._status(module, width)
         lines.append(self._counts(module))
+        if module.decoder.statistics.foreign:
+            lines.append(_line(Text("items of the status that state another wire version are left out", "yellow")))
         advice = self._advice(module.decoder.status)
         if advice:
             lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
@@ -334,7 +336,8 @@ class View:
 
 def counted(s: Statistics) -> str:
     """What became of the frames of one stream."""
-    return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused"
+    foreign = f", {s.foreign} foreign" if s.foreign else ""
+    return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 
 
 def frame_counts(streams: Streams | Decoder, source: Source) -> str:

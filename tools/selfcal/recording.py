@@ -33,7 +33,7 @@ from selfcal.limits import (
     read_text,
     reading,
 )
-from selfcal.output import whole
+from selfcal.output import together, whole
 from selfcal.sampling import Ambiguous, sampling
 from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
 from selfcal.text_table import TextTable
@@ -184,14 +184,12 @@ def save(
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])
     names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
-    with ExitStack() as files:
-        beside = None if meta is None else files.enter_context(whole(meta_place(path)))
-        table = files.enter_context(whole(path))
+    with together(path, meta_place(path)) as (table, beside):
         np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
-        if beside is not None:
+        if meta is None:
+            beside.unlink()
+        else:
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
-        # Both are written. From here to the renaming, first of the table, no meta stands beside another's table.
-        meta_place(path).unlink(missing_ok=True)
 
 
 def _save_npz(

@@ -10,9 +10,15 @@ import hashlib
 import importlib.util
 import json
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import partial
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -75,18 +81,54 @@ def _piece(function: Callable[[Job], list[Row]], work: tuple[int, list[Job]]) ->
 
 
 def _obedient() -> None:
-    """A worker ends when its pool does, without a word; Ctrl-C is the command's own."""
+    """A worker ends with its command, however that ends. Ctrl-C is the command's own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+    threading.Thread(target=_end_with_the_command, daemon=True).start()
+
+
+def _end_with_the_command() -> None:
+    command = multiprocessing.parent_process()
+    if command is not None:
+        wait([command.sentinel])
+        os._exit(1)
+
+
+@contextmanager
+def workers(count: int | None = None) -> Iterator[ProcessPoolExecutor]:
+    """Processes that work for this one; `count`: one for each processor by default.
+
+    A worker that is killed ends the work that waits for it with BrokenProcessPool. Leaving the block by an exception
+    ends the workers at once.
+    """
+    others = multiprocessing.active_children()
+    pool = ProcessPoolExecutor(count, initializer=_obedient)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in multiprocessing.active_children():
+            if worker not in others:
+                worker.terminate()
+        raise
+    finally:
+        pool.shutdown()
 
 
 def _here(
     function: Callable[[Job], list[Row]], waiting: Sequence[tuple[int, list[Job]]]
 ) -> Iterator[tuple[int, list[Row]]]:
-    if waiting:
-        with multiprocessing.Pool(initializer=_obedient) as pool:
-            yield from pool.imap_unordered(partial(_piece, function), waiting)
+    if not waiting:
+        return
+    try:
+        with workers() as pool:
+            for future in as_completed([pool.submit(_piece, function, work) for work in waiting]):
+                yield future.result()
+    except BrokenProcessPool as error:
+        raise UserError(
+            "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
+        ) from error
 
 
 def _cluster(
@@ -94,22 +136,25 @@ def _cluster(
 ) -> Iterator[tuple[int, list[Row]]]:
     if importlib.util.find_spec("distributed") is None:
         raise UserError("--scheduler needs dask.distributed: make setup-cluster")
-    from distributed import Client, as_completed
+    import distributed
 
     try:
-        client: Any = Client(scheduler, timeout=PATIENCE_S)
-    except (OSError, ValueError, TimeoutError) as error:
+        client: Any = distributed.Client(scheduler, timeout=PATIENCE_S)
+    except Exception as error:  # each kind of address has errors of its own
         raise UserError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({first_line(error)}): start one with `dask scheduler`"
         ) from error
     with client:
         futures = client.map(partial(_piece, function), waiting, pure=False)
-        for _, answer in as_completed(futures, with_results=True):
+        for _, answer in distributed.as_completed(futures, with_results=True):
             yield answer
 
 
 class Store:
-    """A folder of finished pieces, each a Parquet file that is whole or absent."""
+    """A folder of finished pieces, each a Parquet file that is whole or absent.
+
+    A table gives every row every column. `selfcal.keys` of its metadata has the keys of each row, in their order.
+    """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         if importlib.util.find_spec("pyarrow") is None:
@@ -138,7 +183,11 @@ class Store:
         made = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
         if made.get("selfcal.settings") != self.key:
             raise UserError(f"{place}: is of other settings: give --results another folder")
-        return table.to_pylist() if made.get("selfcal.jobs") == str(jobs) else None
+        if made.get("selfcal.jobs") != str(jobs) or "selfcal.keys" not in made:
+            return None
+        keys = json.loads(made["selfcal.keys"])
+        rows = zip(table.to_pylist(), keys["rows"], strict=True)
+        return [{name: row[name] for name in keys["kinds"][kind]} for row, kind in rows]
 
     def write(self, k: int, jobs: int, rows: Sequence[Row]) -> None:
         """Keep the rows of piece `k`."""
@@ -146,7 +195,11 @@ class Store:
         from pyarrow import parquet
 
         names = dict.fromkeys(name for row in rows for name in row)
+        kinds = list(dict.fromkeys(tuple(row) for row in rows))
+        keys = {"kinds": kinds, "rows": [kinds.index(tuple(row)) for row in rows]}
         table = pyarrow.table({name: [row.get(name) for row in rows] for name in names})
-        table = table.replace_schema_metadata({"selfcal.settings": self.key, "selfcal.jobs": str(jobs)})
+        table = table.replace_schema_metadata(
+            {"selfcal.settings": self.key, "selfcal.jobs": str(jobs), "selfcal.keys": json.dumps(keys)}
+        )
         with whole(self.place(k)) as temporary:
             parquet.write_table(table, temporary)

@@ -133,10 +133,14 @@ class _Reader:
 
     def number(self, tree: Mapping[str, Any], key: str, where: str, low: float = -math.inf) -> float:
         value = tree.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= low:
+        try:
+            number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        except OverflowError:  # an integer of hundreds of digits
+            number = math.inf
+        if not math.isfinite(number) or number <= low:
             above = "" if low == -math.inf else f" above {low:g}"
             raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {shown(value)}")
-        return float(value)
+        return number
 
     def start(self) -> Start:
         tree = self.tree()
@@ -193,10 +197,11 @@ class _Reader:
             of_law = self.mapping(laws, law, f"{where}.parameters.")
             if set(of_law) != set(self.model.laws[law].parameters):
                 raise self.fail(inside, f"must have {', '.join(self.model.laws[law].parameters)}")
+            entries = {name: self.mapping(of_law, name, f"{inside}.") for name in of_law if of_law[name] is not None}
             limits[law] = {
-                name: self.limits(self.mapping(of_law, name, f"{inside}."), f"{inside}.{name}", name, axis, factor)
-                for name in of_law
-                if of_law[name] is not None and of_law[name].get("identified") is True
+                name: self.limits(one, f"{inside}.{name}", name, axis, factor)
+                for name, one in entries.items()
+                if one.get("identified") is True
             }
         coefficients, odds = self.regressors(posterior.get("regressors") or {}, f"{where}.regressors", factor)
         return AxisStart(limits, coefficients, odds)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.dbc_file import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 from selfcal.errors import UserError
@@ -41,6 +41,7 @@ LEAST_EVIDENCE = -(2**31) * 0.001
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
+FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
 RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
 
 
@@ -154,12 +155,14 @@ class Statistics:
 
     `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
     them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
+    `foreign` stated another version of the wire.
     """
 
     received: int = 0
     lost: int = 0
     damaged: int = 0
     refused: int = 0
+    foreign: int = 0
 
 
 @dataclass(frozen=True)
@@ -363,21 +366,27 @@ class Decoder:
         self._sent = 0  # frames sent since then, as far as known
         self._run: list[int] = []  # counters of good frames refused in a row
         self._open: _Open | None = None
-        self._foreign_ends = False  # a status of another version has come to its end
+        self._other: float | None = None  # version that the status under way states, if it is another
+        self._others = 0  # whole statuses in a row that state it
+        self._ours = False  # a status has stated this tool's version
 
     @property
     def foreign(self) -> str:
-        """What is wrong if the module speaks another version of the wire; empty if it does not."""
-        told = self.status.get("wire_version", VERSION)
-        if told == VERSION:
+        """What is wrong if the module speaks another version of the wire; empty if it does not.
+
+        A module that has spoken this one has to state another in FOREIGN_STATUSES whole statuses in a row.
+        """
+        if self._other is None or self._ours:
             return ""
-        older = "load the firmware of this release into it" if told < VERSION else "take the tools of its release"
-        return f"the module speaks wire version {told:.0f}, this tool reads version {VERSION}: {older}"
+        older = (
+            "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        )
+        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
 
     @property
     def surely_foreign(self) -> bool:
-        """A whole status has said so, no lone frame."""
-        return bool(self.foreign) and self._foreign_ends
+        """Whole statuses in a row have stated so, no lone frame."""
+        return bool(self.foreign) and self._others >= FOREIGN_STATUSES
 
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take one frame; return the reports that it closes (none, one or two)."""
@@ -449,15 +458,23 @@ class Decoder:
 
     def _take_status(self, values: Mapping[str, float]) -> None:
         """Take an item of the status. Of another version nothing is believed but the version."""
-        if values.get("wire_version", VERSION) != VERSION:
-            self.status = dict(values)
-            self._open = None
-            self._foreign_ends = False
-        elif not self.foreign or "wire_version" in values:
-            self.status.update(values)
+        version = values.get("wire_version")
+        if version == VERSION:
+            self._other, self._others, self._ours = None, 0, True
+        elif version is not None:
+            self.statistics.foreign += 1
+            self._others = self._others if version == self._other else 0
+            self._other = version
         if "frames_sent" in values:
             self._exact(int(values["frames_sent"]))
-            self._foreign_ends = bool(self.foreign)
+            self._others += self._other is not None
+            self._ours = self._ours and self._others < FOREIGN_STATUSES
+        if self.foreign:
+            self.status = {"wire_version": cast(float, self._other)}
+            self._open = None
+        elif version in (None, VERSION):
+            self.status.update(values)
+        if "frames_sent" in values:
             self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
@@ -640,6 +657,7 @@ class Streams:
         for node, decoder in list(self.decoders.items()):
             one = decoder.statistics
             total.damaged += one.damaged
+            total.foreign += one.foreign
             if node in known:
                 total.received, total.lost = total.received + one.received, total.lost + one.lost
                 total.refused += one.refused
@@ -776,6 +794,7 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
     except Exception as error:  # python-can's drivers raise what the libraries below them raise
         raise UserError(f"{interface} {channel}: {_reason(interface, channel, error)}") from error
     if isinstance(bus, slcanBus):
+        _leave_out_line_feeds(bus.serialPortOrig)
         bus.serialPortOrig.write_timeout = WRITE_S
         try:
             bus.serialPortOrig.exclusive = True
@@ -789,6 +808,17 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
         with socket.socket(fileno=os.dup(bus.fileno())) as same:
             same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER)
     return bus
+
+
+def _leave_out_line_feeds(port: Any) -> None:
+    """Lines end in CR. Some adapters send CR LF, and python-can takes the LF for the next line's first letter."""
+    read = port.read
+
+    def without(size: int = 1) -> bytes:
+        data: bytes = read(size)
+        return b"" if data == b"\n" else data
+
+    port.read = without
 
 
 def _check_port(interface: str, channel: str) -> None:

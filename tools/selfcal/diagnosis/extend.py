@@ -14,6 +14,7 @@ import yaml
 from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
+from selfcal.errors import remark
 from selfcal.laws import RATIO_LIMITS
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
@@ -288,5 +289,5 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
 
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:
     """The file's text."""
-    head = f"# Written by `selfcal diagnose` from {Path(source).name}: the model with what was found in it.\n"
+    head = f"# Written by `selfcal diagnose` from {remark(Path(source).name)}: the model with what was found in it.\n"
     return head + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))

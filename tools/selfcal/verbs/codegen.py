@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, remark
 from selfcal.model import NOT_HANDLED, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
@@ -124,7 +124,7 @@ def _config(model: Model, tables: Tables, target: str) -> str:
     defined = [f"{name} {size}" for name, size in sizes(tables, target).items()]
     defined += ["FIXED"] if core_of(target) in WITHOUT_FPU else []
     macros = "".join(f"#ifndef SELFCAL_{one.split()[0]}\n#define SELFCAL_{one}\n#endif\n" for one in defined)
-    return f"""/* Made by `selfcal codegen` from the model '{model.name}' for {target}. Do not edit.
+    return f"""/* Made by `selfcal codegen` from the model '{remark(model.name)}' for {target}. Do not edit.
  * The compiler's command line may set any of these. lib/selfcal.h says what each is. */
 #ifndef SELFCAL_CONFIG_H
 #define SELFCAL_CONFIG_H
@@ -136,8 +136,8 @@ def _config(model: Model, tables: Tables, target: str) -> str:
 
 def _header(model: Model, tables: Tables, start: str) -> str:
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
-    measured = f"\n * Priors of {start}, as `selfcal diagnose` measured them." if start else ""
-    return f"""/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit.{measured} */
+    measured = f"\n * Priors of {remark(start)}, as `selfcal diagnose` measured them." if start else ""
+    return f"""/* Made by `selfcal codegen` from the model '{remark(model.name)}'. Do not edit.{measured} */
 #ifndef SELFCAL_MODEL_H
 #define SELFCAL_MODEL_H
 
@@ -205,7 +205,7 @@ def _units(tables: Tables) -> str:
 def _source(model: Model, tables: Tables) -> str:
     sizes = sorted({grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid})
     grids = {grid.nodes: grid for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid}
-    parts = [f"/* Made by `selfcal codegen` from the model '{model.name}'. Do not edit. */"]
+    parts = [f"/* Made by `selfcal codegen` from the model '{remark(model.name)}'. Do not edit. */"]
     parts += ["#include <math.h>", "", '#include "selfcal_model.h"', ""]
     same = '#error "selfcal_model.h is of another run of codegen than this file"'
     parts += [f"#if SELFCAL_MODEL_ID != 0x{tables.id:08X}UL", same, "#endif", ""]

@@ -18,7 +18,7 @@ from selfcal.dbc_file import NODES, Names
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError
-from selfcal.framelog import WRITTEN, FrameLog
+from selfcal.framelog import FrameLog, FrameWriter, check_suffix
 from selfcal.known_models import KnownModels
 from selfcal.live import SILENT_S, Contact, View
 from selfcal.plot import check_picture, plot_run
@@ -81,17 +81,16 @@ def monitor(
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
 
-    Several modules of a bus are shown one below the other; `node`: that one alone. `model`: file of a model beside the
-    default one, for the names of what a module sends; `start`: the diagnosis that its priors are from.
-    A port that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played;
-    default: as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
-    python-can's format. `bitrate` of the CAN bus, bit/s, where the interface needs one. `json`: the last complete
-    reports as a document `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules
-    a document `selfcal.modules/1` that holds one for each. `plot`: the picture of the run; of several modules one each,
-    whose name ends in the node. Raises UserError for what the user can put right.
+    Several modules of a bus are shown one below the other; `node`: that one alone. `model`: file of a model beside
+    the default one, for the names of what a module sends; `start`: the diagnosis that its priors are from. A port
+    that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played; default:
+    as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
+    python-can's format, and an older one is not written over. `bitrate` of the CAN bus, bit/s, where the interface
+    needs one. `json`: the last complete reports as a document `selfcal.identify/1` in telemetry's units, without
+    checks, with the `node`; of several modules a document `selfcal.modules/1` that holds one for each. `plot`: the
+    picture of the run; of several modules one each, whose name ends in the node. Raises UserError for what the user
+    can put right.
     """
-    import can
-
     if (channel is None) == (read is None):
         raise UserError(
             f"which module? --channel names its port ({serial_ports()}), or --read a log of its frames: one of the two"
@@ -102,8 +101,8 @@ def monitor(
         raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     if speed is not None and (read is None or not 0.0 < speed < math.inf):
         raise UserError("--speed is above 0, and goes with --read")
-    if log is not None and Path(log).suffix.lower() not in WRITTEN:
-        raise UserError(f"{log}: the name of a frame log ends in {', '.join(WRITTEN)}")
+    if log is not None:
+        check_suffix(log)
     if duration is not None and not duration > 0.0:
         raise UserError(f"--duration must be above 0 s, not {duration:g}")
     if plot is not None:
@@ -124,12 +123,7 @@ def monitor(
             source = stack.enter_context(open_bus(interface, channel, **options))
             contact, title = Contact(), f"{interface} {channel}"
         end = math.inf if duration is None else time.monotonic() + duration
-        logger = None
-        if log is not None:
-            try:
-                logger = stack.enter_context(can.Logger(str(log)))
-            except OSError as error:
-                raise UserError(f"{log}: cannot write: {error.strerror}") from error
+        writer = None if log is None else stack.enter_context(FrameWriter(log))
         opened = time.monotonic()
         view = View(
             streams,
@@ -144,6 +138,8 @@ def monitor(
         try:
             with view:
                 while not ending.asked and (left := end - time.monotonic()) > 0.0:
+                    if writer is not None:
+                        writer.keep()
                     if source.closed:
                         if once or not isinstance(source, Link):
                             break
@@ -161,8 +157,8 @@ def monitor(
                             cast(Link, source).open_again()  # a module that has restarted waits for that
                             opened = time.monotonic()
                         continue
-                    if logger is not None:
-                        logger(frame)
+                    if writer is not None:
+                        writer.write(frame)
                     if streams.known and all(one.surely_foreign for one in streams.known.values()):
                         break
                     view.show(reports)

@@ -6,14 +6,13 @@ With a recording, one table an axis. With a number of records instead, the same 
 from __future__ import annotations
 
 import math
-import multiprocessing
 import resource
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, replace
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import Recording, Scale, as_float, load
-from selfcal.spread import record_seeds, spread
+from selfcal.spread import record_seeds, spread, workers
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
 from selfcal.verbs.montecarlo import settings_of
@@ -210,22 +209,17 @@ def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
     """One method in a process of its own: its answer, its seconds of CPU, and its memory beyond the program's."""
     if rival.missing:
         return {"title": rival.title, "error": rival.missing}
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_alone, args=(rival, problem, sender))
-    process.start()
-    sender.close()
     try:
-        found: dict[str, Any] = receiver.recv()
-    except EOFError:
+        with workers(1) as pool:
+            found = pool.submit(_alone, rival, problem).result()
+    except BrokenProcessPool:
         found = {"error": "it ended without an answer"}
-    process.join()
     if "answer" in found:
         found |= entry_of(found.pop("answer"), problem.group.unit, unit)
     return {"title": rival.title, **found}
 
 
-def _alone(rival: Rival, problem: Problem, sender: Connection) -> None:
+def _alone(rival: Rival, problem: Problem) -> dict[str, Any]:
     try:
         function = rival.load()
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -233,10 +227,10 @@ def _alone(rival: Rival, problem: Problem, sender: Connection) -> None:
         answer = function(problem)
         seconds = time.process_time() - start
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-        unit_bytes = 1 if sys.platform == "darwin" else 1024
-        sender.send({"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes})
     except Exception as error:  # whatever another's library raises is the answer for this record
-        sender.send({"error": first_line(error)})
+        return {"error": first_line(error)}
+    unit_bytes = 1 if sys.platform == "darwin" else 1024
+    return {"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes}
 
 
 def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
