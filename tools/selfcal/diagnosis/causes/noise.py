@@ -19,6 +19,8 @@ EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
 #: instead of 1350 / e gained 2.5 nats.
 LN_FLICKER = -1.5
 LN_OUTLIERS = -1.5
+#: Outliers are exceptions: a look that takes more of the samples for them has another cause.
+OUTLIERS_MOST = 0.05
 
 
 def ln_changes(n: int, gain: float) -> float:
@@ -202,7 +204,7 @@ def outliers(state: State, record: Record) -> list[Look]:
     gain = value - float(plain)
     worth = net(gain, 2, LN_OUTLIERS)
     picked = np.flatnonzero(present)[weight > 0.5]
-    if worth < 1.0 or not picked.size:
+    if worth < 1.0 or not 0 < picked.size <= OUTLIERS_MOST * n:
         return []
     # Several in a row are no outliers: motion, or a change of the noise.
     alone = np.ones(picked.size, bool)
