@@ -17,6 +17,7 @@ from scipy.special import log_ndtr, ndtr, ndtri_exp
 from selfcal.lattice import Lattice, lattice_of
 from selfcal.model import Group
 from selfcal.recording import Column, Recording
+from selfcal.sampling import rate_change
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,10 +25,8 @@ Rows = NDArray[np.int64]
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
 CLOCK_LEAST = 1e-3
-#: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
-STEPS, PIECES = 20, 100
-#: Share from which on the intervals alone show a change of rate: 1.5 %.
-RATE_LEAST = 0.015
+#: Pieces on either side of a change, and standard deviations of their slopes that it takes.
+SLOPES, SLOPES_LEAST = 10, 8.0
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 0.5, 3e-3
 #: Runs of equal readings that show held ones at least.
@@ -153,56 +152,12 @@ def evened(recording: Recording) -> tuple[Recording, RateChange | None]:
     if off is None or off.size < 60:
         return recording, None
     time = recording.time_s + off
-    found = _large_change(time) or _small_change(time, recording)
+    found = rate_change(time) or _small_change(time, recording)
     if found is None:
         return recording, None
     row, before_s, after_s, nats = found
     change = RateChange(float(time[row] - time[0]), 1.0 / before_s, 1.0 / after_s, nats)
     return _regridded(recording, time, row, before_s, after_s), change
-
-
-def _large_change(time: Array) -> tuple[int, float, float, float] | None:
-    """Row, intervals (s) before and after, and evidence of a change that the intervals of pieces show."""
-    n = time.size
-    size = max(3 * STEPS, n // PIECES)
-    if n < 6 * size:
-        return None
-    steps = (time[STEPS:] - time[:-STEPS]) / STEPS
-    count = steps.size // size
-    pieces = np.median(steps[: count * size].reshape(count, size), axis=1)
-    value = np.log(np.maximum(pieces, 1e-300))
-    total, square = np.cumsum(value), np.cumsum(value**2)
-    k = np.arange(2, count - 1)
-    left = square[k - 1] - total[k - 1] ** 2 / k
-    right = square[-1] - square[k - 1] - (total[-1] - total[k - 1]) ** 2 / (count - k)
-    at = int(k[np.argmin(left + right)])
-    # The piece with the change in it belongs to neither side.
-    sides = (value[: at - 1] if at > 2 else value[:at], value[at + 1 :] if count - at > 2 else value[at:])
-    middles = [float(np.median(side)) for side in sides]
-    apart = abs(middles[1] - middles[0])
-    scatter = max(float(np.quantile(np.abs(side - middle), 0.9)) for side, middle in zip(sides, middles, strict=True))
-    if apart < RATE_LEAST or apart < 6.0 * scatter:
-        return None
-    first, last = max(0, (at - 2) * size), min(n - 1, (at + 2) * size + STEPS)
-    before, after = math.exp(middles[0]), math.exp(middles[1])
-    rows = np.arange(first, last + 1)
-    # The bend: farthest from the chord between the two rates.
-    line = np.cumsum(np.diff(time[rows], prepend=time[first]) - 0.5 * (before + after))
-    row = int(rows[np.argmax(line) if before > after else np.argmin(line)])
-    intervals = [float(np.median(np.diff(part))) for part in (time[: row + 1], time[row:])]
-    exact = [
-        one if abs(math.log(max(one, 1e-300)) - middle) < 0.01 else math.exp(middle)
-        for one, middle in zip(intervals, middles, strict=True)
-    ]
-    means = [_mean_step(part, one) for part, one in zip((time[: row + 1], time[row:]), exact, strict=True)]
-    return row, means[0], means[1], min(1e6, 0.5 * n * apart**2 / max(scatter, 1e-3) ** 2)
-
-
-def _mean_step(time: Array, step: float) -> float:
-    """Mean of the steps between stamps that are no gap."""
-    steps = np.diff(time)
-    whole = steps < 1.5 * step
-    return float(steps[whole].mean()) if whole.mean() > 0.5 else step
 
 
 def _small_change(time: Array, recording: Recording) -> tuple[int, float, float, float] | None:
@@ -221,6 +176,10 @@ def _small_change(time: Array, recording: Recording) -> tuple[int, float, float,
     change = float(lines[1][0] - lines[0][0]) / step
     bend = float(np.abs(off).max())
     if abs(change) < CLOCK_LEAST or bend < 3.0 * step or bend < 5.0 * scatter:
+        return None
+    # Random times walk off any grid. The slopes of pieces show how far.
+    slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]
+    if abs(change) * step < SLOPES_LEAST * math.hypot(*(float(one.std()) / math.sqrt(one.size) for one in slopes)):
         return None
     nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * step)) ** 2)
     return at, step + float(lines[0][0]), step + float(lines[1][0]), nats
@@ -379,7 +338,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     """
     rows = np.flatnonzero(np.isfinite(values))
     y = values[rows]
-    if y.size < 4 * AROUND:
+    if y.size < 4 * AROUND or (lattice is not None and lattice.too_coarse):
         return None
     half = 0.5 * lattice.step if lattice is not None else 0.0
     edges = [(sign, float((sign * y).max())) for sign in (1, -1)]
@@ -389,7 +348,8 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     size = 2 * AROUND + 1
     level = (uniform_filter1d(y, size, mode="reflect") * size - y) / (size - 1)
     # The level's own noise, 1 / (2 AROUND), is in the scatter, and a second time in the level.
-    deviation = float((y - level).std()) * math.sqrt(max(0.0, 1.0 - 2.0 / (size - 1)))
+    variance = float((y - level).var()) * max(0.0, 1.0 - 2.0 / (size - 1))
+    deviation = math.sqrt(max(variance - half * half / 3.0, 0.01 * variance))  # before rounding
     limits: dict[float, Mask] = {}
     nats = 0.0
     for (sign, edge), at_edge in zip(edges, at_edges, strict=True):
