@@ -93,6 +93,11 @@ class Readings:
     held_hz: float | None = None
     change: RateChange | None = None
 
+    def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
+        """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
+        found = {reason: count + self.kept_out.get(reason, 0) for reason, count in kept_out.items()}
+        return {**found, "not_finite": found["not_finite"] - int((~np.isfinite(self.working)).sum())}
+
     @property
     def coarse(self) -> float:
         """Spacing of float32 at the largest reading, in the noise of one."""
@@ -126,12 +131,14 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none)
     lattice = lattice_of(values[inside], recording.rate_hz)
-    stuck, nats = _stuck(values, lattice, group.stuck_limit)
-    values = np.where(stuck, np.nan, values) if stuck.any() else values
-    clipped = _clipped(np.where(inside, values, np.nan), lattice)
+    sound = values if inside.all() else np.where(inside, values, np.nan)
+    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+    if stuck.any():
+        values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+    clipped = _clipped(sound, lattice)
     working = drawn = values
     if clipped is not None:
-        working, drawn = _unclipped(np.where(inside, values, np.nan), clipped, lattice)
+        working, drawn = _unclipped(sound, clipped, lattice)
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": lost, "stuck": int(stuck.sum())}
     return Readings(recording, values, working, drawn, lattice, stuck, nats, clipped, counts)
@@ -324,6 +331,10 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     stuck = lengths >= least
     if not stuck.any():
         return none, 0.0
+    frozen = values[change[stuck]]
+    again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
+    if again > 1 and 2 * int(lengths[stuck].sum()) > n:
+        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
     nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
     return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
 

@@ -141,7 +141,7 @@ def _provisional(
 
 def _wild(state: State, record: Record) -> float:
     """Share of the samples that are outliers beyond doubt: they make an axis loud by itself."""
-    looks = noise.outliers(state, record)
+    looks = noise.mixed(state, record)
     return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
 
 

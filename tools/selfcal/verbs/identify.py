@@ -23,7 +23,7 @@ from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
-from selfcal.readings import Readings, look
+from selfcal.readings import look
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult, in_unit
@@ -187,8 +187,8 @@ def identify_axis(
         beyond = np.abs(column) >= _library32.SAMPLE_MAX
         if beyond.any():
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
-    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
-    blocks = replace(blocks, mean=blocks.mean + offset, kept_out=_counted(blocks.kept_out, readings))
+    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns, readings.counted)
+    blocks = replace(blocks, mean=blocks.mean + offset)
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     if engine == "reference" and model.handling.outlier_sd:
@@ -238,13 +238,6 @@ def identify_axis(
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
     return Identified(unit, group.unit, scored.result, judged, blocks.kept_out, scored, curve)
-
-
-def _counted(kept_out: Mapping[str, int], readings: Readings) -> dict[str, int]:
-    """Samples that are not used, by reason, with the readings that are none or that a limit clipped."""
-    counted = {reason: count + readings.kept_out.get(reason, 0) for reason, count in kept_out.items()}
-    lost = int((~np.isfinite(readings.working)).sum())
-    return {**counted, "not_finite": counted["not_finite"] - lost}
 
 
 def _used(mask: int) -> list[int]:

@@ -177,7 +177,12 @@ def variance_change(state: State, record: Record) -> list[Look]:
 
 
 def outliers(state: State, record: Record) -> list[Look]:
-    """Isolated wild samples: a mixture of the innovations with a share of wider ones."""
+    """Isolated wild samples. They are exceptions: a mixture with many of them has another cause."""
+    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= OUTLIERS_MOST]
+
+
+def mixed(state: State, record: Record) -> list[Look]:
+    """A mixture of the innovations with a share of wider ones."""
     w = state.whitened
     present = np.isfinite(w)
     x = w[present]
@@ -204,7 +209,7 @@ def outliers(state: State, record: Record) -> list[Look]:
     gain = value - float(plain)
     worth = net(gain, 2, LN_OUTLIERS)
     picked = np.flatnonzero(present)[weight > 0.5]
-    if worth < 1.0 or not 0 < picked.size <= OUTLIERS_MOST * n:
+    if worth < 1.0 or not picked.size:
         return []
     # Several in a row are no outliers: motion, or a change of the noise.
     alone = np.ones(picked.size, bool)
@@ -216,6 +221,8 @@ def outliers(state: State, record: Record) -> list[Look]:
         worth *= float(alone.mean())
     y = state.y.copy()
     y[picked] = np.nan
+    if not np.nanmax(y) > np.nanmin(y):
+        return []  # the others are all equal: a dead band
     largest = int(picked[np.argmax(np.abs(w[picked]))])
     fraction = picked.size / n
     return [
