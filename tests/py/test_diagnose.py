@@ -418,8 +418,13 @@ def test_a_change_of_the_sampling_clock_is_told(tmp_path: Path) -> None:
             assert axis["verdict"] == "adequate"
             continue
         (finding,) = axis["findings"]
-        assert finding["estimate"] == {"statistic": "sampling_interval", "measured": pytest.approx(1.02, rel=1e-3)}
-        assert finding["when"][0] == pytest.approx(1500.0, rel=0.02)
+        assert finding["cause"] == "rate_change"
+        found = {key: value["median"] for key, value in finding["estimate"].items()}
+        assert found == {
+            "time_s": pytest.approx(1500.0, rel=0.02),
+            "before_hz": pytest.approx(1.0, rel=1e-3),
+            "after_hz": pytest.approx(1.0 / 1.02, rel=1e-3),
+        }
 
 
 INTERRUPTED = """

@@ -175,6 +175,7 @@ public:
     }
 
     void skip(uint64_t count) { check(selfcal_skip(&bank_, count)); }
+    void shift(uint8_t axis, float amount) { check(selfcal_shift(&bank_, axis, amount)); }
     void moving() { check(selfcal_moving(&bank_)); }
     void push_moving(const Rows &samples) {
         if (samples.shape(1) != axes_.size())
@@ -543,6 +544,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("watch", &Bank::watch)
         .def("skip", &Bank::skip)
+        .def("shift", &Bank::shift)
         .def("moving", &Bank::moving)
         .def("push_moving", &Bank::push_moving)
         .def("rate", &Bank::rate)

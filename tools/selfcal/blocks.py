@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,10 +43,13 @@ def usable_blocks(
     tables: Tables,
     group: Group,
     columns: NDArray[np.float32] | None = None,
+    counted: Callable[[Mapping[str, int]], Mapping[str, int]] = dict,
 ) -> Blocks:
-    """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them."""
+    """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them.
+    `counted`: the samples kept out by reason, from those that the averaging knows."""
     z = None if columns is None else columns.astype(np.float64)
     blocks = block_means(samples.astype(np.float64), missing_before, tables.block, group, z)
+    blocks = replace(blocks, kept_out=counted(blocks.kept_out))
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = REPORT_MIN + len(tables.regressors)
     kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from selfcal import units
 from selfcal.allan import Curve, curve_of, ratio_at
-from selfcal.blocks import MOST_DENSE, Blocks, kept_out
-from selfcal.lattice import BELOW_LATTICE, lattice_of
+from selfcal.blocks import MOST_DENSE, Blocks
+from selfcal.lattice import BELOW_LATTICE
 from selfcal.model import Group
-from selfcal.recording import Recording, as_float
+from selfcal.readings import CLOCK_LEAST, Readings
 from selfcal.result import AxisResult
 from selfcal.tables import Tables
 
@@ -23,6 +24,8 @@ from selfcal.tables import Tables
 CHECK_LIMIT = 4.0
 #: Bank samples without which there are no checks.
 FEWEST = 20
+#: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
+SPACING_MOST = 0.3
 
 
 @dataclass(frozen=True)
@@ -57,17 +60,32 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
     return Judged({**checks, **(allan_checks(curve) if curve else {})}, curve)
 
 
-def with_lattice(judged: Judged, recording: Recording, axis: str, group: Group) -> Judged:
-    """The same with one check more: is the noise of the usable readings above their lattice, if they lie on one?
+def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *, as_fed: bool = False) -> Judged:
+    """The same with the checks of the readings. `unit`: the recording's.
 
-    `value`: steps in the noise of a reading; `step` in the recording's unit; `distinct` readings."""
-    unused = np.logical_or.reduce(list(kept_out(as_float(recording.in_unit(axis, group.unit)), group).values()))
-    found = lattice_of(recording.columns[axis].values[~unused], recording.rate_hz)
-    if found is None:
-        return judged
-    told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse}
-    check = {**told, "step": found.step, "distinct": found.distinct}
-    return replace(judged, checks={**judged.checks, "lattice": check})
+    `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
+    recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
+    `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the change of the
+    sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
+    """
+    factor = units.factor(group.unit, unit)
+    checks: dict[str, dict[str, Any]] = {}
+    found = readings.lattice
+    if found is not None:
+        told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse}
+        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct}
+    if readings.clipped is not None:
+        share = float(readings.clipped.mask.mean())
+        checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}
+    if as_fed:
+        if readings.stuck.any():
+            checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}
+        if readings.change is not None:
+            ratio = readings.change.after_hz / readings.change.before_hz - 1.0
+            checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}
+        if readings.coarse > SPACING_MOST:
+            checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
+    return replace(judged, checks={**judged.checks, **checks})
 
 
 def coefficients_of(result: AxisResult) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -611,6 +612,8 @@ def main() -> NoReturn:
     """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
     traceback is our bug."""
     install()
+    if not sys.warnoptions:  # a library's warning is none for the user
+        warnings.simplefilter("ignore")
     try:
         code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
         sys.exit((last_signal() or code) if code == INTERRUPTED else code)  # typer's code for every signal

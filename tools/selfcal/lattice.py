@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 #: lattice. A reading that toggles between two values has at least 2, however little noise there was before rounding.
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
 BELOW_LATTICE = 1.9
+#: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
+FINE = 0.01
+#: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
+SHOWN = 20
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,14 @@ class Lattice:
 
 
 def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | None:
-    """The lattice of readings [n] at `rate_hz`, None if they lie on none or are all the same.
+    """The lattice of readings [n] at `rate_hz`, None if they lie on none or are all the same, or if it is FINE.
 
     Their noise is the scatter about means of 1 s, or that of differences where a second holds fewer than four: a drift
     has no part in either.
     """
     unique = np.unique(values)
     step = _step(unique)
-    if step <= 0.0:
+    if step <= 0.0 or not _throughout(unique, step):
         return None
     second = round(rate_hz)
     count = values.size // second if second >= 4 else 0
@@ -46,7 +50,22 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
         noise = math.sqrt(float(within.var(axis=1).mean()) * second / (second - 1.0))
     else:
         noise = float(np.diff(values).std()) / math.sqrt(2.0)
-    return Lattice(step, step / noise if noise > 0.0 else math.inf, unique.size)
+    coarseness = step / noise if noise > 0.0 else math.inf
+    return Lattice(step, coarseness, unique.size) if coarseness >= FINE else None
+
+
+def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
+    """Whether values of every size have this step. A printed number of so many digits has a coarser one from each power
+    of ten on, a binary one from each power of two on."""
+    size = np.abs(unique)
+    for base in (2.0, 10.0):
+        with np.errstate(divide="ignore"):
+            kind = np.floor(np.log(size) / math.log(base))
+        for one in np.unique(kind[np.isfinite(kind)]):
+            for part in (unique[(kind == one) & (unique > 0.0)], unique[(kind == one) & (unique < 0.0)]):
+                if part.size > SHOWN and not abs(_step(part) / step - 1.0) < 0.02:
+                    return False
+    return True
 
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:

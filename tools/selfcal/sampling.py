@@ -5,6 +5,7 @@ Stamps of 1 ms at 819.2 Hz do not: steps of 1 and 2 ms alternate, and a missing 
 What such stamps do obey is that sample k was stamped within one lattice step of k dt. A sequential decoder follows the
 times that are still possible under a supposed dt: where none is left a sample is missing. Of all dt the one that needs
 the fewest missing samples is taken; where others need hardly more, the stamps cannot tell and that is said.
+Stamps at random times, or in the bursts of a bus, lie on no grid. They have a mean rate, and gaps where these are long.
 """
 
 from __future__ import annotations
@@ -36,6 +37,13 @@ _SLACKS = np.array([0.02, 0.52, 0.69, 0.85, 1.0, 1.5]) * 1.0001
 _PRICE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.15])
 #: A stamp that fits nowhere weighs as many missing samples.
 _ODD = 10
+#: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
+_STEPS, _PIECES = 20, 100
+#: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
+_CHANGE = 0.015
+#: Stamps lie on no grid if the mean step is so much longer than the usual one, and long steps are off whole ones by so
+#: many intervals rms (at random: 0.29). Then a step of so many mean ones is a gap.
+_MEAN, _BETWEEN, _GAP = 1.2, 0.2, 20.0
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
@@ -53,6 +61,10 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
     record with gaps take about a second and 10^6 rows another; all others are fast.
     """
     steps = np.diff(time)
+    changed = rate_change(time) if rate is None else None
+    if changed is not None:
+        dt = min(changed[1:3])
+        return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     window = max(1, min(_WINDOW, steps.size // 4))
     typical = float(np.median(time[window:] - time[:-window])) / window
     lattice = _lattice(steps, max(4.0 * noise_s, 1e-9 * typical))
@@ -64,7 +76,70 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
                 raise  # a stated rate decides, and is checked by who knows it
     positive = steps[steps > 0.0]
     first = float(np.median(positive[positive < 1.5 * np.median(positive)])) if rate is None else 1.0 / rate
+    if rate is None and typical > _MEAN * first and _between(steps / first):
+        return _mean_grid(steps)
     return _fine(time, steps, first)
+
+
+def _between(intervals: NDArray[np.float64]) -> bool:
+    """Whether long steps are of no whole number of intervals: those of missing samples are."""
+    long = intervals[intervals > 1.5]
+    return bool(((long - np.rint(long)) ** 2).mean() > _BETWEEN**2)
+
+
+def _mean_grid(steps: NDArray[np.float64]) -> Found:
+    """The mean step without gaps, and the samples missing in those."""
+    dt = float(steps.mean())
+    for _ in range(8):
+        dt = float(steps[steps < _GAP * dt].mean())
+    missing = np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)
+    return dt, np.concatenate(([0], missing))
+
+
+def rate_change(time: NDArray[np.float64]) -> tuple[int, float, float, float] | None:
+    """Row, intervals (s) before and after, and evidence (nats) of one change of rate in stamps float64[n], s."""
+    n = time.size
+    size = max(3 * _STEPS, n // _PIECES)
+    if n < 6 * size:
+        return None
+    steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
+    count = steps.size // size
+    pieces = steps[: count * size].reshape(count, size)
+    middle = np.median(pieces, axis=1, keepdims=True)
+    if not middle.min() > 0.0:
+        return None
+    # Medians of coarse stamps jump by a step of their lattice, means move with the gaps: a change of rate does both.
+    near = np.abs(pieces - middle) < 0.5 * middle
+    value = np.log(middle[:, 0])
+    mean = np.log((pieces * near).sum(axis=1) / near.sum(axis=1))
+    total, square = np.cumsum(value), np.cumsum(value**2)
+    k = np.arange(2, count - 1)
+    left = square[k - 1] - total[k - 1] ** 2 / k
+    right = square[-1] - square[k - 1] - (total[-1] - total[k - 1]) ** 2 / (count - k)
+    at = int(k[np.argmin(left + right)])
+    # The piece with the change in it belongs to neither side.
+    sides = (slice(0, at - 1 if at > 2 else at), slice(at + 1 if count - at > 2 else at, None))
+    before, after = (float(np.median(value[side])) for side in sides)
+    apart = abs(after - before)
+    means = float(np.median(mean[sides[1]]) - np.median(mean[sides[0]]))
+    scatter = max(
+        float(np.quantile(np.abs(value[side] - level), 0.9)) for side, level in zip(sides, (before, after), strict=True)
+    )
+    if apart < _CHANGE or apart < 6.0 * scatter or abs(means - (after - before)) > 0.3 * apart:
+        return None
+    first, last = max(0, (at - 2) * size), min(n - 1, (at + 2) * size + _STEPS)
+    # The bend: farthest from the line of the mean interval.
+    line = time[first : last + 1] - 0.5 * (math.exp(before) + math.exp(after)) * np.arange(last + 1 - first)
+    row = first + int(np.argmax(line) if before > after else np.argmin(line))
+    exact = [_mean_step(part, math.exp(level)) for part, level in ((time[: row + 1], before), (time[row:], after))]
+    return row, exact[0], exact[1], min(1e6, 0.5 * n * apart**2 / max(scatter, 1e-3) ** 2)
+
+
+def _mean_step(time: NDArray[np.float64], step: float) -> float:
+    """Mean of the steps between stamps that are no gap of an even grid, `step` where the grid has none such."""
+    steps = np.diff(time)
+    whole = np.abs(steps - step) < 0.5 * step
+    return float(steps[whole].mean()) if whole.mean() > 0.5 else step
 
 
 def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:

@@ -1,4 +1,4 @@
-"""Findings that need little or no fit: missing samples, an unstated lattice, readings at a limit, motion."""
+"""Findings that need little or no fit: of the readings and of the clock, missing samples, motion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import ndtr
-from scipy.stats import poisson, truncnorm
+from scipy.stats import poisson
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
@@ -17,10 +17,10 @@ from selfcal.diagnosis.statemodel import Array, Mask
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
-#: A change of the sampling clock is told of from this share on; a crystal keeps 1e-4.
-CLOCK_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
+#: Readings at most of which a log's means show by their lattice.
+AVERAGED_MOST = 20
 #: Motion: the piece of time that rests or moves, s; variances over the resting one's; mean lengths, s, and the shares
 #: of pieces in which a motion begins.
 PIECE_S = 0.5
@@ -67,12 +67,14 @@ def _held(record: Record) -> Mask:
     for state in record.axes.values():
         same = np.zeros(record.present.size, bool)
         same[1:] = np.diff(state.y) == 0.0
+        if state.axis in record.unclipped:
+            same &= record.unclipped[state.axis] == state.y  # a clipped reading repeats for being clipped
         repeats.append(same)
     if not repeats or any(state.redrawn for state in record.axes.values()):
         return none  # means of blocks repeat by chance: a held reading shows at the recording's own rate
     held = np.all(repeats, axis=0)
     shares = [
-        max((float(same.sum()) - float(held.sum())) / same.size, _repeats_by_chance(state))
+        max((float(same.sum()) - float(held.sum())) / same.size, _repeats_by_chance(state), _repeats_of_earlier(state))
         for same, state in zip(repeats, record.axes.values(), strict=True)
     ]
     expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
@@ -85,42 +87,60 @@ def _repeats_by_chance(state: State) -> float:
     return 2.0 * float(ndtr(state.lsb / (2.0 * math.sqrt(2.0) * state.best.sigma))) - 1.0 if state.fits else 0.0
 
 
-def clock(record: Record) -> Look | None:
-    """The sampling interval changes once: the time stamps, laid on one even grid, have a bend."""
-    off = record.off_grid_s
-    if off is None or off.size < 60:
+def _repeats_of_earlier(state: State) -> float:
+    """Share of readings that repeat one two to four before: chance alone, on a lattice of several steps as well."""
+    return sum(float((state.y[k:] == state.y[:-k]).mean()) for k in (2, 3, 4)) / 3.0
+
+
+def rate_change(record: Record) -> Look | None:
+    """The sampling rate changes once. The record has means over an interval that both rates share."""
+    change = record.change
+    if change is None:
         return None
-    k = np.arange(off.size)
-    off = off - np.interp(k, [0, k[-1]], [off[0], off[-1]])  # a bend is farthest from the chord
-    edge = max(10, off.size // 50)
-    at = edge + int(np.argmax(np.abs(off[edge:-edge])))
-    halves = (slice(None, at), slice(at, None))
-    lines = [np.polyfit(k[half], off[half], 1) for half in halves]
-    bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
-    scatter = float((off - bent).std())
-    interval_s = 1.0 / record.recorded_hz
-    change = float(lines[1][0] - lines[0][0]) / interval_s
-    bend = float(np.abs(off).max())
-    if abs(change) < CLOCK_LEAST or bend < 3.0 * interval_s or bend < 5.0 * scatter:
-        return None
-    time = float(at * interval_s)
-    nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * interval_s)) ** 2)
+    rates = {"before_hz": change.before_hz, "after_hz": change.after_hz}
     return Look(
-        "unexplained",
-        nats,
-        nats,
-        {"statistic": "sampling_interval", "measured": 1.0 + change},
+        "rate_change",
+        change.nats,
+        change.nats,
+        {
+            "time_s": interval(change.time_s, 0.5 / min(rates.values()), "s"),
+            **{key: interval(rate, 0.0, "Hz") for key, rate in rates.items()},
+        },
         {},
-        when=(time, time),
-        shown_by="sampling_interval",
+        when=(change.time_s, change.time_s),
     )
+
+
+def held_samples(record: Record, axis: str) -> Look | None:
+    """The logger asks oftener than the part measures."""
+    readings = record.readings[axis]
+    if readings.held_hz is None:
+        return None
+    # Each reading that is asked for again repeats; by chance one in 100 would at most.
+    nats = min(1e6, readings.values.size * math.log(100.0))
+    return Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+
+
+def stuck(record: Record, axis: str) -> Look | None:
+    """Stretches of equal readings that are no chance."""
+    readings = record.readings[axis]
+    intervals = readings.intervals
+    if not intervals:
+        return None
+    nats = readings.stuck_nats
+    return Look("stuck", nats, nats, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
+
+
+def _averaged(steps: float) -> bool:
+    """Whether the stated lattice has a whole number of these `steps`: the log has means of so many readings."""
+    return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.005 * steps
 
 
 def quantization(state: State) -> Look | None:
     """A lattice that the model file does not state and that is coarse against the white noise."""
     q = state.lsb
     stated = state.stated_lsb
-    if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02):
+    if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02) or _averaged(stated / q):
         return None
     sigma = state.best.sigma
     white = math.sqrt(max(sigma**2 - q * q / 12.0, 1e-12 * sigma**2))
@@ -138,69 +158,20 @@ def quantization(state: State) -> Look | None:
     )
 
 
-def saturation(state: State) -> tuple[Look, State] | None:
-    """Readings pile up at the largest or the smallest value: the model expects some beyond it and none is.
-
-    The expected number beyond is the evidence, in nats (Poisson). Clipped readings are then drawn anew from what the
-    filter predicts beyond the limit, so that the rest is judged as if it had not been clipped."""
-    y = state.y
-    finite = np.isfinite(y)
-    found = state
-    sides: list[tuple[float, int]] = []
-    gain = 0.0
-    for sign in (1, -1):
-        edge = float(np.nanmax(sign * y))
-        at_edge = finite & (sign * y >= edge - 1e-9 * max(1.0, abs(edge)))
-        if at_edge.sum() < 3:
-            continue
-        half = 0.5 * state.lsb
-        predicted = sign * (y - state.whitened * np.sqrt(state.variance))
-        deviation = np.sqrt(state.variance)
-        beyond = ndtr((predicted - edge - half) / deviation)
-        expected = float(np.nansum(beyond))
-        # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
-        worth = expected - math.log(2.0)
-        if half > 0.0:
-            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
-            cell = ndtr((predicted - edge + half) / deviation) - beyond
-            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
-            worth = max(worth, pile - math.log(20.0))
-        elif not state.redrawn:
-            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
-            worth = max(worth, (int(at_edge.sum()) - 1) * math.log(100.0))
-        if worth < NET_LEAST or at_edge.sum() < 0.5 * expected:
-            continue
-        sides.append((sign * edge, int(at_edge.sum())))
-        gain += worth + math.log(2.0)
-        found = _unclipped(found, at_edge, edge, sign)
-    if not sides:
+def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Readings are clipped at a limit. In a record at the recording's own rate they are drawn anew beyond the limit, so
+    that the rest is judged as if it had not been clipped. Means are of those from the start."""
+    state, readings = record.axes[axis], record.readings[axis]
+    clipped = readings.clipped
+    if clipped is None:
         return None
-    limit = max(sides, key=lambda side: side[1])[0]
-    count = sum(side[1] for side in sides)
-    look = Look(
-        "saturation",
-        gain,
-        gain,
-        {
-            "limit": interval(limit + state.level, state.lsb / 4.0 or 1e-6 * abs(limit + state.level), state.unit),
-            "clipped": count,
-        },
-        {},
-    )
-    return look, found
-
-
-def _unclipped(state: State, at_edge: Mask, edge: float, sign: int) -> State:
-    random = np.random.default_rng(1)
-    for _ in range(4):
-        s = np.sqrt(state.variance[at_edge])
-        predicted = sign * state.y[at_edge] - sign * state.whitened[at_edge] * s
-        low = (edge - 0.5 * state.lsb - predicted) / s
-        drawn = predicted + s * truncnorm.rvs(low, np.inf, random_state=random)
-        y = state.y.copy()
-        y[at_edge] = sign * drawn
-        state = state.refit(y=y, redrawn=True)
-    return state
+    sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
+    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
+    look = Look("saturation", clipped.nats, clipped.nats, estimate, {})
+    if axis not in record.unclipped:
+        return look, state
+    y = np.where(np.isfinite(state.y), record.unclipped[axis], np.nan)
+    return look, state.refit(y=y, redrawn=True)
 
 
 def motion(record: Record, wild: Mapping[str, float]) -> dict[str, tuple[Look, Mask]]:

@@ -141,7 +141,7 @@ def _provisional(
 
 def _wild(state: State, record: Record) -> float:
     """Share of the samples that are outliers beyond doubt: they make an axis loud by itself."""
-    looks = noise.outliers(state, record)
+    looks = noise.mixed(state, record)
     return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
 
 
@@ -164,11 +164,14 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
         mask = next(iter(moved.values()))[1]
         for name in states:
             states[name] = integrity.masked(states[name], mask).refit()
-    bent = integrity.clock(record)
+    changed = integrity.rate_change(record)
     for name, one in found.items():
-        if bent is not None:
+        if changed is not None:
             others = tuple(other for other in found if other != name)
-            one.findings.append(Finding(bent, 0, one.state, one.state, shared_with=others))
+            one.findings.append(Finding(changed, 0, one.state, one.state, shared_with=others))
+        for look in (integrity.held_samples(record, name), integrity.stuck(record, name)):
+            if look is not None:
+                one.findings.append(Finding(look, 0, one.state, one.state))
         if name in moved:
             one.findings.append(
                 Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
@@ -176,7 +179,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
-        clipped = None if states[name].below_lattice else integrity.saturation(states[name])
+        clipped = None if states[name].below_lattice else integrity.saturation(replace(record, axes=states), name)
         if clipped is not None:
             if name in found:
                 found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
@@ -322,7 +325,9 @@ def _same(a: Look, b: Look) -> bool:
     if a.cause == "periodic":
         f, g = a.estimate["frequency_hz"]["median"], b.estimate["frequency_hz"]["median"]
         return bool(abs(f / g - 1.0) < 0.01)
-    return a.cause in ("temperature", "supply", "motion", "missing_samples")
+    if a.cause == "stuck":
+        return bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0])
+    return a.cause in ("temperature", "supply", "motion", "missing_samples", "held_samples")
 
 
 def _unexplained(one: Diagnosed) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -13,9 +13,9 @@ from selfcal import _library32
 from selfcal.diagnosis.state import Regressor, State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
-from selfcal.lattice import lattice_of
 from selfcal.model import Group, Model
 from selfcal.model import Regressor as Stated
+from selfcal.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
 from selfcal.recording import SIDE_CHANNELS, Recording
 from selfcal.regressors import columns_of, offered
 
@@ -37,8 +37,10 @@ class Record:
     channel_names: Mapping[str, str]
     present: Mask
     missing: int = 0
-    off_grid_s: Array | None = None
     recorded_hz: float = 1.0
+    readings: Mapping[str, Readings] = field(default_factory=dict)
+    change: RateChange | None = None
+    unclipped: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def time_s(self) -> Array:
@@ -51,12 +53,16 @@ class Record:
 
 def of_recording(recording: Recording, model: Model, decimate: float | None = None) -> Record:
     """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
-    file states is in the model of each axis from the start.
+    file states is in the model of each axis from the start. Stuck readings are left out. Where every axis holds its
+    readings the record has the part's own rate; where some do, the repeats of those are left out.
 
     `decimate`, Hz: means of whole blocks at the rate nearest to it; a block of which half is missing is missing.
     """
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
+    known = [name for name in model.axes if name in recording.columns and np.ptp(recording.columns[name].values) > 0.0]
+    recording, change = evened(recording)
+    recording, held_hz = thinned(recording, tuple(known))
     at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
     at -= at[0]
     block = 1 if decimate is None else max(1, round(recording.rate_hz / decimate))
@@ -73,10 +79,16 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     used = np.bincount(index[kept], minlength=n)
     present = 2 * used >= block
 
+    def averaged(values: Array) -> tuple[Array, Array]:
+        """Means of the values that are there, NaN where fewer than half are, and samples a block over those used."""
+        there = kept & np.isfinite(values)
+        many = np.bincount(index[there], minlength=n)
+        mean = np.bincount(index[there], values[there], minlength=n) / np.maximum(many, 1)
+        enough = 2 * many >= block
+        return np.where(enough, mean, np.nan), np.where(enough, block / np.maximum(many, 1), 1.0)
+
     def on_grid(values: Array) -> Array:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(index[kept], values[kept], minlength=n) / used
-        return np.where(present, mean, np.nan)
+        return averaged(values)[0]
 
     def stated(name: str) -> tuple[Regressor, ...]:
         """The model file's regressors of an axis."""
@@ -90,23 +102,39 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         return tuple(found)
 
     states: dict[str, State] = {}
-    for name in model.axes:
-        if name not in recording.columns:
-            continue
+    read: dict[str, Readings] = {}
+    unclipped: dict[str, Array] = {}
+    for name in known:
         group = model.group_of(name)
-        values = recording.in_unit(name, group.unit)
-        if not np.ptp(values) > 0.0 or _beyond(values, group):
+        if _beyond(recording.in_unit(name, group.unit), group):
             continue
-        y = on_grid(values)
-        found = lattice_of(values, recording.rate_hz)
+        rows = None if held_hz is not None else own_rows(recording, name)
+        one = look(recording, name, group) if rows is not None else readings_of(recording, name, group)
+        if held_hz is not None:
+            one = replace(one, held_hz=held_hz)
+
+        def spread(values: Array, rows: Rows | None = rows) -> Array:
+            if rows is None:
+                return values
+            found = np.full(recording.samples, np.nan)
+            found[rows] = values
+            return found if block == 1 else _held_on(found)
+
+        y, r = averaged(spread(one.values if block == 1 else one.drawn))
+        if np.isfinite(y).sum() < LEAST:
+            continue
+        read[name] = one
+        found = one.lattice
         level = float(np.nanmedian(y))
+        if block == 1 and one.clipped is not None:
+            unclipped[name] = averaged(spread(one.drawn))[0] - level
         states[name] = State(
             axis=name,
             unit=group.unit,
             y=y - level,
             dt=block / recording.rate_hz,
             level=level,
-            r=np.where(present, block / np.maximum(used, 1), 1.0),
+            r=r,
             regressors=stated(name),
             lsb=found.step if found is not None and block == 1 else 0.0,
             stated_lsb=group.lsb,
@@ -128,9 +156,17 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         names,
         present,
         int(recording.missing_before.sum()),
-        recording.off_grid_s,
         recording.rate_hz,
+        read,
+        change,
+        unclipped,
     )
+
+
+def _held_on(values: Array) -> Array:
+    """Each value until the next that is there."""
+    there = np.flatnonzero(np.isfinite(values))
+    return values[there[np.maximum(0, np.searchsorted(there, np.arange(values.size), side="right") - 1)]]
 
 
 def why_left_out(recording: Recording, model: Model, name: str) -> str:
@@ -138,6 +174,8 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     group = model.group_of(name)
     if _beyond(recording.in_unit(name, group.unit), group):
         return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
+    if np.ptp(recording.columns[name].values) > 0.0:
+        return "too few of its readings are none that stick or are clipped"
     return "every reading is the same"
 
 

@@ -30,6 +30,9 @@ UNDEFINED = {
     "missing_samples": "gaps are bridged before and after: the model of the noise is the same",
     "quantization": "the lattice is in the reading and not in the prediction",
     "saturation": "readings at the limit are scored by no density",
+    "stuck": "readings that stick are no readings: none is scored",
+    "held_samples": "repeats are left out before and after",
+    "rate_change": "the record has one rate before and after",
     "unexplained": "no model was extended",
 }
 
@@ -186,6 +189,8 @@ def _ratio_anew(before: State, after: State, place: int, split: int) -> State:
 
 def inflation(before: State, after: State) -> Mapping[str, float]:
     """Factors by which plain white noise and random walk are off for want of a cause: fitted without it over with."""
+    if before is after:
+        return {"N": 1.0, "K": 1.0}
     plain = [next(one for one in state.fits if one.terms.walk) for state in (before, after)]
     N = [one.sigma * _low_gain(one) for one in plain]
     K = [one.sigma * math.exp(one.value("ln_rho")) for one in plain]

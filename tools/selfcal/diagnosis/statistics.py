@@ -25,7 +25,10 @@ ENSEMBLE = 48
 #: An ensemble of this size shows the skewness of a statistic too.
 SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
-LEAST_SPREAD = {"longest_repeat": 0.25}
+LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
+#: Steps of the lattice in the noise of a reading up to which even and odd codes are alike, block means of a coarser
+#: lattice included: beyond, the level decides.
+PARITY_MOST = 0.5
 #: Lags at most at which an echo is looked for, lengths of a spectrogram's pieces, and places of a jump at most: longer
 #: records are looked at in blocks.
 ECHOES = 20_000
@@ -127,18 +130,21 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None
         found["spectrum_worst_third_octave"] = worst
     if y is None:
         return found
-    # Readings that repeat the one before, beyond what the lattice makes them.
-    step = np.diff(y)
-    both = np.isfinite(step)
-    repeats = float((step[both] == 0.0).mean()) if both.any() else 0.0
-    found["repeated_readings"] = repeats * math.sqrt(max(1, both.sum()))
-    if lsb > 0.0:
-        runs = _longest_run(y)
-        found["longest_repeat"] = math.log(runs)
-        read = y[np.isfinite(y)]
-        codes = np.rint((read - read[0]) / lsb).astype(np.int64)
-        odd = int((codes & 1).sum())
-        found["odd_even_codes"] = (codes.size - 2 * odd) / math.sqrt(codes.size) if 0 < odd < codes.size else 9.0
+    # The codes of the lattice: sums in floating point differ in the last digit.
+    codes = y if lsb <= 0.0 else np.rint((y - y[np.argmax(np.isfinite(y))]) / lsb)
+    # Readings that repeat the one before, beyond those that repeat an earlier one: these do by chance.
+    equal = [int((codes[k:] == codes[:-k]).sum()) for k in (1, 2, 3, 4)]
+    usual = sum(equal[1:]) / 3.0
+    found["repeated_readings"] = (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))
+    if lsb <= 0.0:
+        # Without a lattice, or on one of several steps, no reading is much commoner than the next.
+        found["commonest_reading"] = _commonest(codes) if sum(equal) else 0.0
+    else:
+        found["longest_repeat"] = math.log(_longest_run(codes))
+        read = codes[np.isfinite(codes)].astype(np.int64)
+        odd = int((read & 1).sum())
+        if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
+            found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
     return found
 
 
@@ -195,6 +201,13 @@ def _largest(x: Array) -> float:
     ln_p = math.log(2.0) + float(norm.logsf(np.abs(x).max())) + math.log(x.size)
     p = -math.expm1(-math.exp(min(ln_p, 5.0)))
     return float(norm.isf(min(max(p, 1e-300), 1.0 - 1e-16)))
+
+
+def _commonest(y: Array) -> float:
+    """How much oftener the commonest reading comes than the next, as a normal deviate."""
+    _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
+    first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
+    return float(first - second) / math.sqrt(float(first + second))
 
 
 def _longest_run(y: Array) -> int:

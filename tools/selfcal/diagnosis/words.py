@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 WORDS: Mapping[str, str] = {
@@ -20,13 +20,11 @@ WORDS: Mapping[str, str] = {
     "variance_change": "The noise level changes once.",
     "saturation": "Readings are clipped at a limit.",
     "missing_samples": "Samples are missing.",
+    "stuck": "The readings stop at one value for a while.",
+    "held_samples": "The logger asks oftener than the sensor measures: each reading repeats.",
+    "rate_change": "The sampling rate changes once.",
     "motion": "The sensor was moved or shaken while it should have rested.",
     "unexplained": "The readings differ from every model tried, and no known cause explains it.",
-}
-
-#: What a statistic says by itself where no cause is named.
-STATISTICS: Mapping[str, str] = {
-    "sampling_interval": "The sampling clock changes its rate: rates, drifts and lines before and after do not agree.",
 }
 
 NEXT: Mapping[str, str] = {
@@ -43,13 +41,25 @@ NEXT: Mapping[str, str] = {
     "variance_change": "Look for what was switched on at that time.",
     "saturation": "Choose a wider range.",
     "missing_samples": "Check the logger's buffer and the data-ready line.",
+    "stuck": "Check the bus and the sensor's data-ready line at that time.",
+    "held_samples": "Log at the sensor's own rate, on its data-ready line.",
+    "rate_change": "Look for what set the rate at that time; record at one rate.",
     "motion": "Record on a heavy table, away from traffic.",
     "unexplained": "Record again: if the statistic stands out a second time, it is the sensor's own.",
 }
 
 
+#: Stretches of time that a sentence names.
+INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.
-LABELS = {"time_s": "at", "frequency_hz": "frequency", "width_hz": "half width"}
+LABELS = {
+    "time_s": "at",
+    "rate_hz": "at",
+    "before_hz": "from",
+    "after_hz": "to",
+    "frequency_hz": "frequency",
+    "width_hz": "half width",
+}
 
 
 def _rounded(value: float, half: float) -> str:
@@ -59,6 +69,13 @@ def _rounded(value: float, half: float) -> str:
     first = math.floor(math.log10(abs(value)))
     digits = max(2, first + 1, first - math.floor(math.log10(half)) + 2)
     return f"{value:#.{digits}g}".removesuffix(".")
+
+
+def _intervals(stretches: Sequence[Sequence[float]]) -> str:
+    """The first few stretches of time, and how many more there are."""
+    shown = ", ".join(f"{start:.6g} s to {end:.6g} s" for start, end in stretches[:INTERVALS_SHOWN])
+    more = len(stretches) - INTERVALS_SHOWN
+    return f"from {shown}" + (f" and {more} more" if more > 0 else "")
 
 
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
@@ -71,11 +88,12 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             unit = "" if value["unit"] == "1" else f" {value['unit']}"
             spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
             parts.append(f"{label} {_rounded(value['median'], half)}{spread}{unit}")
+        elif key == "intervals":
+            parts.append(_intervals(value))
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
-    words = STATISTICS.get(str(estimate.get("statistic")), WORDS[cause])
-    return f"{words} {text[:1].upper()}{text[1:]}."
+    return f"{WORDS[cause]} {text[:1].upper()}{text[1:]}."
 
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:

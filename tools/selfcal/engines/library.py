@@ -36,7 +36,8 @@ class Bank:
     """A bank over the axes of `tables`.
 
     `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
-    module's reports, `fixed` the integer kernels (SELFCAL_FIXED).
+    module's reports, `fixed` the integer kernels (SELFCAL_FIXED). `offset`: what the samples of the first axis are less
+    than the readings; its reports have it again.
     """
 
     def __init__(
@@ -47,8 +48,10 @@ class Bank:
         dense: bool = False,
         coarse: bool = False,
         fixed: bool = False,
+        offset: float = 0.0,
     ) -> None:
         self.tables = tables
+        self.offset = offset
         build = _dense if dense else _library64 if double else _coarse if coarse else _library32
         if fixed:
             build = _fixed
@@ -62,6 +65,8 @@ class Bank:
             tables.half_life_s,
             tables.handling.as_tuple,
         )
+        if offset:
+            self.raw.shift(0, -offset)
 
     def push(
         self,
@@ -111,7 +116,13 @@ class Bank:
         if not self.tables.regressors and not any(math.isfinite(p) for p in probability.values()):
             raise UserError(outside_priors(self.tables.axes[axis]))
         return AxisResult(
-            report["n"], log_evidence, probability, parameters, report["bias_mean"], report["bias_sd"], coefficients
+            report["n"],
+            log_evidence,
+            probability,
+            parameters,
+            report["bias_mean"] + (self.offset if axis == 0 else 0.0),
+            report["bias_sd"],
+            coefficients,
         )
 
 

@@ -17,12 +17,13 @@ from rich.progress import Progress
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, kept_out, usable_blocks
-from selfcal.checks import coefficients_of, judge, with_lattice
+from selfcal.checks import coefficients_of, judge, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
+from selfcal.readings import look
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult, in_unit
@@ -30,6 +31,8 @@ from selfcal.tables import make_tables
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
+#: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
+SPACING_LEAST = 0.01
 #: Suspicions that a sum of drifts, or coloured noise, may be.
 SLOW = ("flicker", "colored_noise", "ramp", "step")
 
@@ -105,6 +108,9 @@ def identify(
             rate_hz = loaded_model.bank_rate_hz if decimate is None else decimate
             for name, cause in suspicions(recording, loaded_model, doubtful, rate_hz).items():
                 document["axes"][name]["suspicion"] = cause
+            for name in doubtful:
+                if "saturation" in document["axes"][name]["checks"]:
+                    document["axes"][name]["suspicion"] = "saturation"
             if model is None:
                 progress.update(task, description="more laws")
                 _weigh_more_laws(document, recording, doubtful, decimate)
@@ -158,18 +164,31 @@ def identify_axis(
     *,
     draw: bool = False,
 ) -> Identified:
-    """One axis by one engine. The record is fed as float32, as the firmware gets it. With regressors every subset of
-    them is scored; `advance` is called after each. `draw`: with the Allan deviation of the samples."""
-    group = model.group_of(name)
+    """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
+    is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
+    `advance` is called after each. `draw`: with the Allan deviation of the samples."""
+    group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
+    readings = look(recording, name, group)
+    recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
-    samples = as_float(recording.in_unit(name, group.unit))
+    values, offset = readings.working, 0.0
+    if readings.clipped is not None or readings.coarse > SPACING_LEAST:
+        # What takes the place of clipped readings may lie beyond the range, and so may readings less an offset.
+        beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
+        values = np.where(beyond, np.nan, values)
+        group = replace(group, range=0.0)
+        tables = replace(tables, axes=(replace(tables.axes[0], range=0.0),))
+    if readings.coarse > SPACING_LEAST:
+        offset = float(np.float32(np.nanmedian(values)))
+    samples = as_float(values - offset)
     columns = as_float(columns_of(regressors, recording))
     for name_of, column in zip([column.name for column in tables.regressors], columns.T, strict=True):
         beyond = np.abs(column) >= _library32.SAMPLE_MAX
         if beyond.any():
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
-    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
+    blocks = usable_blocks(samples, recording.missing_before, tables, group, columns, readings.counted)
+    blocks = replace(blocks, mean=blocks.mean + offset)
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     if engine == "reference" and model.handling.outlier_sd:
@@ -187,7 +206,7 @@ def identify_axis(
     if engine in ("library", "fixed"):
         from selfcal.engines.library import Bank
 
-        bank = Bank(tables, fixed=engine == "fixed")
+        bank = Bank(tables, fixed=engine == "fixed", offset=offset)
         bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
         for choice in choices:
             results.append(bank.report(0, mask_of(regressors, choice)))
@@ -204,9 +223,8 @@ def identify_axis(
                 reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r, *with_columns)
             )
             advance()
-    unit = recording.columns[name].unit
     if not regressors:
-        judged = with_lattice(judge(blocks, tables, group, results[0]), recording, name, group)
+        judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit)
         curve = curve_of_samples(samples) if draw else None
         return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, blocks.kept_out, None, curve)
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
@@ -215,7 +233,7 @@ def identify_axis(
         raise UserError(outside_priors(tables.axes[0]))
     inside = combine(choices, results, model.hypotheses, group.unit)
     used = _used(mask_of(regressors, choices[inside.best]))
-    judged = with_lattice(judge(blocks, tables, group, results[inside.best], used), recording, name, group)
+    judged = with_readings(judge(blocks, tables, group, results[inside.best], used), readings, group, unit)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)

@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 
 from selfcal.blocks import usable_blocks
-from selfcal.checks import Judged, judge, with_lattice
+from selfcal.checks import Judged, judge, with_readings
 from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
@@ -30,6 +30,7 @@ from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
+from selfcal.readings import look
 from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, load
 from selfcal.regressors import (
     Choice,
@@ -477,7 +478,8 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     judged = Judged({}, None)
     if not gate:
         used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
-        judged = with_lattice(judge(blocks, tables, group, result, used), recording, name, group)
+        readings = look(recording, name, group)
+        judged = with_readings(judge(blocks, tables, group, result, used), readings, group, unit, as_fed=True)
     told = in_unit(result, group.unit, unit)
     return Identified(unit, group.unit, told, judged, blocks.kept_out, replace(scored, result=told) if scored else None)
 

@@ -19,6 +19,8 @@ EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
 #: instead of 1350 / e gained 2.5 nats.
 LN_FLICKER = -1.5
 LN_OUTLIERS = -1.5
+#: Outliers are exceptions: a look that takes more of the samples for them has another cause.
+OUTLIERS_MOST = 0.05
 
 
 def ln_changes(n: int, gain: float) -> float:
@@ -175,7 +177,12 @@ def variance_change(state: State, record: Record) -> list[Look]:
 
 
 def outliers(state: State, record: Record) -> list[Look]:
-    """Isolated wild samples: a mixture of the innovations with a share of wider ones."""
+    """Isolated wild samples. They are exceptions: a mixture with many of them has another cause."""
+    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= OUTLIERS_MOST]
+
+
+def mixed(state: State, record: Record) -> list[Look]:
+    """A mixture of the innovations with a share of wider ones."""
     w = state.whitened
     present = np.isfinite(w)
     x = w[present]
@@ -214,6 +221,8 @@ def outliers(state: State, record: Record) -> list[Look]:
         worth *= float(alone.mean())
     y = state.y.copy()
     y[picked] = np.nan
+    if not np.nanmax(y) > np.nanmin(y):
+        return []  # the others are all equal: a dead band
     largest = int(picked[np.argmax(np.abs(w[picked]))])
     fraction = picked.size / n
     return [

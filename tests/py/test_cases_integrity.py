@@ -1,0 +1,397 @@
+"""Readings that are none, and clocks that change: found in the raw readings, whatever the rate they are averaged to.
+
+Truth: what was done to records of known noise. Shares of intervals that hold the truth have binomial limits: 90 % less
+the 5 % that are allowed, less three standard deviations of the share. A few records are held to 5 sd instead.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from selfcal.diagnosis.loop import Diagnosed, diagnose_record
+from selfcal.diagnosis.record import of_recording
+from selfcal.model import Model
+from selfcal.readings import evened, look
+from selfcal.recording import Column, Recording, load, save
+from selfcal.sampling import sampling
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify_axis
+
+from conftest import case_records, run, shared_case, shared_recording
+
+Array = NDArray[np.float64]
+MODEL = Model.load(None)
+GYRO = MODEL.group_of("gx")
+#: Median, 5 % and 95 % of a posterior in standard deviations.
+HALF_90 = 1.645
+
+
+def a_recording(values: Array, rate_hz: float, time: Array | None = None, axis: str = "gx") -> Recording:
+    """One axis, deg/s, on an even grid or with the stamps `time`."""
+    missing, off = np.zeros(values.size, np.int64), None
+    if time is not None:
+        step, missing = sampling(time, 1e-9, None)
+        off = time - (np.arange(time.size) + np.cumsum(missing)) * step
+        rate_hz = 1.0 / step
+    return Recording(Path("a"), rate_hz, {axis: Column(axis, "deg/s", values)}, missing, {}, off)
+
+
+def noise(random: np.random.Generator, n: int, rate_hz: float, K: float = 0.0) -> tuple[Array, Array]:
+    """Readings of N 0.04 deg/s/sqrt(Hz) about a bias, and the bias with its walk."""
+    bias = random.uniform(-5.0, 5.0) + np.cumsum(random.normal(size=n)) * K / math.sqrt(rate_hz)
+    return bias + 0.04 * math.sqrt(rate_hz) * random.normal(size=n), bias
+
+
+class Held:
+    """Counts how often the 90 % intervals of `identify` hold the truth."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, list[bool]] = {}
+        self.far = 0.0
+
+    def add(self, recording: Recording, bias: float, N: float, K: float = 0.0) -> dict[str, bool]:
+        """The checks of the axis that failed."""
+        found = identify_axis(recording, "gx", MODEL, "library", None)
+        estimates = found.result.parameters["random_walk" if K else "constant"]
+        for name, truth in (("N", N), ("K", K)):
+            if truth and (one := estimates[name]).identified:
+                self.held.setdefault(name, []).append(one.q05 <= truth <= one.q95)
+                off = math.log(truth / one.median) / math.log((one.q95 if truth > one.median else one.q05) / one.median)
+                self.far = max(self.far, HALF_90 * off)
+        distance = abs(found.result.bias_mean - bias) / found.result.bias_sd
+        self.held.setdefault("bias", []).append(distance < HALF_90)
+        self.far = max(self.far, distance)
+        return {name: True for name, check in found.judged.checks.items() if not check["passed"]}
+
+    def check(self) -> None:
+        assert self.far < 5.0
+        for name, held in self.held.items():
+            if len(held) >= 100:
+                least = 0.85 - 3.0 * math.sqrt(0.85 * 0.15 / len(held))
+                assert np.mean(held) > least, name
+
+
+def judged(recording: Recording) -> Diagnosed:
+    """What the diagnosis finds, without a library's warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return diagnose_record(of_recording(recording, MODEL), ["gx"])["gx"]
+
+
+def causes(one: Mapping[str, Any]) -> list[str]:
+    """Of an axis of the document."""
+    return [finding["cause"] for finding in one["findings"]]
+
+
+# ------------------------------------------------------------------------------------------------------------- lattice
+
+FORMS: dict[str, Callable[[Array], Array]] = {
+    "8 digits": lambda y: np.array([float(f"{value:.8g}") for value in y]),
+    "6 digits": lambda y: np.array([float(f"{value:.6g}") for value in y]),
+    "5 digits": lambda y: np.array([float(f"{value:.5g}") for value in y]),
+    "float32": lambda y: y.astype(np.float32).astype(np.float64),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_digits_of_a_number_are_no_lattice(form: str) -> None:
+    """Spacing that changes with the size of the reading: clean records about 0 to 10 at 1 to 100 Hz show nothing."""
+    records, wrong = case_records(2, 200), 0
+    for seed in range(records):
+        random = np.random.default_rng([1, seed, len(form)])
+        rate = float(random.choice([1.0, 10.0, 100.0]))
+        y, bias = noise(random, 2500, rate, 2e-4)
+        level = float(random.choice([-0.02, 0.0, 0.97, 1.01, 9.81, -9.99]))
+        wrong += bool(judged(a_recording(FORMS[form](y - bias[0] + level), rate)).findings)
+    assert wrong <= max(0, records // 200)
+
+
+@pytest.mark.parametrize("block", [2, 5, 10, 16])
+def test_means_of_readings_on_a_lattice_are_judged_by_it(block: int) -> None:
+    """Means of `block` readings, as sums in floating point: their lattice is a part of the first one's. Truth: the
+    noise is white, and no statistic of the lattice stands out. A coarse lattice is one to be told of."""
+    records, wrong = case_records(2, 200), 0
+    for seed in range(records):
+        random = np.random.default_rng([2, seed, block])
+        rate = float(random.choice([1.0, 10.0, 100.0]))
+        y, _ = noise(random, 2500 * block, rate * block)
+        q = 0.04 * math.sqrt(rate * block) * random.uniform(0.1, 1.8)
+        means = (np.rint(y / q) * q).reshape(-1, block).mean(axis=1)
+        wrong += any(finding.look.cause != "quantization" for finding in judged(a_recording(means, rate)).findings)
+    assert wrong <= max(0, records // 200)
+
+
+def test_the_means_of_the_real_runs_show_no_lattice_statistic() -> None:
+    """Ten-sample means of a run whose readings lie on 0.05 deg/s: a sixth of it, one axis (make cases: all, whole)."""
+    from selfcal.diagnosis.statistics import judged as statistics
+
+    whole = bool(case_records(0, 1))
+    for number in (1, 2, 4) if whole else (2,):
+        recorded = shared_recording(f"adis16405_run{number}.npz")
+        n = recorded.samples // (1 if whole else 20) // 10 * 10
+        columns = {
+            name: replace(one, values=one.values[:n].reshape(-1, 10).mean(axis=1))
+            for name, one in recorded.columns.items()
+            if whole or name == "gx"
+        }
+        means = replace(recorded, rate_hz=10.0, columns=columns, missing_before=np.zeros(n // 10, np.int64))
+        for name, state in of_recording(means, MODEL).axes.items():
+            rows = {row.name: row.p for row in statistics(state.refit())}
+            of_lattice = [rows[key] for key in ("repeated_readings", "longest_repeat", "odd_even_codes") if key in rows]
+            assert min(of_lattice) > 1e-5, (number, name)
+
+
+def test_a_dead_band_is_told_of_without_a_warning() -> None:
+    """Readings near one value read as that value, on no lattice. Nothing claims most of the samples as exceptions."""
+    for width in (0.3, 1.0, 2.5):
+        y, bias = noise(np.random.default_rng(3), 4000, 10.0)
+        y = np.where(np.abs(y - bias[0]) < width * 0.04 * math.sqrt(10.0), bias[0], y)
+        found = judged(a_recording(y, 10.0)).findings
+        assert found, width
+        assert "outliers" not in [finding.look.cause for finding in found]
+
+
+# ------------------------------------------------------------------------------------------------------------ clipping
+
+
+@pytest.mark.parametrize(
+    ("share", "both", "rate", "q", "K"),
+    [(0.05, False, 100.0, 0.0, 0.0), (0.2, True, 50.0, 0.0, 1e-3), (0.38, False, 20.0, 0.09, 1e-3),
+     (0.6, False, 100.0, 0.0, 0.0)],
+)  # fmt: skip
+def test_clipped_readings_are_said_and_spoil_nothing(share: float, both: bool, rate: float, q: float, K: float) -> None:
+    """A share of the readings is at the part's own rail, or at two: N, K and the bias are those of the unclipped."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([4, seed, round(100 * share)])
+        y, bias = noise(random, round(400 * rate), rate, K)
+        sign = random.choice([-1.0, 1.0])
+        limits = [float(np.quantile(sign * y, 0.1)) if both else -math.inf, float(np.quantile(sign * y, 1.0 - share))]
+        if q:
+            y, limits = (
+                np.rint(y / q) * q,
+                [q * round(limit / q) if math.isfinite(limit) else limit for limit in limits],
+            )
+        y = sign * np.clip(sign * y, *limits)
+        N = math.sqrt(0.04**2 + q * q / 12.0 / rate)
+        assert "saturation" in held.add(a_recording(y, rate), float(bias[-1]), N, K)
+        found = look(a_recording(y, rate), "gx", GYRO).clipped
+        assert found is not None
+        assert len(found.limits) == 1 + both
+        assert sign * limits[1] == pytest.approx(max(found.limits, key=lambda limit: sign * limit), abs=1e-9)
+    held.check()
+
+
+def test_clipping_at_the_models_range_is_clipping_too() -> None:
+    """A range that the model states: readings at it are clipped, and those beyond it are none."""
+    y, bias = noise(np.random.default_rng(5), 40_000, 100.0)
+    limit = abs(float(bias[0])) + 0.1
+    model = replace(MODEL, groups=tuple(replace(group, range=limit) for group in MODEL.groups))
+    found = identify_axis(a_recording(np.clip(y, -limit, limit), 100.0), "gx", model, "library", None)
+    assert abs(found.result.bias_mean - bias[0]) < 4.0 * found.result.bias_sd
+    N = found.result.parameters["constant"]["N"]
+    assert abs(N.median - 0.04) < 4.0 * N.sd
+    assert not found.judged.checks["saturation"]["passed"]
+
+
+@pytest.mark.parametrize("decimate", [1.0, 10.0])
+def test_the_diagnosis_names_clipping_at_every_rate(decimate: float, tmp_path: Path) -> None:
+    """38 % of the readings at the part's rail, far below the model's range: that alone, with the truth beside it."""
+    axis = diagnose(shared_case("P26_clip_own.py", tmp_path), decimate=decimate)["axes"]["az"]
+    assert causes(axis) == ["saturation"]
+    assert axis["findings"][0]["estimate"]["limit"]["median"] == pytest.approx(19.6133, rel=1e-6)
+    N = axis["posterior"]["parameters"]["constant"]["N"]
+    assert N["q05"] < 0.02 < N["q95"]
+
+
+# ---------------------------------------------------------------------------------------------------------- stuck, held
+
+
+@pytest.mark.parametrize(
+    ("rate", "q", "K"), [(100.0, 0.0, 0.0), (100.0, 0.01, 1e-3), (10.0, 0.12, 0.0), (1.0, 0.0, 1e-3)]
+)
+def test_stuck_stretches_are_left_out_whole(rate: float, q: float, K: float) -> None:
+    """Two stretches of equal readings, on a lattice or none, each 2 to 10 % of the record: from the first one to the
+    last they are found, and the rest has the truth."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([6, seed, round(rate)])
+        n = round(max(300.0 * rate, 2000.0))
+        y, bias = noise(random, n, rate, K)
+        if q:
+            y = np.rint(y / q) * q
+        truth = []
+        for first in (0.1, 0.6):
+            start, count = round(random.uniform(first, first + 0.3) * n), round(random.uniform(0.02, 0.1) * n)
+            y[start : start + count] = y[start]
+            truth.append((start / rate, (start + count) / rate))
+        recording = a_recording(y, rate)
+        failed = held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + q * q / 12.0 / rate), K)
+        found = look(recording, "gx", GYRO).intervals
+        assert len(found) == 2
+        # A neighbour may have the same code by chance: at most a few readings.
+        assert np.abs(np.array(found) - truth).max() <= 8.0 / rate
+        assert "lattice" not in failed
+    held.check()
+
+
+@pytest.mark.parametrize("ratio", [2.5, 3.0, 5.0, 10.0, 4.3])
+def test_held_readings_are_taken_once(ratio: float) -> None:
+    """A part on a lattice that is asked `ratio` times as often as it measures, at times that jitter by a tenth."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([7, seed, round(10 * ratio)])
+        y, bias = noise(random, 30_000, 100.0, 1e-3)
+        y = np.rint(y / 0.01) * 0.01
+        count = int(y.size * ratio) - 10
+        asked = (np.arange(count) + random.uniform() + 0.1 * random.uniform(-0.5, 0.5, count)) / ratio
+        recording = a_recording(y[np.clip(asked.astype(np.int64), 0, y.size - 1)], 100.0 * ratio)
+        assert not held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + 1e-4 / 12.0 / 100.0), 1e-3)
+        assert look(recording, "gx", GYRO).held_hz == pytest.approx(100.0, rel=1e-3)
+    held.check()
+
+
+def test_one_slow_axis_leaves_the_others_at_their_rate() -> None:
+    """gx at 100 Hz beside gy that is new every fourth row: each has its truth, and gy alone is held."""
+    random = np.random.default_rng(8)
+    fast, slow = noise(random, 8000, 100.0)[0], np.repeat(noise(random, 2000, 25.0)[0], 4)
+    both = a_recording(fast, 100.0)
+    both = replace(both, columns={**both.columns, "gy": Column("gy", "deg/s", slow)})
+    record = of_recording(both, MODEL)
+    found = diagnose_record(record, ["gx", "gy"])
+    assert not found["gx"].findings
+    assert [one.look.cause for one in found["gy"].findings] == ["held_samples"]
+    assert record.readings["gy"].held_hz == pytest.approx(25.0)
+    for one in found.values():
+        assert one.state.best.sigma * math.sqrt(0.01) == pytest.approx(0.04 if one is found["gx"] else 0.02, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("case", "cause", "truth"),
+    [("P20c_hold_lattice.py", "held_samples", {"rate_hz": 200.0}),
+     ("P35_i2c_freeze.py", "stuck", {"intervals": [[1200.0, 1800.0]]}),
+     ("P85_rate_change.py", "rate_change", {"time_s": 900.0, "before_hz": 100.0, "after_hz": 50.0})],
+)  # fmt: skip
+def test_the_diagnosis_of_a_case_has_one_cause(
+    case: str, cause: str, truth: dict[str, Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The shared cases as their README has them: the cause alone, N 0.04 beside it, and nothing on the terminal."""
+    axis = diagnose(shared_case(case, tmp_path), axes=["gx"], decimate=4.0)["axes"]["gx"]
+    assert causes(axis) == [cause]
+    estimate = axis["findings"][0]["estimate"]
+    for key, value in truth.items():
+        found = estimate[key]["median"] if key != "intervals" else np.array(estimate[key])
+        assert found == pytest.approx(np.array(value) if key == "intervals" else value, rel=1e-3)
+    N = axis["posterior"]["parameters"]["constant"]["N"]
+    assert N["q05"] < 0.0402 < N["q95"]
+    assert capfd.readouterr().err == ""
+
+
+# --------------------------------------------------------------------------------------------------------------- clock
+
+
+@pytest.mark.parametrize(("before", "after"), [(100.0, 50.0), (50.0, 200.0), (104.0, 83.0), (10.0, 9.6)])
+def test_a_change_of_rate_is_found_and_spoils_nothing(before: float, after: float) -> None:
+    """Stamps of two rates with jitter and lost rows; the part has one N. Its place is known to a few intervals."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([9, seed, round(before)])
+        counts = [round(random.uniform(0.3, 0.7) * 6000 * rate / before) for rate in (before, after)]
+        dt = np.repeat([1.0 / before, 1.0 / after], counts)
+        bias = random.uniform(-5.0, 5.0) + np.cumsum(random.normal(size=dt.size) * 1e-3 * np.sqrt(dt))
+        y = bias + 0.04 / np.sqrt(dt) * random.normal(size=dt.size)
+        time = np.cumsum(dt) + 0.2 * dt * random.uniform(-0.5, 0.5, dt.size)
+        kept = random.random(dt.size) > 0.005
+        kept[0] = True
+        time, y = np.round(time[kept] - time[0], 6), y[kept]
+        recording = a_recording(y, 0.0, time)
+        held.add(recording, float(bias[-1]), 0.04, 1e-3)
+        change = evened(recording)[1]
+        assert change is not None
+        assert change.time_s == pytest.approx(counts[0] / before, abs=10.0 / min(before, after))
+        assert (change.before_hz, change.after_hz) == pytest.approx((before, after), rel=5e-3)
+    held.check()
+
+
+def test_readings_at_random_times_have_their_mean_rate() -> None:
+    """Stamps of a Poisson process with a gap of 100 mean intervals: N is that at the mean rate."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([10, seed])
+        rate = float(random.choice([20.0, 100.0]))
+        dt = random.exponential(1.0 / rate, 8000)
+        dt[random.integers(1000, 7000)] = 100.0 / rate
+        bias = random.uniform(-5.0, 5.0)
+        y = bias + 0.04 * math.sqrt(rate) * random.normal(size=dt.size)
+        recording = a_recording(y, 0.0, np.round(np.cumsum(dt) - dt[0], 6))
+        assert recording.rate_hz == pytest.approx(rate, rel=5.0 / math.sqrt(8000))
+        assert recording.missing_before.max() == pytest.approx(99, rel=0.06)
+        held.add(recording, bias, 0.04)
+    held.check()
+
+
+def test_bursts_of_a_bus_have_the_rate_of_the_part(tmp_path: Path) -> None:
+    """Five samples together every 50 ms, stamped close to each other."""
+    recording = load(shared_case("P99_usb_stamps.py", tmp_path))
+    assert recording.rate_hz == pytest.approx(99.31, rel=1e-3)
+    assert not recording.missing_before.any()
+
+
+@pytest.mark.parametrize("engine", ["library", "fixed", *(["reference"] if case_records(0, 1) else [])])
+def test_an_offset_of_a_million_times_the_noise_costs_nothing(engine: str) -> None:
+    """Steps of float32 are 1.25 times the noise there. Without the offset the answer is the same to its digits."""
+    offset, random = 5e5, np.random.default_rng(11)
+    y = 0.05 * random.normal(size=1200)
+    groups = tuple(
+        replace(group, range=0.0, priors={**group.priors, "bias": replace(group.priors["bias"], sd=1e6)})
+        for group in MODEL.groups
+    )
+    wide = replace(MODEL, groups=groups)
+    far = identify_axis(a_recording(y + offset, 1.0), "gx", wide, engine, None)
+    near = identify_axis(a_recording(y, 1.0), "gx", wide, engine, None)
+    assert far.result.bias_mean - offset == pytest.approx(near.result.bias_mean, abs=0.1 * near.result.bias_sd)
+    for law, parameters in near.result.parameters.items():
+        assert far.result.parameters[law]["N"].median == pytest.approx(parameters["N"].median, rel=2e-3)
+    assert far.adequate
+
+
+# ---------------------------------------------------------------------------------------------------------- clean twins
+
+
+def test_clean_records_show_none_of_it() -> None:
+    """White noise and a walk on lattices up to three times the noise, at even, jittering and lossy stamps. Without the
+    effect each look fires in 1 of 200 at most; together in 1 of 100."""
+    records, found = case_records(10, 600), 0
+    for seed in range(records):
+        random = np.random.default_rng([12, seed])
+        rate = float(random.choice([1.0, 10.0, 100.0]))
+        y, _ = noise(random, 4000, rate, float(random.choice([0.0, 1e-3])))
+        q = 0.04 * math.sqrt(rate) * float(random.choice([0.0, 0.01, 0.3, 1.0, 2.0, 3.0]))
+        y = np.rint(y / q) * q if q else y
+        time = np.arange(y.size) / rate
+        if random.random() < 0.7:
+            time = time + random.choice([0.0, 0.1, 0.4]) / rate * random.uniform(-0.5, 0.5, y.size)
+            kept = random.random(y.size) > random.choice([0.0, 0.003, 0.05])
+            kept[0] = True
+            y, time = y[kept], np.round(time[kept] - time[0], 6)
+        recording = a_recording(y, rate, time)
+        one = look(recording, "gx", GYRO)
+        found += bool(one.intervals) + (one.clipped is not None) + (one.held_hz is not None) + (one.change is not None)
+    assert found <= records // 100
+
+
+def test_no_warning_of_a_library_reaches_the_user(tmp_path: Path) -> None:
+    """A dead band that holds nearly every reading: whatever is found, numpy keeps silent."""
+    y, bias = noise(np.random.default_rng(13), 2000, 10.0)
+    save(tmp_path / "log.csv", {"gx": ("deg/s", np.where(np.abs(y - bias) < 0.32, bias[0], y))}, 10.0)
+    for verb in ("identify", "diagnose"):
+        assert "Warning" not in run(verb, tmp_path / "log.csv").stderr

@@ -1,0 +1,485 @@
+"""What the readings of a recording show by themselves: a change of rate, held, stuck and clipped ones.
+
+None of it needs a fit. `identify` and `diagnose` look at it once, at the recording's own rate, whatever they average.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.special import log_ndtr, ndtr, ndtri_exp
+
+from selfcal.lattice import Lattice, lattice_of
+from selfcal.model import Group
+from selfcal.recording import Column, Recording
+from selfcal.sampling import rate_change
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+
+#: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
+CLOCK_LEAST = 1e-3
+#: Pieces on either side of a change, and standard deviations of their slopes that it takes.
+SLOPES, SLOPES_LEAST = 10, 8.0
+#: Longest common interval of two rates, s, and how far off it may be.
+COMMON_S, COMMON_OFF = 0.5, 3e-3
+#: Runs of equal readings that show held ones at least.
+RUNS_LEAST = 50
+#: ln of the probability, a record, of a run of equal readings that is no chance.
+LN_STUCK = math.log(1e-9)
+#: Samples on either side that make the level of one.
+AROUND = 32
+#: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
+CLIPPED_LEAST = -math.log(5e-4)
+#: A reading that bears less than this share of an unclipped one's information bears none.
+INFORMATION_LEAST = 0.05
+#: Steps of EM at most, and the change of the noise at which it has settled.
+ITERATIONS, SETTLED = 200, 1e-6
+
+
+@dataclass(frozen=True)
+class RateChange:
+    """The sampling rate changes once: `time_s`, the rates before and after, and the evidence in nats."""
+
+    time_s: float
+    before_hz: float
+    after_hz: float
+    nats: float
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Readings at limits: by limit [unit] the mask [n] of its readings, and the evidence in nats."""
+
+    limits: Mapping[float, Mask]
+    nats: float
+
+    @property
+    def mask(self) -> Mask:
+        """Every clipped reading, [n]."""
+        found: Mask = np.logical_or.reduce(list(self.limits.values()))
+        return found
+
+    @property
+    def limit(self) -> float:
+        """The limit with the most readings."""
+        return max(self.limits, key=lambda limit: int(self.limits[limit].sum()))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck`. `working` [n] are
+    those to average: clipped ones give their information to others (see `_unclipped`). In `drawn` [n] a clipped one is
+    drawn by chance beyond its limit. `kept_out` counts both kinds.
+
+    `recording`: of the part's own readings, [n] rows. `held_hz`: the rate of the part, where the logger asked oftener.
+    """
+
+    recording: Recording
+    values: Array
+    working: Array
+    drawn: Array
+    lattice: Lattice | None
+    stuck: Mask
+    stuck_nats: float = 0.0
+    clipped: Clipped | None = None
+    kept_out: Mapping[str, int] = field(default_factory=dict)
+    held_hz: float | None = None
+    change: RateChange | None = None
+
+    def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
+        """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
+        found = {reason: count + self.kept_out.get(reason, 0) for reason, count in kept_out.items()}
+        return {**found, "not_finite": found["not_finite"] - int((~np.isfinite(self.working)).sum())}
+
+    @property
+    def coarse(self) -> float:
+        """Spacing of float32 at the largest reading, in the noise of one."""
+        values = self.working[np.isfinite(self.working)]
+        with np.errstate(over="ignore"):
+            largest = np.float32(np.abs(values).max(initial=0.0))
+        noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
+        return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
+
+    @property
+    def intervals(self) -> list[list[float]]:
+        """Start and end of every stuck stretch, s."""
+        time = self.recording.time_s
+        step = 1.0 / self.recording.rate_hz
+        return [[float(time[a]), float(time[b - 1]) + step] for a, b in _stretches(self.stuck)]
+
+
+def look(recording: Recording, axis: str, group: Group) -> Readings:
+    """The readings of an axis at the part's own rate. O(n log n)."""
+    even, change = evened(recording)
+    own, held_hz = thinned(even, (axis,))
+    return replace(readings_of(own, axis, group), held_hz=held_hz, change=change)
+
+
+def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
+    """The readings of an axis of an evened and thinned recording."""
+    values = recording.in_unit(axis, group.unit)
+    none = np.zeros(values.size, bool)
+    # Readings beyond the part's range are none: the engines leave them out.
+    inside = np.abs(values) <= (group.range * (1.0 + 1e-6) if group.range > 0.0 else math.inf)
+    if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
+        return Readings(recording, values, values, values, None, none)
+    lattice = lattice_of(values[inside], recording.rate_hz)
+    sound = values if inside.all() else np.where(inside, values, np.nan)
+    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+    if stuck.any():
+        values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+    clipped = _clipped(sound, lattice)
+    working = drawn = values
+    if clipped is not None:
+        working, drawn = _unclipped(sound, clipped, lattice)
+    lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
+    counts = {"saturated": lost, "stuck": int(stuck.sum())}
+    return Readings(recording, values, working, drawn, lattice, stuck, nats, clipped, counts)
+
+
+def _stretches(mask: Mask) -> list[tuple[int, int]]:
+    """First row and the row after the last of every stretch of a mask [n]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+# ------------------------------------------------------------------------------------------------------ change of rate
+
+
+def evened(recording: Recording) -> tuple[Recording, RateChange | None]:
+    """The recording on one even grid, where its rate changes once: means over an interval that both rates share."""
+    off = recording.off_grid_s
+    if off is None or off.size < 60:
+        return recording, None
+    time = recording.time_s + off
+    found = rate_change(time) or _small_change(time, recording)
+    if found is None:
+        return recording, None
+    row, before_s, after_s, nats = found
+    change = RateChange(float(time[row] - time[0]), 1.0 / before_s, 1.0 / after_s, nats)
+    return _regridded(recording, time, row, before_s, after_s), change
+
+
+def _small_change(time: Array, recording: Recording) -> tuple[int, float, float, float] | None:
+    """The same of a change so small that the grid is known: the time stamps laid on it have a bend."""
+    off = recording.off_grid_s
+    assert off is not None
+    k = np.arange(off.size)
+    off = off - np.interp(k, [0, k[-1]], [off[0], off[-1]])
+    edge = max(10, off.size // 50)
+    at = edge + int(np.argmax(np.abs(off[edge:-edge])))
+    halves = (slice(None, at), slice(at, None))
+    lines = [np.polyfit(k[half], off[half], 1) for half in halves]
+    bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
+    scatter = float((off - bent).std())
+    step = 1.0 / recording.rate_hz
+    change = float(lines[1][0] - lines[0][0]) / step
+    bend = float(np.abs(off).max())
+    if abs(change) < CLOCK_LEAST or bend < 3.0 * step or bend < 5.0 * scatter:
+        return None
+    # Random times walk off any grid. The slopes of pieces show how far.
+    slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]
+    if abs(change) * step < SLOPES_LEAST * math.hypot(*(float(one.std()) / math.sqrt(one.size) for one in slopes)):
+        return None
+    nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * step)) ** 2)
+    return at, step + float(lines[0][0]), step + float(lines[1][0]), nats
+
+
+def _regridded(recording: Recording, time: Array, row: int, before_s: float, after_s: float) -> Recording:
+    """Means of whole blocks of either side over an interval that both share; a block with a gap in it is missing."""
+    blocks = _common(before_s, after_s)
+    starts = []
+    first = 0
+    index = np.empty(time.size, np.int64)
+    for part, step, block in ((slice(0, row), before_s, blocks[0]), (slice(row, None), after_s, blocks[1])):
+        if time[part].size == 0:
+            continue
+        here = time[part]
+        rows = np.arange(here.size)
+        gaps = np.rint(np.maximum(0.0, np.diff(here, prepend=here[0]) - 0.5 * step) / step).astype(np.int64)
+        gaps = np.where(gaps > 1, gaps - 1, 0)  # a late stamp is no gap
+        at = (rows + np.cumsum(gaps)) // block
+        index[part] = first + at
+        starts.append((first, block))
+        first += int(at[-1]) + 1
+    size = np.full(first, starts[-1][1])
+    size[: starts[-1][0]] = starts[0][1]
+    used = np.bincount(index, minlength=first)
+    whole = np.flatnonzero(used == size)
+    columns = {
+        name: Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
+        for name, column in recording.columns.items()
+    }
+    missing = np.diff(whole, prepend=-1) - 1
+    missing[0] = 0
+    rate = float(f"{2.0 / (blocks[0] * before_s + blocks[1] * after_s):.10g}")
+    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None)
+
+
+def _common(before_s: float, after_s: float) -> tuple[int, int]:
+    """Samples before and after that take the same time: the fewest, else those that fit best within COMMON_S."""
+    best, least = (1, 1), math.inf
+    for count in range(1, max(1, int(COMMON_S / max(before_s, 1e-9))) + 1):
+        other = max(1, round(count * before_s / after_s))
+        off = abs(other * after_s / (count * before_s) - 1.0)
+        if off < COMMON_OFF:
+            return count, other
+        if off < least:
+            best, least = (count, other), off
+    return best
+
+
+# -------------------------------------------------------------------------------------------------------- held readings
+
+
+def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, float | None]:
+    """The recording with each reading of the part once, where all of `axes` hold every reading for as long; its rate
+    in Hz. Else the recording as it is, and None."""
+    holds = [_held(recording, name) for name in axes]
+    if not holds or any(one is None for one in holds):
+        return recording, None
+    ratios = [one[0] for one in holds if one is not None]
+    if max(ratios) > 1.01 * min(ratios):
+        return recording, None
+    first = holds[0]
+    assert first is not None
+    ratio, rows = first
+    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    missing = np.maximum(0, np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64) - 1)
+    columns = {name: Column(name, one.unit, one.values[rows]) for name, one in recording.columns.items()}
+    rate = recording.rate_hz / ratio
+    thin = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None)
+    return thin, rate
+
+
+def own_rows(recording: Recording, axis: str) -> Rows | None:
+    """The rows that hold a new reading of an axis, where it holds each for several rows; else None."""
+    found = _held(recording, axis)
+    return None if found is None else found[1]
+
+
+def _held(recording: Recording, axis: str) -> tuple[float, Rows] | None:
+    """Rows a reading, and the rows at which readings begin, where a logger asks a part oftener than it measures.
+
+    Readings that repeat by chance make runs of any length, most of them of one. Held ones make few shorter than half
+    of the usual run. A run of several lengths is of as many readings that are equal by chance.
+    """
+    values = recording.columns[axis].values
+    n = values.size
+    changes = np.flatnonzero(np.diff(values) != 0.0) + 1
+    if not RUNS_LEAST <= changes.size < 0.55 * n:
+        return None
+    starts = np.concatenate([[0], changes])
+    lengths = np.diff(starts, append=n)
+    inner = lengths[1:-1]
+    low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
+    if usual < 2 or low <= 0.5 * usual:
+        return None
+    ratio = float(inner[inner <= 1.5 * usual].mean())
+    for _ in range(20):
+        times = np.maximum(1, np.rint(inner / ratio))
+        single = times <= 3
+        again = float(inner[single].sum() / times[single].sum())
+        if abs(again - ratio) < 1e-9 * ratio:
+            break
+        ratio = again
+    times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
+    run = np.repeat(np.arange(starts.size), times)
+    place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
+    return ratio, starts[run] + place * lengths[run] // times[run]
+
+
+# ------------------------------------------------------------------------------------------------------- stuck readings
+
+
+def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float]:
+    """Whole runs of equal readings [n] that are no chance, and the evidence in nats. `stated`: a length from which on a
+    run is stuck whatever the chance; 0: none.
+
+    The chance that a reading repeats is the largest of three: the noise stays within one cell of the lattice, the level
+    in its middle; the share of repeats; their share among readings after a repeat, since a dead band has more.
+    """
+    n = values.size
+    change = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    lengths = np.diff(change, append=n)
+    none = np.zeros(n, bool)
+    if lengths.max(initial=0) < 4:
+        return none, 0.0
+    inside = 0.0
+    if lattice is not None and math.isfinite(lattice.coarseness):
+        # A coarse lattice shows its noise only roughly: 0.7 of it is the least.
+        noise = math.sqrt(max(1.0 / lattice.coarseness**2 - 1.0 / 12.0, 0.01)) * (0.7 if lattice.too_coarse else 1.0)
+        inside = 2.0 * float(ndtr(0.5 / noise)) - 1.0
+    limit = n
+    chance = max(inside, 0.01)
+    for _ in range(4):
+        wanted = 1 + math.ceil((LN_STUCK - math.log(n)) / math.log(min(chance, 1.0 - 1e-12)))
+        if wanted == limit:
+            break
+        limit = wanted
+        short = lengths[lengths < limit]
+        repeats, twice = int((short - 1).sum()), int(np.maximum(short - 2, 0).sum())
+        chance = max(inside, (repeats + 0.5) / n, (twice + 0.5) / (repeats + 50.0), 0.01)
+    least = min(limit, stated) if stated > 0 else limit
+    stuck = lengths >= least
+    if not stuck.any():
+        return none, 0.0
+    frozen = values[change[stuck]]
+    again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
+    if again > 1 and 2 * int(lengths[stuck].sum()) > n:
+        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
+    nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
+    return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
+
+
+# ----------------------------------------------------------------------------------------------------- clipped readings
+
+
+def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
+    """Readings [n] that pile up at their largest or smallest value: noise would go on beyond it, and none does.
+
+    The number expected beyond is the evidence, in nats (Poisson). Noise is normal about the mean of its neighbours.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows]
+    if y.size < 4 * AROUND or (lattice is not None and lattice.too_coarse):
+        return None
+    half = 0.5 * lattice.step if lattice is not None else 0.0
+    edges = [(sign, float((sign * y).max())) for sign in (1, -1)]
+    at_edges = [sign * y >= edge - max(1e-9 * max(1.0, abs(edge)), 0.5 * half) for sign, edge in edges]
+    if all(at_edge.sum() < 3 for at_edge in at_edges):
+        return None
+    size = 2 * AROUND + 1
+    level = (uniform_filter1d(y, size, mode="reflect") * size - y) / (size - 1)
+    # The level's own noise, 1 / (2 AROUND), is in the scatter, and a second time in the level.
+    variance = float((y - level).var()) * max(0.0, 1.0 - 2.0 / (size - 1))
+    deviation = math.sqrt(max(variance - half * half / 3.0, 0.01 * variance))  # before rounding
+    limits: dict[float, Mask] = {}
+    nats = 0.0
+    for (sign, edge), at_edge in zip(edges, at_edges, strict=True):
+        count = int(at_edge.sum())
+        if count < 3 or not deviation > 0.0:
+            continue
+        beyond = ndtr((sign * level - edge - half) / deviation)
+        expected = float(beyond.sum())
+        # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
+        worth = expected - math.log(2.0)
+        if half > 0.0:
+            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
+            cell = ndtr((sign * level - edge + half) / deviation) - beyond
+            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
+            worth = max(worth, pile - math.log(20.0))
+        else:
+            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
+            worth = max(worth, (count - 2) * math.log(100.0))
+        if worth < CLIPPED_LEAST or count < 0.5 * expected:
+            continue
+        mask = np.zeros(values.size, bool)
+        mask[rows[at_edge]] = True
+        limits[sign * edge] = mask
+        nats += worth + math.log(2.0)
+    return Clipped(limits, nats) if limits else None
+
+
+def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
+    """Readings [n] to average in place of clipped ones, NaN for those left out: means of them have the level and the
+    spread that unclipped readings would have, and as many are left as the clipped record has information. And the
+    readings [n] with each clipped one drawn anew.
+
+    A clipped reading shows that the true one lies beyond the limit (Tobit's model). To first order in the level the
+    scores of the readings hold all that the record shows of it. EM finds the level and the noise to take them at. With
+    the noise as the unit a score has the variance I, the information of a reading. So the scores of 1 / I readings have
+    a sum of variance 1, as the deviation of one unclipped reading has.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows]
+    half = 0.5 * lattice.step if lattice is not None else 0.0
+    # A limit at or below the middle of the readings is a lower one.
+    middle = 0.5 * (float(y.max()) + float(y.min()))
+    upper = [limit for limit in clipped.limits if limit > middle]
+    lower = [limit for limit in clipped.limits if limit <= middle]
+    at_upper = clipped.limits[upper[0]][rows] if upper else np.zeros(y.size, bool)
+    at_lower = clipped.limits[lower[0]][rows] if lower else np.zeros(y.size, bool)
+    high = upper[0] - half if upper else math.inf
+    low = lower[0] + half if lower else -math.inf
+    window = _quiet_window(y)
+    level = np.full(y.size, float(y.mean())) if window >= y.size else uniform_filter1d(y, window, mode="nearest")
+    sigma = float((y - level).std())
+    score, information = y, y
+    for _ in range(ITERATIONS):
+        up = np.clip((high - level) / sigma, -4.0, None)
+        down = np.clip((low - level) / sigma, None, 4.0)
+        score, second, information = _tobit((y - level) / sigma, up, down, at_upper, at_lower)
+        known = np.maximum(_smooth(information, window), INFORMATION_LEAST)
+        level = _smooth(information * level + sigma * score, window) / known
+        level = np.clip(level, low - 4.0 * sigma, high + 4.0 * sigma)
+        before, sigma = sigma, sigma * math.sqrt(float(second.mean()))
+        if abs(sigma / before - 1.0) < SETTLED:
+            break
+    score = np.where(information < INFORMATION_LEAST, 0.0, score)
+    total = np.cumsum(np.where(information < INFORMATION_LEAST, 0.0, information))
+    last = np.flatnonzero(np.floor(total) > np.floor(np.concatenate([[0.0], total[:-1]])))
+    sums = np.diff(np.concatenate([[0.0], np.cumsum(score)[last]]))
+    working = np.full(values.size, np.nan)
+    working[rows[last]] = level[last] + sigma * sums
+    drawn = values.copy()
+    random = np.random.default_rng(1)
+    for mask, sign, edge in ((at_upper, 1.0, high), (at_lower, -1.0, low)):
+        # The tail of the normal beyond the limit, by its inverse.
+        least = sign * (edge - level[mask]) / sigma
+        ln_p = log_ndtr(-least) + np.log(1.0 - random.random(int(mask.sum())))
+        drawn[rows[mask]] = level[mask] - sign * sigma * ndtri_exp(ln_p)
+    return working, drawn
+
+
+def _tobit(u: Array, up: Array, down: Array, at_upper: Mask, at_lower: Mask) -> tuple[Array, Array, Array]:
+    """Of readings `u` about their level in units of the noise, with limits `up` and `down`: the score of the level, the
+    expected square, and the expected information of a reading; [n] each."""
+
+    def density(z: Array) -> Array:
+        found: Array = np.exp(-0.5 * np.minimum(z * z, 1400.0)) / math.sqrt(2.0 * math.pi)
+        return found
+
+    def product(z: Array, value: Array) -> Array:
+        found: Array = np.where(np.isfinite(z), np.where(np.isfinite(z), z, 0.0) * value, 0.0)
+        return found
+
+    def tail(z: Array) -> Array:
+        """Density over the probability beyond, of `z` upwards; 0 where there is no limit."""
+        here = np.where(np.isfinite(z), np.minimum(z, 37.0), 0.0)
+        return np.where(np.isfinite(z), density(here) / ndtr(-here), 0.0)
+
+    p, q = density(up), density(down)
+    above, below = tail(up), tail(-down)
+    score = np.where(at_upper, above, np.where(at_lower, -below, u))
+    second = np.where(at_upper, 1.0 + product(up, above), np.where(at_lower, 1.0 - product(down, below), u * u))
+    information = ndtr(up) - ndtr(down) - product(up, p) + product(down, q) + p * above + q * below
+    return score, second, information
+
+
+def _smooth(values: Array, window: int) -> Array:
+    if window >= values.size:
+        return np.full(values.size, float(values.mean()))
+    found: Array = uniform_filter1d(values, window, mode="nearest")
+    return found
+
+
+def _quiet_window(y: Array) -> int:
+    """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
+    all of them where the longest that the record shows is the best."""
+    best, least, length = 2 * AROUND, math.inf, 2 * AROUND
+    means = y[: y.size // length * length].reshape(-1, length).mean(axis=1)
+    while means.size >= 8:
+        variance = 0.5 * float((np.diff(means) ** 2).mean())
+        if variance < least:
+            best, least = length, variance
+        means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
+        length *= 2
+    return y.size if 2 * best >= length else best
