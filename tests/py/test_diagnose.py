@@ -21,10 +21,11 @@ from selfcal.diagnosis.fit import Series, fit, ln_likelihood
 from selfcal.diagnosis.fit import run as run_filter
 from selfcal.diagnosis.statemodel import Terms, matrices
 from selfcal.errors import UserError
+from selfcal.fail_on import outcome
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import save
 from selfcal.verbs.compare import compare
-from selfcal.verbs.diagnose import diagnose, failing
+from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
@@ -136,7 +137,7 @@ def test_a_clean_record_is_adequate(kind: str, tmp_path: Path) -> None:
     record = draw(f"clean:{kind}", SEED, "plain", 1.0, "random_walk", None)
     document = diagnose(written(record, tmp_path / "log.npz"), axes=[record.axis])
     assert document["axes"][record.axis]["findings"] == []
-    assert not failing(document, "inadequate")
+    assert outcome(document, "inadequate").code == 0
 
 
 def effect(tmp_path: Path, text: str) -> tuple[Path, dict[str, Any]]:
@@ -348,7 +349,7 @@ def test_an_axis_below_its_lattice_stops_no_other(tmp_path: Path) -> None:
         document = diagnose(log, decimate=decimate)
         assert "below the lattice" in document["axes"]["gx"]["error"]
         assert document["axes"]["gy"]["verdict"] == "adequate"
-    assert failing(document, "inadequate")  # what cannot be judged has not passed
+    assert outcome(document, "inadequate").code == 2  # what cannot be judged has not passed
     for decimate in (0.0, -1.0, math.nan, math.inf, 2.0):
         with pytest.raises(UserError, match="--decimate must be a rate above 0 Hz, at most the recording's 1 Hz"):
             diagnose(log, decimate=decimate)
@@ -434,7 +435,7 @@ from selfcal.verbs import diagnose as verb
 
 loop, last = verb.diagnose_record, time.monotonic()
 
-def interrupted(record, axes, advance):
+def interrupted(record, axes, advance, found):
     seen = 0
     def noted(text):
         nonlocal seen
@@ -447,7 +448,7 @@ def interrupted(record, axes, advance):
             time.sleep(0.2)
         last = time.monotonic()
         advance(text)
-    return loop(record, axes, noted)
+    return loop(record, axes, noted, found)
 
 verb.diagnose_record = interrupted
 cli.main()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from gated import Learning
+from gated import learning_gate
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -221,7 +221,7 @@ def at_rest(readings: NDArray[np.float64], lost: Callable[[int], bool] = lambda 
     """By the default model's gate, which learns its noise: of each window of 0.5 s, of six axes at 102.4 Hz; `lost`:
     which of them are missing."""
     model = Model.load()
-    gate = Learning(model, make_tables(model, 102.4, tuple(model.axes)))
+    gate = learning_gate(model, make_tables(model, 102.4, tuple(model.axes)))
     windows = len(readings) // gate.window
     samples = readings[: windows * gate.window].astype(np.float32).reshape(windows, gate.window, -1)
     return np.array(

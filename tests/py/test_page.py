@@ -128,7 +128,7 @@ SHOWN: dict[str, tuple[Callable[[Array], Finding], str, int]] = {
 
 
 def drawn(finding: Finding, record: Record) -> list[Figure]:
-    one = Diagnosed(finding.before, finding.after, [finding])
+    one = Diagnosed(finding.before, finding.after, record, [finding])
     return pictures.figures(one, record, 1.0, "deg/s")[1][0]
 
 
@@ -261,7 +261,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     recording = load(path)
     record = of_recording(recording, Model.load(None))
     found = diagnose_record(record, ("gx", "gy"))
-    document = to_document(recording, record, found, {}, {"name": "extended"})
+    document = to_document(recording, found, {}, {"name": "extended"})
     return Case(document, record, found, page(document, record, found))
 
 
@@ -384,7 +384,7 @@ def test_a_page_with_many_findings_stays_small(case: Case) -> None:
     entry = case.document["axes"]["gx"]
     step_found = next(finding for finding in one.findings if finding.look.cause == "step")
     step_told = next(finding for finding in entry["findings"] if finding["cause"] == "step")
-    many = Diagnosed(one.first, one.state, [step_found] * 10, one.before, one.after)
+    many = Diagnosed(one.first, one.state, one.record, [step_found] * 10, one.before, one.after)
     findings = [{**step_told, "shared_with": [], "words": f"Finding {k}."} for k in range(10)]
     names = ("gx", "gy", "gz", "ax", "ay", "az")
     document = {**case.document, "axes": {name: {**entry, "findings": findings} for name in names}}

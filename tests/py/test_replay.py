@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gated import Gated, Learning
+from gated import Gated, learning_gate
 
 from selfcal import recording as recording_module
 from selfcal.engines.library import Bank
@@ -121,7 +121,7 @@ def test_the_shocks_of_run_4_do_not_reach_the_bank() -> None:
     model, axes = Model.load(), Model.load().axes
     tables = make_tables(model, recording.rate_hz, axes)
     samples = np.column_stack([recording.in_unit(name, model.group_of(name).unit) for name in axes]).astype(np.float32)
-    gate = Learning(model, tables)
+    gate = learning_gate(model, tables)
     rest = np.concatenate([gate.push(samples[at : at + gate.window]) for at in range(0, len(samples), gate.window)])
     used = rest & np.concatenate([[False], rest[:-1]])
     start = int(np.argmax(used))
@@ -250,7 +250,7 @@ def test_recording_without_a_report_says_why(tmp_path: Path) -> None:
     for gx, complaint in (
         (np.full(600, 400.0), "column gx: no usable sample: all are saturated (range 300 deg/s) or stuck"),
         (np.full(600, 1.0), "column gx: all 60 averages are equal (1 deg/s): a stuck or too coarse reading"),
-        (50.0 * noise, "column gx: the record lies outside the model's priors of gx, whose white noise N"),
+        (50.0 * noise, "column gx: outside the model's priors, above: Allan deviation at 1 s: gx "),
     ):
         rows = "".join(f"{k / 10:.1f},{value:.6f}\n" for k, value in enumerate(gx))
         (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + rows)

@@ -70,8 +70,10 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
     stuck = np.zeros(samples.size, bool)
     if group.stuck_limit > 0:
         change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
-        run = np.arange(samples.size) - np.repeat(change, np.diff(np.append(change, samples.size))) + 1
-        stuck = finite & (run >= group.stuck_limit)
+        length = np.diff(np.append(change, samples.size))
+        for first, count in zip(change[length >= group.stuck_limit], length[length >= group.stuck_limit], strict=True):
+            stuck[first + group.stuck_limit - 1 : first + count] = True
+        stuck &= finite
     return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
 
 
@@ -92,10 +94,12 @@ def block_means(
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
     at -= at[np.argmax(usable)]
     columns = np.empty((samples.size, 0)) if columns is None else columns
-    values, index, rows = samples[usable], at[usable] // block, columns[usable]
     count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
-    keep = index < count
-    values, index, rows = values[keep], index[keep], rows[keep]
+    if not usable.all():
+        samples, at, columns = samples[usable], at[usable], columns[usable]
+    index = at // block
+    end = int(np.searchsorted(index, count))
+    values, index, rows = samples[:end], index[:end], columns[:end]
     used = np.bincount(index, minlength=count)
     total = np.bincount(index, values, minlength=count)
     with np.errstate(invalid="ignore", divide="ignore"):

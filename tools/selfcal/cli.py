@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.exceptions import TyperException
 
-from selfcal.ending import Held, install, last_signal
-from selfcal.errors import UserError, printable
+from selfcal.ending import Held, install, last_signal, leave
+from selfcal.errors import UserError, note, printable
 from selfcal.suffixes import READ, WRITTEN
 
 app = typer.Typer(
@@ -101,6 +102,19 @@ Scale = Annotated[
     list[str] | None,
     typer.Option("--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB of LSB columns (repeat for more)"),
 ]
+Start = Annotated[
+    float | None, typer.Option("--start", metavar="S", help="Begin here, seconds of the recording; default: its start")
+]
+End = Annotated[
+    float | None, typer.Option("--end", metavar="S", help="End before this, seconds of the recording; default: its end")
+]
+Gate = Annotated[bool, typer.Option("--gate", help="Keep motion out, by the model's stationary gate")]
+FailOn = Annotated[
+    str | None,
+    typer.Option(
+        "--fail-on", metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it, 2 when one cannot be judged"
+    ),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
@@ -108,6 +122,19 @@ Scheduler = Annotated[
 Results = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder that keeps finished records, so that a later run goes on")
 ]
+
+
+def _judge(result: Mapping[str, Any], fail_on: str | None) -> None:
+    """End by the signal that came, else by what `--fail-on` makes of the result."""
+    Held().check()
+    if fail_on is not None:
+        from selfcal.fail_on import outcome
+
+        found = outcome(result, fail_on)
+        for line in found.lines:
+            note(line)
+        if found.code:
+            sys.exit(found.code)
 
 
 @app.command()
@@ -137,6 +164,13 @@ def identify(
             metavar="P", help="Export white noise and walk above the recording's Allan deviation, at P (0.95)"
         ),
     ] = None,
+    no_suspicion: Annotated[
+        bool, typer.Option("--no-suspicion", help="No second look at the axes that are not adequate")
+    ] = False,
+    fail_on: FailOn = None,
+    start: Start = None,
+    end: End = None,
+    gate: Gate = False,
     rate: Rate = None,
     column: Column = None,
     unit: Unit = None,
@@ -158,12 +192,18 @@ def identify(
         datasheet=table_units is Units.datasheet,
         export=export,
         overbound=overbound,
+        suspicion=not no_suspicion,
+        fail_on=fail_on,
+        start_s=start,
+        end_s=end,
+        gate=gate,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
     show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
+    _judge(result, fail_on)
 
 
 @app.command()
@@ -172,8 +212,12 @@ def diagnose(
     axis: Axis = None,
     model: ModelFile = None,
     decimate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Look at block means at this rate; default: every sample")
+        float | None,
+        typer.Option(metavar="HZ", help="Look at means at this rate alone; default: means of 1 s, then every sample"),
     ] = None,
+    full_rate: Annotated[
+        bool, typer.Option("--full-rate", help="Look at every sample at once, not at means of 1 s first")
+    ] = False,
     json: Json = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")
@@ -181,9 +225,10 @@ def diagnose(
     write_model: Annotated[
         Path | None, typer.Option(metavar="MODEL.yaml", help="Write the model file with what was found in it")
     ] = None,
-    fail_on: Annotated[
-        str | None, typer.Option(metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it")
-    ] = None,
+    fail_on: FailOn = None,
+    start: Start = None,
+    end: End = None,
+    gate: Gate = False,
     rate: Rate = None,
     column: Column = None,
     unit: Unit = None,
@@ -198,19 +243,21 @@ def diagnose(
         axes=axis or (),
         model=model,
         decimate=decimate,
+        full_rate=full_rate,
         json=json,
         report=report,
         write_model=write_model,
         fail_on=fail_on,
+        start_s=start,
+        end_s=end,
+        gate=gate,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
     )
     verb.show(result, to_stderr=str(json) == "-")
-    Held().check()
-    if fail_on is not None and verb.failing(result, fail_on):
-        sys.exit(1)
+    _judge(result, fail_on)
 
 
 @app.command()
@@ -223,13 +270,33 @@ def compare(
     decimate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Diagnose block means at this rate; default: every sample")
     ] = None,
+    fail_on: Annotated[
+        str | None,
+        typer.Option(
+            metavar="changed|inadequate|CAUSE", help="Exit code 1 when an axis shows it, 2 when one cannot be judged"
+        ),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    gate: Gate = False,
     json: Json = None,
 ) -> None:
     """What changed between recordings of one part, beyond what each leaves open."""
     from selfcal.verbs import compare as verb
 
-    result = verb.compare(logs, axes=axis or (), model=model, decimate=decimate, json=json)
+    result = verb.compare(
+        logs,
+        axes=axis or (),
+        model=model,
+        decimate=decimate,
+        fail_on=fail_on,
+        start_s=start,
+        end_s=end,
+        gate=gate,
+        json=json,
+    )
     verb.show(result, to_stderr=str(json) == "-")
+    _judge(result, fail_on)
 
 
 @app.command()
@@ -333,7 +400,9 @@ def replay(
     report_every: Annotated[
         float | None, typer.Option(metavar="S", help="Seconds between reports; default: 100 in all, fewer in QEMU")
     ] = None,
-    gate: Annotated[bool, typer.Option("--gate", help="Keep motion out, by the model's stationary gate")] = False,
+    gate: Gate = False,
+    begin: Start = None,
+    end: End = None,
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
     rate: Rate = None,
@@ -356,6 +425,8 @@ def replay(
         channel=channel,
         report_every=report_every,
         gate=gate,
+        start_s=begin,
+        end_s=end,
         json=json,
         plot=plot,
         rate=rate,
@@ -616,13 +687,15 @@ def main() -> NoReturn:
         warnings.simplefilter("ignore")
     try:
         code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
-        sys.exit((last_signal() or code) if code == INTERRUPTED else code)  # typer's code for every signal
+        if code == INTERRUPTED:  # typer's code for every signal
+            leave(last_signal() or code)
+        sys.exit(code)
     except UserError as error:
         _fail(str(error))
     except TyperException as error:
         _fail(_usage(error))
     except (typer.Abort, KeyboardInterrupt):
-        sys.exit(last_signal() or INTERRUPTED)
+        leave(last_signal() or INTERRUPTED)
     except (BrokenPipeError, SystemExit) as error:  # the reader of our output has gone, as in `| head`
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise  # typer turns the others into one

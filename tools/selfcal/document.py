@@ -49,12 +49,15 @@ def recording_entry(recording: Recording) -> dict[str, Any]:
         "rate_hz": recording.rate_hz,
         "samples": recording.samples,
         "duration_s": recording.duration_s,
+        "start_s": recording.start_s,
     }
 
 
-def to_document(recording: Recording, found: Mapping[str, Identified | UserError]) -> dict[str, Any]:
+def to_document(
+    recording: Recording, found: Mapping[str, Identified | UserError], *, all_failed: Path | str | None = None
+) -> dict[str, Any]:
     """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
-    if no axis has a result."""
+    if no axis has a result; the reasons are then written to `all_failed`."""
     reasons = {
         name: str(axis).removeprefix(f"{recording.path}: ")
         for name, axis in found.items()
@@ -67,6 +70,8 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
         said = "; ".join(
             f"column{'s' if len(names) > 1 else ''} {', '.join(names)}: {reason}" for reason, names in columns.items()
         )
+        if all_failed is not None:
+            write_json(of_errors(SCHEMA, recording, reasons), all_failed)
         raise UserError(f"{recording.path}: {said or 'no axis has a result'}")
     return {
         "schema": SCHEMA,
@@ -88,6 +93,12 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
             for name, axis in found.items()
         },
     }
+
+
+def of_errors(schema: str, recording: Recording, reasons: Mapping[str, str]) -> dict[str, Any]:
+    """The document of a recording no axis of which has a result."""
+    axes = {name: {"error": reason} for name, reason in reasons.items()}
+    return {"schema": schema, "recording": recording_entry(recording), "axes": axes}
 
 
 def parameters_entry(axis: Identified) -> dict[str, Any]:

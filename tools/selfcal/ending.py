@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+#: How long results may still be worked out after a signal, s.
+GRACE_S = 0.8
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -28,7 +33,9 @@ class _State:
 
     holding = False
     came: int | None = None
+    came_at = 0.0
     raised: int | None = None
+    abandoned = False
 
 
 _state = _State()
@@ -36,7 +43,7 @@ _state = _State()
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
     if _state.holding and _state.came is None:
-        _state.came = number  # a second one ends at once, whatever is held
+        _state.came, _state.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
         return
     for other in SIGNALS[1:]:
         signal.signal(other, signal.SIG_IGN)  # the end is under way: it is not to be cut short
@@ -53,6 +60,20 @@ def last_signal() -> int:
     return 0 if _state.raised is None else 128 + _state.raised
 
 
+def abandon() -> None:
+    """Threads are left at their work: the process ends without them."""
+    _state.abandoned = True
+
+
+def leave(code: int) -> NoReturn:
+    """End the process, whatever threads are still at work."""
+    if _state.abandoned:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 def install() -> None:
     """Have the signals raise Ended. One that is ignored stays so: `nohup`, a shell's background job."""
     for number in SIGNALS:
@@ -67,6 +88,11 @@ class Held:
     def asked(self) -> bool:
         """One came."""
         return _state.came is not None
+
+    @property
+    def overdue(self) -> bool:
+        """One came GRACE_S ago."""
+        return _state.came is not None and time.monotonic() > _state.came_at + GRACE_S
 
     def check(self) -> None:
         """Raise Ended if one came."""

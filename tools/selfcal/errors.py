@@ -15,6 +15,13 @@ class UserError(Exception):
     """Something the user can put right. Its text is one line; the command prints it and ends with exit code 2."""
 
 
+class OutsidePriors(UserError):
+    """No law of the model has any evidence on an axis. `rest.py` says of all such axes in one line why."""
+
+    def __init__(self) -> None:
+        super().__init__("the record lies outside the model's priors")
+
+
 def printable(text: str) -> str:
     """`text` with every character that a terminal would obey, or cannot show, as its escape: `\\x1b`, `\\ud800`."""
     return "".join(

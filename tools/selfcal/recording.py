@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
@@ -71,7 +71,9 @@ class Column:
 class Recording:
     """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row.
 
-    `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps."""
+    `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps. `start_s`: where in the file's
+    recording the first row is, s. `moving`: how many of the missing samples are there, but were measured in motion.
+    """
 
     path: Path
     rate_hz: float
@@ -79,6 +81,8 @@ class Recording:
     missing_before: NDArray[np.int64]
     meta: Mapping[str, Any]
     off_grid_s: NDArray[np.float64] | None = None
+    start_s: float = 0.0
+    moving: int = 0
 
     @property
     def samples(self) -> int:
@@ -91,9 +95,48 @@ class Recording:
         return (self.samples + int(self.missing_before.sum())) / self.rate_hz
 
     @property
+    def lost(self) -> int:
+        """Samples that are not there at all."""
+        return int(self.missing_before.sum()) - self.moving
+
+    @property
     def time_s(self) -> NDArray[np.float64]:
         """float64[n]: time since the first row on the even grid of the sampling rate, s."""
         return (np.arange(self.samples) + np.cumsum(self.missing_before)) / self.rate_hz
+
+    def with_rows(self, kept: NDArray[np.bool_], *, moving: bool = False) -> Recording:
+        """The recording of the rows `kept` [n] alone, two or more. The others count as missing, and as `moving` where
+        that is why they are left out. Rows before the first and after the last that is kept are cut off."""
+        at = np.arange(self.samples) + np.cumsum(self.missing_before)
+        where = np.flatnonzero(kept)
+        missing = np.diff(at[where], prepend=at[where[0]] - 1) - 1
+        inner = where[-1] - where[0] + 1 - where.size if moving else 0
+        return replace(
+            self,
+            columns={name: replace(one, values=one.values[kept]) for name, one in self.columns.items()},
+            missing_before=missing,
+            off_grid_s=None if self.off_grid_s is None else self.off_grid_s[kept],
+            start_s=self.start_s + float(at[where[0]] - at[0]) / self.rate_hz,
+            moving=self.moving + int(inner),
+        )
+
+    def between(self, start_s: float | None, end_s: float | None) -> Recording:
+        """The stretch from `start_s` on and before `end_s`, seconds of the recording. Raises UserError for an empty
+        one, and for one that lies outside."""
+        if start_s is None and end_s is None:
+            return self
+        first, last = 0.0 if start_s is None else start_s, math.inf if end_s is None else end_s
+        if not 0.0 <= first < last:  # or not a number
+            raise UserError(
+                f"--start {first:g} --end {last:g}: takes two times in seconds, the first one before the other"
+            )
+        kept = (self.time_s >= first) & (self.time_s < last)
+        if np.count_nonzero(kept) < 2:
+            raise UserError(
+                f"{self.path}: --start {first:g} --end {last:g}: fewer than two samples there; the recording lasts "
+                f"{self.duration_s:.6g} s"
+            )
+        return self.with_rows(kept)
 
     def in_unit(self, name: str, unit: str) -> NDArray[np.float64]:
         """float64[n]: a column in `unit`. Raises UserError if it is absent or of another kind."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,21 +63,27 @@ class Scored:
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module. Time counts from the first row, s. A column with
-    a `window_s` is the mean over that time up to each row. A step is 1 from its time on. A rate is the channel's gain
-    over the last `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a
-    column that is absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. Time counts from the first row, s; a step's is
+    that of the recording that the rows were cut from. A column with a `window_s` is the mean over that time up to each
+    row. A step is 1 from its time on. A rate is the channel's gain over the last `window_s`, in the first window its
+    gain since the first row, over `window_s`. Raises UserError for a column that is absent or of another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
     check_channels(regressors, recording)
     channels = channels_of(regressors)
+    regressors = from_time(regressors, recording.start_s)
     values = [as_float(recording.in_unit(name, unit)) for name, unit in channels]
     rows = np.ascontiguousarray(np.column_stack(values) if values else np.empty((recording.samples, 0), np.float32))
     sources = [source for one in regressors for source in sources_of(one, channels)]
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
     formed = _library32.form(sources, 1.0 / recording.rate_hz, rows, missing)
     return np.ascontiguousarray(formed, np.float64)
+
+
+def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
+    """The regressors for a clock that begins at `start_s` of the one that their times are of."""
+    return tuple(replace(one, time_s=one.time_s - start_s) if one.kind == "step" else one for one in regressors)
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:

@@ -41,7 +41,13 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
     for line in notes:
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def since(recording: Mapping[str, Any]) -> str:
+    """Where a stretch of a recording begins, for its heading."""
+    start_s = recording.get("start_s", 0.0)
+    return f" from {start_s:g} s on" if start_s else ""
 
 
 def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
@@ -53,7 +59,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         collapse_padding=left_out > 0,
         pad_edge=left_out == 0,
         title=f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s",
+        f"{recording['duration_s']:g} s{since(recording)}",
         title_justify="left",
         caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
         "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
@@ -65,11 +71,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
     second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
     for heading in ("law", "P", "N", drift, second):
         table.add_column(heading, no_wrap=True)
-    failed = [
-        f"no result: {name}: {axis['error']}; choose axes with --axis"
-        for name, axis in document["axes"].items()
-        if name not in axes
-    ]
+    without: dict[str, list[str]] = {}
+    for name, axis in document["axes"].items():
+        if name not in axes:
+            without.setdefault(axis["error"], []).append(name)
+    failed = [f"no result: {', '.join(names)}: {error}; choose axes with --axis" for error, names in without.items()]
     kept: list[str] = []
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])

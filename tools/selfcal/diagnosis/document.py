@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from selfcal import units as unit_module
@@ -12,21 +13,22 @@ from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
 from selfcal.document import recording_entry
-from selfcal.recording import Recording
+from selfcal.ending import Stopped
+from selfcal.recording import SIDE_CHANNELS, Recording
 
 SCHEMA = "selfcal.diagnose/1"
 
 
 def to_document(
     recording: Recording,
-    record: Record,
     found: Mapping[str, Diagnosed],
     errors: Mapping[str, str],
     model: Mapping[str, Any],
+    first: Mapping[str, Diagnosed] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
-    model file's tree."""
-    axes = {name: _axis(one, record, recording.columns[name].unit) for name, one in found.items()}
+    model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it."""
+    axes = {name: _axis(one, recording.columns[name].unit, first.get(name)) for name, one in found.items()}
     return {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
@@ -35,15 +37,22 @@ def to_document(
     }
 
 
-def _axis(one: Diagnosed, record: Record, unit: str) -> dict[str, Any]:
+def _axis(one: Diagnosed, unit: str, first: Diagnosed | None) -> dict[str, Any]:
+    record = one.record
+    causes = {finding.look.cause for finding in one.findings}
+    only = [] if first is None else [finding for finding in first.findings if finding.look.cause not in causes]
     factor = unit_module.factor(one.state.unit, unit)
     findings = sorted(one.findings, key=lambda finding: finding.look.gain, reverse=True)
     after = {row.name: row for row in one.after}
     return {
         "unit": unit,
+        "judged_at_hz": record.rate_hz,
         "verdict": "adequate" if one.adequate else "inadequate",
+        **({"unfinished": one.unfinished} if one.unfinished else {}),
         "findings": [_finding(finding, record, factor, unit) for finding in findings],
+        **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit) for one in only]}),
         "not_found": _not_found(one, record, factor, unit),
+        "not_judged": _not_judged(one, record),
         "discrepancies": [
             {
                 "statistic": row.name,
@@ -69,7 +78,10 @@ def _axis(one: Diagnosed, record: Record, unit: str) -> dict[str, Any]:
 def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict[str, Any]:
     look = finding.look
     inner = finding.before.unit
-    held_out, reason = gain(look, finding.before, finding.after, record)
+    try:
+        held_out, reason = gain(look, finding.before, finding.after, record)
+    except Stopped:
+        held_out, reason = None, "there was no time left to measure it"
     if held_out is not None:
         held_out["bias_rmse"]["unit"] = unit
         for row in held_out["bias_rmse"]["horizon_s"].values():
@@ -79,13 +91,15 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
             held_out["log_score_per_sample"][key] -= math.log(factor)
     factors = inflation(finding.before, finding.after)
     estimate = {key: _in_unit(value, inner, factor, unit) for key, value in look.estimate.items()}
+    estimate |= {key: later(value, record.start_s) for key, value in estimate.items() if _is_time(key, value)}
     return {
         "cause": look.cause,
+        "judged_at_hz": record.rate_hz,
         "words": words.sentence(look.cause, estimate),
         "evidence_gain_nats": look.gain,
         "net_nats": min(look.net, look.gain),  # a search of less than one look is paid for by nothing
         "estimate": estimate,
-        "when": list(look.when) if look.when else None,
+        "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
         "also_possible": list(finding.also_possible),
         "record_next": words.NEXT[look.cause],
@@ -97,14 +111,42 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
     }
 
 
+def _is_time(key: str, value: Any) -> bool:
+    return key == "time_s" or (key == "intervals" and isinstance(value, list | tuple))
+
+
+def later(value: Any, start_s: float) -> Any:
+    """A time of the record, s, or any form of several, as one of the recording."""
+    if isinstance(value, Mapping):
+        return {key: later(entry, start_s) if key not in ("sd", "unit") else entry for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [later(entry, start_s) for entry in value]
+    return value + start_s
+
+
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
-    rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
+    try:
+        rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
+    except Stopped:
+        return []
     for row in rows:
         sizes = row["would_have_been_found"]
         row["would_have_been_found"] = {
             key: _in_unit(value, one.state.unit, factor, unit) for key, value in sizes.items()
         }
     return rows
+
+
+def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:
+    """Causes that this recording cannot show, with the reason."""
+    reasons = {
+        cause: f"the recording has no {cause} that changes (column {column})"
+        for cause, (column, _) in SIDE_CHANNELS.items()
+        if cause not in record.channels
+    }
+    if set(record.axes) <= {one.state.axis}:
+        reasons["cross_axis"] = "the recording has no other axis"
+    return [{"cause": cause, "reason": reason} for cause, reason in reasons.items()]
 
 
 def _in_unit(value: Any, inner: str, factor: float, unit: str) -> Any:

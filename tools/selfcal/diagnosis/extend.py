@@ -14,6 +14,7 @@ import yaml
 from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
+from selfcal.ending import Stopped
 from selfcal.errors import remark
 from selfcal.laws import RATIO_LIMITS
 from selfcal.model import MOST_COLUMNS, Model
@@ -32,7 +33,8 @@ WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
 
 def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> dict[str, Any]:
-    """The model file's tree. `simulate` in it reproduces each axis: its law, parameters, bias and effects."""
+    """The model file's tree; `record` is the finest of those that `found` was found in. `simulate` in
+    it reproduces each axis: its law, parameters, bias and effects."""
     tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
     tree["name"] = f"{model.name}, extended"
     kept = _regressors(model, record, found)
@@ -107,6 +109,9 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
                 continue
             key = _key(regressor.name)
             entry = entries.setdefault(key, {"name": key, **regressor.entry, "sd": {}, "probability": 0.5})
+            if regressor.cause == "step":  # its time is one of the whole recording's
+                time_s = float(regressor.entry["time_s"]) + record.start_s
+                entry |= {"name": f"step_{time_s:.6g}s", "time_s": time_s}
             if regressor.cause == "cross_axis":
                 entry["reference"] = _digits(record.axes[str(regressor.entry["column"])].level)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
@@ -119,34 +124,38 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
         columns = _columns_of(entry)
         if used + columns <= MOST_COLUMNS:
             if key in record.channels:
-                _smooth(entry, key, record, found)
+                _smooth(entry, key, found)
             kept.append(entry)
             used += columns
     return kept
 
 
-def _smooth(entry: dict[str, Any], channel: str, record: Record, found: Mapping[str, Diagnosed]) -> None:
+def _smooth(entry: dict[str, Any], channel: str, found: Mapping[str, Diagnosed]) -> None:
     """The window whose trailing mean explains the axes best. A centred mean, which the diagnosis takes, needs values
     that a module does not have yet; a trailing one lags, so a shorter window suits it."""
+    explained = [one for one in found.values() if any(column.name == channel for column in one.state.regressors)]
+    record = max((one.record for one in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
     for width in WINDOWS_S:
         window = max(1, round(width * record.rate_hz))
         if window > record.present.size // 10:
             break
-        values = trailing_mean(record.channels[channel], window) - float(entry["reference"])
-        gains[width if window > 1 else 0.0] = sum(
-            _with_values(one, channel, values)
-            for one in found.values()
-            if any(column.name == channel for column in one.state.regressors)
-        )
-    best = max(gains, key=lambda width: gains[width])
+        try:
+            gains[width if window > 1 else 0.0] = sum(
+                _with_values(one, channel, width, float(entry["reference"])) for one in explained
+            )
+        except Stopped:  # the shortest, which suits any
+            break
+    best = max(gains, key=lambda width: gains[width], default=0.0)
     entry.pop("window_s", None)
     if best:
         entry["window_s"] = best
 
 
-def _with_values(one: Diagnosed, channel: str, values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    """ln likelihood of the axis with other values of one of its columns, at the drift that was found."""
+def _with_values(one: Diagnosed, channel: str, width: float, reference: float) -> float:
+    """ln likelihood of the axis with trailing means of `width` s as the values of a channel, at the drift found."""
+    record = one.record
+    values = trailing_mean(record.channels[channel], max(1, round(width * record.rate_hz))) - reference
     columns = tuple(
         replace(column, values=values) if column.name == channel else column for column in one.state.regressors
     )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from selfcal.diagnosis import integrity
+from selfcal.diagnosis import integrity, work
 from selfcal.diagnosis.causes import noise, periodic, regressors, step
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State
@@ -32,6 +30,9 @@ STATIONARY = (periodic.looks, noise.colored, noise.variance_change)
 CERTAIN = 25.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
+#: Why an axis is not done.
+INTERRUPTED = "interrupted before it was done"
+SPENT = "its work was bounded (tools/README.md): there may be more causes"
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
 #: Times that one cause is named on an axis: more jumps or changes of the noise are none of single ones.
@@ -61,14 +62,17 @@ class Finding:
 
 @dataclass
 class Diagnosed:
-    """One axis after the loop: what it began as, what it is, and what was found."""
+    """One axis after the loop: what it began as, what it is, and what was found in which record. `unfinished`: why it
+    is not done, "" if it is."""
 
     first: State
     state: State
+    record: Record
     findings: list[Finding] = field(default_factory=list)
     before: list[Statistic] = field(default_factory=list)
     after: list[Statistic] = field(default_factory=list)
     refused: list[Look] = field(default_factory=list)
+    unfinished: str = ""
 
     @property
     def adequate(self) -> bool:
@@ -76,41 +80,48 @@ class Diagnosed:
 
 
 def diagnose_record(
-    record: Record, axes: Sequence[str], advance: Callable[[str], None] = lambda text: None
+    record: Record,
+    axes: Sequence[str],
+    advance: Callable[[str], None] = lambda text: None,
+    found: dict[str, Diagnosed] | None = None,
 ) -> dict[str, Diagnosed]:
     """Walk the loop on every axis of `axes`; the others of the record serve as side channels.
 
-    `advance` may raise Stopped: axes whose rounds are done are then ended and given, the others are left out. Without
-    any, Stopped goes on to the caller.
-    """
+    `found` is filled as the rounds go, for who stops it: Stopped then goes on to the caller, and axes that are not done
+    are `unfinished`. So is an axis whose work is spent (work.py), with what was found until then."""
+    found = {} if found is None else found
     advance("fit")
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        states = dict(zip(record.axes, pool.map(lambda state: state.refit(), record.axes.values()), strict=True))
+    states = dict(zip(record.axes, work.each(lambda state: state.refit(), record.axes.values()), strict=True))
     # An axis below its stated lattice is judged by nobody, and explains nobody.
     left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
     states = {name: state for name, state in states.items() if name not in left_out}
-    axes = [name for name in axes if name not in left_out]
     record = replace(record, axes=states)
-    found = {name: Diagnosed(states[name], states[name]) for name in axes}
-    record = _integrity(record, found, advance)
-    done: set[str] = set()
+    works = {name: work.of_axis(state.y.size) for name, state in states.items()}
+    for name in axes:
+        if name not in left_out:
+            found[name] = Diagnosed(states[name], states[name], record, unfinished=INTERRUPTED)
+    record = _integrity(record, found, advance, works)
 
     def walk(name: str) -> None:
+        one, spent = found[name], ""
+        one.record = record
         with suppress(Stopped):
-            _rounds(record, found[name], advance)
-            done.add(name)
+            try:
+                with work.within(works[name]):
+                    _rounds(record, one, advance)
+            except work.Spent:
+                spent = SPENT
+            _end(one, advance)
+            one.unfinished = spent
 
-    # Threads: nearly all the time goes into the compiled filter and the transforms, which run side by side.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(walk, axes))
-        found = {name: one for name, one in found.items() if name in done}
-        if axes and not found:
-            raise Stopped
-        _directions(record, found)
-        for one in found.values():
-            _harmonics(one)
-        _share(found)
-        list(pool.map(lambda one: _end(one, advance), found.values()))
+    work.each(walk, found)
+    changed = _directions(record, found)
+    for one in found.values():
+        _harmonics(one)
+    _share(found)
+    work.each(lambda name: _end(found[name], advance), changed)
+    if any(one.unfinished == INTERRUPTED for one in found.values()):
+        raise Stopped
     return found
 
 
@@ -121,8 +132,8 @@ def _stated(state: State) -> bool:
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     """What is left over, and the statistics of the model that the loop began with."""
-    with suppress(Stopped):
-        advance(f"{one.state.axis}: statistics")
+    advance(f"{one.state.axis}: statistics")
+    one.findings = [finding for finding in one.findings if finding.round <= ROUNDS]
     _unexplained(one)
     one.before = judged(one.first, seed=1) if one.findings and not one.first.below_lattice else one.after
 
@@ -134,8 +145,9 @@ def _provisional(
     causes: tuple[Callable[[State, Record], list[Look]], ...] = STATIONARY,
 ) -> State:
     """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
-    one = Diagnosed(state, state)
-    _rounds(record, one, advance, causes, CERTAIN)
+    one = Diagnosed(state, state, record)
+    with suppress(work.Spent):
+        _rounds(record, one, advance, causes, CERTAIN)
     return one.state
 
 
@@ -145,15 +157,23 @@ def _wild(state: State, record: Record) -> float:
     return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
 
 
-def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
+def _integrity(
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    advance: Callable[[str], None],
+    works: Mapping[str, work.Work],
+) -> Record:
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
         masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        quieted = pool.map(lambda state: _provisional(state, record, advance), states.values())
-        quiet = dict(zip(states, quieted, strict=True))
+
+    def quieted(name: str) -> State:
+        with work.within(works[name]):
+            return _provisional(states[name], record, advance)
+
+    quiet = dict(zip(states, work.each(quieted, states), strict=True))
     wild = {name: _wild(state, record) for name, state in quiet.items()}
     moved = integrity.motion(replace(record, axes=quiet), wild) if len(states) > 1 else {}
     if moved:
@@ -279,11 +299,12 @@ def _breadth(line: Look) -> float:
     return 3.0 * float(line.estimate["frequency_hz"]["sd"])
 
 
-def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
+def _directions(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Two axes that each blame the other: the reading that follows is the one that gains more by it.
 
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
-    coupling is kept: a mechanical one is below 1."""
+    coupling is kept: a mechanical one is below 1. Returns the axes that are blamed less."""
+    changed: list[str] = []
     pairs = {
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
@@ -303,6 +324,8 @@ def _directions(record: Record, found: Mapping[str, Diagnosed]) -> None:
             one.findings.remove(finding)
             kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
             one.state = one.state.refit(regressors=kept)
+            changed.append(name)
+    return changed
 
 
 def _share(found: Mapping[str, Diagnosed]) -> None:

@@ -20,6 +20,7 @@ from selfcal.diagnosis.chart import Figure, draw, number, scrolled
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.words import WORDS
+from selfcal.ending import Stopped
 from selfcal.output import write_text
 
 #: Bytes of the page without its style, at most.
@@ -127,7 +128,7 @@ def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagn
     failed = {axis: str(entry["error"]) for axis, entry in document["axes"].items() if "error" in entry}
     sections: list[list[_Part]] = []
     for k, (axis, entry) in enumerate(axes.items()):
-        sections.append(list(_axis(k, axis, entry, record, found[axis])))
+        sections.append(list(_axis(k, axis, entry, found[axis])))
     rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, options), *_reading()]
     parts = [_Part(text) for text in (*_summary(axes, failed), *_contents(axes))]
     parts += [part for section in sections for part in section]
@@ -291,10 +292,19 @@ def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "</ul></nav>"
 
 
-def _axis(place: int, axis: str, entry: Mapping[str, Any], record: Record, one: Diagnosed) -> Iterator[_Part]:
+def _axis(place: int, axis: str, entry: Mapping[str, Any], one: Diagnosed) -> Iterator[_Part]:
     unit = str(entry["unit"])
-    overview, own = pictures.figures(one, record, unit_module.factor(one.state.unit, unit), unit)
     yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>")
+    if entry.get("unfinished"):
+        rate = number(entry["judged_at_hz"])
+        yield _Part(f"<p><strong>Not finished.</strong> Judged at {rate} Hz; {escape(str(entry['unfinished']))}.</p>")
+    overview: Sequence[Figure]
+    own: Sequence[Sequence[Figure]]
+    try:
+        overview, own = pictures.figures(one, one.record, unit_module.factor(one.state.unit, unit), unit)
+    except Stopped:
+        yield _Part("<p>There was no time left to draw its pictures.</p>")
+        overview, own = [], [[] for _ in one.findings]
     for k, finding in enumerate(entry["findings"]):
         match = _match(finding, one.findings)
         yield from _finding(_id(axis, k), finding, own[match] if match is not None else [])

@@ -29,7 +29,8 @@ BEYOND = 100.0
 class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `missing` samples of the
-    recording, at its own rate `recorded_hz`. `off_grid_s`: of its time stamps, [rows], None without."""
+    recording, at its own rate `recorded_hz`. `start_s`: where
+    in the recording the grid begins, s; every time here counts from it."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -41,6 +42,7 @@ class Record:
     readings: Mapping[str, Readings] = field(default_factory=dict)
     change: RateChange | None = None
     unclipped: Mapping[str, Array] = field(default_factory=dict)
+    start_s: float = 0.0
 
     @property
     def time_s(self) -> Array:
@@ -95,7 +97,11 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         found: list[Regressor] = []
         for one in offered(model, name):
             values = columns_of((one,), recording)
-            entry = {"column": one.column, "frequency_hz": one.frequency_hz, "time_s": one.time_s}
+            entry = {
+                "column": one.column,
+                "frequency_hz": one.frequency_hz,
+                "time_s": one.time_s - recording.start_s,
+            }
             for column, row in zip(one.columns, values.T, strict=True):
                 about = bridged(on_grid(np.ascontiguousarray(row))) - one.reference
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
@@ -155,11 +161,12 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         channels,
         names,
         present,
-        int(recording.missing_before.sum()),
+        recording.lost,
         recording.rate_hz,
         read,
         change,
         unclipped,
+        recording.start_s,
     )
 
 

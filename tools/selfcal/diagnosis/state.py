@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from selfcal.diagnosis.fit import Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
+from selfcal.diagnosis.fit import FTOL, Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
 from selfcal.result import HALF_90, of_mixture
 
@@ -48,7 +48,7 @@ class State:
     theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
     they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
     noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
-    the model file's.
+    the model file's. `ftol`: of its fits, see Series.
     """
 
     axis: str
@@ -66,11 +66,12 @@ class State:
     variance: Array = field(default_factory=lambda: np.empty(0))
     redrawn: bool = False
     below_lattice: bool = False
+    ftol: float = FTOL
 
     @property
     def series(self) -> Series:
         columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
-        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns))
+        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol)
 
     @property
     def best(self) -> Fit:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from selfcal.diagnosis.fit import ROUGH_FTOL
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.state import NET_LEAST
@@ -11,19 +12,23 @@ from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import Recording
 
+#: Rate of the means that are looked at, Hz, and how many of them at most: a longer record has longer ones.
+RATE_HZ, MOST = 1.0, 20_000
 
-def suspicions(recording: Recording, model: Model, axes: Sequence[str], rate_hz: float) -> dict[str, str]:
-    """By axis the cause that gains most on block means at `rate_hz`. Axes that show none, or are too short, are left
-    out."""
+
+def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[str, str]:
+    """By axis the cause that gains most on means of 1 s. Axes that show none, or are too short, are left out.
+
+    The fits are rough: they rank causes, and no size of one is used."""
     try:
-        record = of_recording(recording, model, min(rate_hz, recording.rate_hz))
+        record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
     except UserError:
         return {}
     found: dict[str, str] = {}
     for name in axes:
         if name not in record.axes or record.axes[name].below_lattice:
             continue
-        state = record.axes[name].refit()
+        state = record.axes[name].refit(ftol=ROUGH_FTOL)
         best = max((look for cause in LOOKS for look in cause(state, record)), key=lambda look: look.net, default=None)
         if best is not None and best.net >= NET_LEAST:
             found[name] = best.cause

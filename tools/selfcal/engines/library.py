@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import _coarse, _dense, _fixed, _library32, _library64
-from selfcal.errors import UserError
+from selfcal.errors import OutsidePriors, UserError
 from selfcal.laws import PLACES
 from selfcal.result import AxisResult, Estimate
-from selfcal.tables import AxisTable, Grid, Tables
+from selfcal.tables import Grid, Tables
 
 
 def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
@@ -114,7 +114,7 @@ class Bank:
                 name: _estimate(entry["parameters"][PLACES[name]]) for name in table.law.parameters
             }
         if not self.tables.regressors and not any(math.isfinite(p) for p in probability.values()):
-            raise UserError(outside_priors(self.tables.axes[axis]))
+            raise OutsidePriors
         return AxisResult(
             report["n"],
             log_evidence,
@@ -124,16 +124,6 @@ class Bank:
             report["bias_sd"],
             coefficients,
         )
-
-
-def outside_priors(prior: AxisTable) -> str:
-    """What to tell the user when no hypothesis has any evidence."""
-    return (
-        f"the record lies outside the model's priors of {prior.name}, whose white noise N runs from "
-        f"{math.exp(prior.ln_min[0]):g} to {math.exp(prior.ln_max[0]):g} {prior.unit}/sqrt(Hz), or its drift "
-        "beyond those of K or sigma_m: widen them in the model file, or check the unit and whether the sensor was at "
-        "rest"
-    )
 
 
 def _too_short(tables: Tables, count: int, weight: float) -> str:

@@ -15,6 +15,7 @@ from rich.table import Table
 from selfcal.document import check_writable, write_json
 from selfcal.ending import Held
 from selfcal.errors import UserError, printable
+from selfcal.fail_on import CHANGED, check
 from selfcal.result import HALF_90
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -32,31 +33,57 @@ def compare(
     axes: Sequence[str] = (),
     model: Path | str | None = None,
     decimate: float | None = None,
+    fail_on: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    gate: bool = False,
     json: Path | str | None = None,
 ) -> dict[str, Any]:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
 
     Returns the document `selfcal.compare/1`: by axis the `changes`, each with the quantity, its values and the distance
-    in standard deviations. Raises UserError for fewer than two recordings, and as `identify` and `diagnose` do.
+    in standard deviations; and the `verdicts` by recording and axis. `decimate`, `start_s`, `end_s`, `gate`: as
+    `diagnose` has them, of each recording. `fail_on`: see fail_on.py; it is only checked here.
+    Raises UserError for fewer than two recordings, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
         raise UserError("compare takes two recordings or more of one part: selfcal compare A B")
+    check(fail_on, more=(CHANGED,))
     check_writable(json, inputs=(*logs, model))
     seen = []
+    verdicts: dict[str, dict[str, Any]] = {}
+    part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     for log in logs:
-        identified = identify(log, axes=axes, model=model)["axes"]
-        diagnosed = diagnose(log, axes=axes, model=model, decimate=decimate)["axes"]
+        identified = identify(log, suspicion=False, **part)["axes"]
+        diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
         Held().check()
+        verdicts[str(log)] = {
+            name: _verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
+        }
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
     changes: dict[str, list[dict[str, Any]]] = {}
     for (first, before), (second, after) in pairwise(zip(logs, seen, strict=True)):
         for name in before.keys() & after.keys():
             rows = _changes(before[name], after[name])
             changes.setdefault(name, []).extend({"from": str(first), "to": str(second), **row} for row in rows)
-    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "axes": dict(sorted(changes.items()))}
+    document = {
+        "schema": SCHEMA,
+        "recordings": [str(log) for log in logs],
+        "axes": dict(sorted(changes.items())),
+        "verdicts": verdicts,
+    }
     if json is not None:
         write_json(document, json)
     return document
+
+
+def _verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
+    """Verdict and causes of an axis of one recording, or why one of the two has no result."""
+    error = diagnosed.get("error", identified.get("error"))
+    if error is not None:
+        return {"error": error}
+    kept = {key: diagnosed[key] for key in ("verdict", "not_judged", "unfinished") if key in diagnosed}
+    return {**kept, "causes": sorted({finding["cause"] for finding in diagnosed["findings"]})}
 
 
 def _quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
 
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis import work
+from selfcal.diagnosis.document import SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, extended
-from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording, why_left_out
-from selfcal.diagnosis.words import WORDS
-from selfcal.document import check_writable, parameters_entry, regressors_entry, write_json
-from selfcal.ending import Stopped, held
-from selfcal.errors import UserError, printable
+from selfcal.diagnosis.loop import INTERRUPTED, Diagnosed, diagnose_record
+from selfcal.diagnosis.record import Record, of_recording, why_left_out
+from selfcal.document import check_writable, of_errors, parameters_entry, regressors_entry, write_json
+from selfcal.ending import Held, Stopped, abandon, held
+from selfcal.errors import UserError, note, printable
+from selfcal.fail_on import check
 from selfcal.model import Model
 from selfcal.output import write_text
+from selfcal.progress import Doing
 from selfcal.recording import Recording, Scale, load
-from selfcal.verbs.identify import chosen_axes, identify_axis
+from selfcal.table import since
+from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
-INTERRUPTED = "interrupted before it was done"
+#: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
+FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
+#: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
+PATIENCE_S = 0.3
 
 
 def diagnose(
@@ -33,10 +42,14 @@ def diagnose(
     axes: Sequence[str] = (),
     model: Path | str | None = None,
     decimate: float | None = None,
+    full_rate: bool = False,
     json: Path | str | None = None,
     report: Path | str | None = None,
     write_model: Path | str | None = None,
     fail_on: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    gate: bool = False,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -44,66 +57,134 @@ def diagnose(
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
-    `axes`: those reported on; every other column may explain them. `decimate`: look at block means at this rate, Hz.
-    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on` is only checked here.
+    `axes`: those reported on; every other column may explain them. A long recording is looked at twice: first its means
+    of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one. A finding that
+    the means alone show stays in the axis' `only_in_means`, and counts for no verdict. An axis that the second look did
+    not finish has the first one's result if it has none of its own. `full_rate`: no first look. `decimate`: look at
+    block means at this rate alone, Hz.
+    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on`: see fail_on.py; it is
+    only checked here. `start_s`, `end_s`, `gate`: as `identify` has them; times found are those of the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
-    Under the command a signal ends it early: axes that are done are reported and written, the others have an error.
-    The caller then ends by `Held().check()`; a second signal ends at once.
+    Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
+    yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
-    if fail_on is not None and fail_on not in ("inadequate", *WORDS):
-        raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
+    check(fail_on)
+    if full_rate and decimate is not None:
+        raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
     check_writable(json, report, write_model, inputs=(log, model))
     loaded = Model.load(model)
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = stretch_of(
+        load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale), loaded, start_s, end_s, gate
+    )
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
-    record = of_recording(recording, loaded, decimate)
-    judged = [name for name in names if name in record.axes]
-    errors = {name: why_left_out(recording, loaded, name) for name in names if name not in judged}
-    console = Console(stderr=True)
-    with held() as ending, Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("diagnose", total=None)
+    first: dict[str, Diagnosed] = {}
+    with held() as ending, Doing("diagnose") as doing:
+        record = of_recording(recording, loaded, decimate)
+        if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
+            first = _look(of_recording(recording, loaded, FIRST_HZ), names, ending, doing)
+            _show_first(recording, first)
+        seen = _look(record, names, ending, doing) if not ending.asked else {}
+        found = _joined(names, first, seen)
+        errors = {
+            name: seen[name].unfinished if name in seen else _why_not(recording, loaded, record, name)
+            for name in names
+            if name not in found
+        }
+        with work.within(work.Work(lambda: ending.overdue)):
+            if not found:
+                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
+                if fail_on is not None and json is not None:
+                    write_json(of_errors(SCHEMA, recording, errors), json)
+                ending.check()
+                raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
+            doing.now("held-out gain")
+            tree = extended(loaded, record, found)
+            document = to_document(recording, found, errors, tree, first)
+            doing.now("posterior")
+            _add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
+            if write_model is not None:
+                write_text(write_model, as_text(tree, recording.path))
+            if report is not None:
+                from selfcal.diagnosis.page import write_page
 
-        def advance(text: str) -> None:
-            if ending.asked:
-                raise Stopped
-            progress.update(task, description=text)
-
-        try:
-            found = diagnose_record(record, judged, advance)
-        except Stopped:
-            ending.check()
-            raise
-        for name in judged:
-            if name not in found:
-                errors[name] = BELOW_LATTICE if record.axes[name].below_lattice else INTERRUPTED
-        if not found:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
-            raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
-        progress.update(task, description="held-out gain")
-        tree = extended(loaded, record, found)
-        document = to_document(recording, record, found, errors, tree)
-        progress.update(task, description="posterior")
-        _add_posteriors(document, recording, Model.of_tree(tree, loaded.path))
-    if write_model is not None:
-        write_text(write_model, as_text(tree, recording.path))
-    if report is not None:
-        from selfcal.diagnosis.page import write_page
-
-        write_page(report, document, record, found, _given(axes, model, decimate, rate, columns, units, scale))
+                doing.now("pictures")
+                given = _given(axes, model, decimate, rate, columns, units, scale)
+                write_page(report, document, record, found, given)
     if json is not None:
         write_json(document, json)
     return document
 
 
-def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model) -> None:
-    """What the extended model knows of each axis, as `identify` tells it; null where the sensor moved, or where the
-    record bears no report."""
+def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> dict[str, Diagnosed]:
+    """The loop in a thread, so that a signal is answered while the compiled filter runs. What a signal left undone is
+    `unfinished`, and the threads are then left behind."""
+    found: dict[str, Diagnosed] = {}
+    stopped = Event()
+    judged = [name for name in names if name in record.axes]
+
+    def loop() -> None:
+        with work.within(work.Work(lambda: stopped.is_set() or ending.asked)):
+            diagnose_record(record, judged, doing.now, found)
+
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(loop)
+    try:
+        while not future.done() and not ending.asked:
+            wait([future], timeout=0.1)
+            doing.tick()
+        wait([future], timeout=PATIENCE_S if ending.asked else None)
+        if future.done():
+            with suppress(Stopped):
+                future.result()
+        else:
+            abandon()
+    finally:
+        stopped.set()
+        pool.shutdown(wait=False)
+    return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
+
+
+def _joined(
+    names: Sequence[str], first: Mapping[str, Diagnosed], seen: Mapping[str, Diagnosed]
+) -> dict[str, Diagnosed]:
+    """What there is to report of each axis: what every sample shows, if that is done or shows a cause; else the first
+    look."""
+    found: dict[str, Diagnosed] = {}
+    for name in names:
+        ends = [one for one in (seen.get(name), first.get(name)) if one and (one.findings or not one.unfinished)]
+        if ends:
+            later = seen[name].unfinished if name in seen else INTERRUPTED
+            done = ends[0] is seen.get(name)
+            found[name] = ends[0] if done else replace(ends[0], unfinished=f"every sample: {later or INTERRUPTED}")
+    return found
+
+
+def _show_first(recording: Recording, first: Mapping[str, Diagnosed]) -> None:
+    """The findings of the first look on stderr, as soon as they are there."""
+    with work.within(work.Work(lambda: True)):  # in words: nothing is measured for them
+        axes = to_document(recording, first, {}, {})["axes"]
+    told = [f"{name}: {finding['cause']}: {finding['words']}" for name in axes for finding in axes[name]["findings"]]
+    note(f"means of {1.0 / FIRST_HZ:g} s, before every sample is looked at: {'' if told else 'nothing found'}")
+    for line in told:
+        note(line)
+
+
+def _why_not(recording: Recording, model: Model, record: Record, name: str) -> str:
+    """Why an axis has no result."""
+    if name not in record.axes:
+        return why_left_out(recording, model, name)
+    return BELOW_LATTICE if record.axes[name].below_lattice else INTERRUPTED
+
+
+def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model, ending: Held) -> None:
+    """What the extended model knows of each axis, as `identify` tells it; null where the sensor moved, where the record
+    bears no report, and after a signal."""
     for name, axis in document["axes"].items():
         if "error" not in axis:
             moved = any(finding["cause"] == "motion" for finding in axis["findings"])
-            axis["posterior"] = None if moved else _posterior(recording, name, model)
+            axis["posterior"] = None if moved or ending.asked else _posterior(recording, name, model)
 
 
 def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] | None:
@@ -140,23 +221,13 @@ def _given(
     return given
 
 
-def failing(document: Mapping[str, Any], wanted: str) -> bool:
-    """Whether `--fail-on` applies: `inadequate`, or the id of a cause that some axis shows."""
-    for axis in document["axes"].values():
-        if wanted == "inadequate" and axis.get("verdict") != "adequate":
-            return True
-        if any(finding["cause"] == wanted for finding in axis.get("findings", [])):
-            return True
-    return False
-
-
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
     recording = document["recording"]
     console = Console(stderr=to_stderr)
     console.print(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s\n",
+        f"{recording['duration_s']:g} s{since(recording)}\n",
         highlight=False,
         markup=False,
         soft_wrap=True,

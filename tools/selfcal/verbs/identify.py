@@ -16,16 +16,19 @@ from rich.progress import Progress
 
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
-from selfcal.blocks import MOST_DENSE, kept_out, usable_blocks
+from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.checks import coefficients_of, judge, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
-from selfcal.errors import UserError
+from selfcal.errors import OutsidePriors, UserError
 from selfcal.export import FORMS, write_export
+from selfcal.fail_on import check
+from selfcal.gate import gated
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
 from selfcal.readings import look
 from selfcal.recording import Recording, Scale, as_float, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
+from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
 from selfcal.tables import make_tables
 
@@ -33,6 +36,9 @@ from selfcal.tables import make_tables
 LARGEST_OVERBOUND = 0.99999
 #: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
 SPACING_LEAST = 0.01
+#: Intervals at most that the laws of `models/sums.yaml` are weighed on: their filters cost twenty times the others'.
+#: Half as many as runs 1 and 2 have at 1 Hz move no probability there by more than 0.08.
+MORE_LAWS_MOST = 5000
 #: Suspicions that a sum of drifts, or coloured noise, may be.
 SLOW = ("flicker", "colored_noise", "ramp", "step")
 
@@ -49,6 +55,11 @@ def identify(
     datasheet: bool = False,
     export: tuple[str, Path | str] | None = None,
     overbound: float | None = None,
+    suspicion: bool = True,
+    fail_on: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    gate: bool = False,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -60,10 +71,14 @@ def identify(
     or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
     `decimate`: rate of the block means in Hz, else the model's.
     `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
-    `export`: a format of `selfcal.export` and the file to write.
+    `export`: a format of `selfcal.export` and the file to write. `suspicion`: look at the axes that are not adequate
+    once more, for the cause that explains most. `fail_on`: see fail_on.py; it is only checked here.
+    `start_s`, `end_s`: the stretch of the recording to look at, s. `gate`: without the bank intervals in which the
+    model's stationary gate sees motion.
     Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
     UserError for what the user can put right, and if no axis has a result.
     """
+    check(fail_on)
     check_writable(json, plot, None if export is None else export[1], inputs=(log, model))
     if plot is not None:
         check_picture(plot)
@@ -78,7 +93,9 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = stretch_of(
+        load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale), loaded_model, start_s, end_s, gate
+    )
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
@@ -99,21 +116,21 @@ def identify(
                 )
             except UserError as error:
                 found[name] = error
-        document = to_document(recording, found)
+        with_reasons(found, recording, loaded_model)
+        document = to_document(recording, found, all_failed=json if fail_on is not None else None)
         doubtful = [name for name, axis in found.items() if isinstance(axis, Identified) and not axis.adequate]
-        if doubtful:
+        if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import suspicions
 
             progress.update(task, description="strongest suspicion")
-            rate_hz = loaded_model.bank_rate_hz if decimate is None else decimate
-            for name, cause in suspicions(recording, loaded_model, doubtful, rate_hz).items():
+            for name, cause in suspicions(recording, loaded_model, doubtful).items():
                 document["axes"][name]["suspicion"] = cause
             for name in doubtful:
                 if "saturation" in document["axes"][name]["checks"]:
                     document["axes"][name]["suspicion"] = "saturation"
             if model is None:
                 progress.update(task, description="more laws")
-                _weigh_more_laws(document, recording, doubtful, decimate)
+                _weigh_more_laws(document, recording, doubtful)
     if json is not None:
         write_json(document, json)
     if export is not None:
@@ -126,17 +143,37 @@ def identify(
     return document
 
 
-def _weigh_more_laws(
-    document: dict[str, Any], recording: Recording, names: Sequence[str], decimate: float | None
-) -> None:
-    """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them."""
+def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s: float | None, gate: bool) -> Recording:
+    """The part of a recording that a verb looks at: `--start`, `--end`, `--gate`."""
+    stretch = recording.between(start_s, end_s)
+    return gated(stretch, model) if gate else stretch
+
+
+def with_reasons(found: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
+    """Give the axes outside the priors their reason: one for all of them."""
+    outside = [name for name, axis in found.items() if isinstance(axis, OutsidePriors)]
+    if outside:
+        reason = UserError(outside_priors(recording, model, outside))
+        found.update(dict.fromkeys(outside, reason))
+
+
+def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequence[str]) -> None:
+    """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them.
+
+    At the model's own bank rate; of a longer record than MORE_LAWS_MOST such intervals at a lower one."""
+    from selfcal.engines.library import Bank
+
     more = Model.load(DEFAULT.parent / "sums.yaml")
+    rate_hz = min(more.bank_rate_hz, MORE_LAWS_MOST / recording.duration_s)
     for name in names:
         axis = document["axes"][name]
         if axis.get("suspicion", "flicker") in SLOW:
             with suppress(UserError):  # a record too long for these laws
-                found = identify_axis(recording, name, more, "library", decimate)
-                axis["more_laws"] = to_document(recording, {name: found})["axes"][name]["hypotheses"]
+                tables = make_tables(more, recording.rate_hz, (name,), bank_rate_hz=rate_hz)
+                bank = Bank(tables)
+                samples = as_float(recording.in_unit(name, more.group_of(name).unit))
+                bank.push(samples[:, None], recording.missing_before)
+                axis["more_laws"] = bank.report(0).probability
 
 
 def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -223,21 +260,26 @@ def identify_axis(
                 reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r, *with_columns)
             )
             advance()
+    kept = kept_out_of(blocks, recording)
     if not regressors:
         judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit)
         curve = curve_of_samples(samples) if draw else None
-        return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, blocks.kept_out, None, curve)
+        return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, kept, None, curve)
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
-        from selfcal.engines.library import outside_priors
-
-        raise UserError(outside_priors(tables.axes[0]))
+        raise OutsidePriors
     inside = combine(choices, results, model.hypotheses, group.unit)
     used = _used(mask_of(regressors, choices[inside.best]))
     judged = with_readings(judge(blocks, tables, group, results[inside.best], used), readings, group, unit)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
-    return Identified(unit, group.unit, scored.result, judged, blocks.kept_out, scored, curve)
+    return Identified(unit, group.unit, scored.result, judged, kept, scored, curve)
+
+
+def kept_out_of(blocks: Blocks, recording: Recording) -> dict[str, int]:
+    """Samples that were not used, by reason."""
+    moving = {"moving": recording.moving} if recording.moving else {}
+    return {**blocks.kept_out, "missing": recording.lost, **moving}
 
 
 def _used(mask: int) -> list[int]:

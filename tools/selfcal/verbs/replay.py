@@ -26,7 +26,8 @@ from selfcal.checks import Judged, judge, with_readings
 from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.ending import held
-from selfcal.errors import UserError, note
+from selfcal.errors import OutsidePriors, UserError, note
+from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
@@ -39,16 +40,17 @@ from selfcal.regressors import (
     check_channels,
     coefficient_unit,
     columns_of,
+    from_time,
     ln_prior,
     normal_coefficient,
     offered,
 )
 from selfcal.result import AxisResult, in_unit
-from selfcal.tables import bank_block, gate_table, make_tables
+from selfcal.tables import bank_block, make_tables
 from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
 from selfcal.verbs.codegen import write_tables
-from selfcal.verbs.identify import chosen_axes
+from selfcal.verbs.identify import chosen_axes, with_reasons
 from selfcal.warm import Start, warmed
 from selfcal.warm import load as load_start
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus, reasons
@@ -98,6 +100,8 @@ def replay(
     channel: str = "",
     report_every: float | None = None,
     gate: bool = False,
+    start_s: float | None = None,
+    end_s: float | None = None,
     json: Path | str | None = None,
     plot: Path | str | None = None,
     rate: float | None = None,
@@ -113,7 +117,8 @@ def replay(
     at the pace of a bus of 500 kbit/s, or over the CAN device `channel`. `report_every`: seconds of the recording
     between reports, one bank interval at least (default: a hundredth of it on the host, a tenth on the cortex-m4f, all
     of it on the cortex-m0). `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves
-    time passes as a gap. `plot`: file for the picture of the run.
+    time passes as a gap. `start_s`, `end_s`: the stretch of the recording to play, s; the firmware's clock begins with
+    it. `plot`: file for the picture of the run.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
@@ -136,7 +141,10 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale).between(start_s, end_s)
+    known_s = recording.start_s
+    loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))
+    recording = replace(recording, start_s=0.0)  # as the firmware has it
     names = chosen_axes(recording, loaded_model, axes)
     for name in names:
         if loaded_model.group_of(name).unit != axis_unit(name):
@@ -144,14 +152,12 @@ def replay(
                 f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
                 f"{axis_unit(name)}, so the model must be in that unit"
             )
-    if gate and gate_table(loaded_model, make_tables(loaded_model, recording.rate_hz, tuple(names))) is None:
-        raise UserError(
-            f"{loaded_model.path}: no gate for samples at {recording.rate_hz:g} Hz: it wants an entry `gate`, and two "
-            f"samples or more a bank interval ({loaded_model.bank_rate_hz:g} Hz)"
-        )
+    if gate:
+        gate_of(recording, loaded_model, tuple(names))
     firmware = build(loaded_model, recording.rate_hz, names, target, start=known)
     history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
     document = _document(recording, loaded_model, history, why, gate)
+    document["recording"]["start_s"] = known_s
     if json is not None:
         write_json(document, json)
     if plot is not None:
@@ -443,6 +449,7 @@ def _document(
             found[name] = _identified(recording, model, name, reports, gate)
         except UserError as error:
             found[name] = error
+    with_reasons(found, recording, model)
     document = to_document(recording, found)
     for name, axis in document["axes"].items():
         axis["module_reason"] = why.get(name)
@@ -472,9 +479,7 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
         raise UserError("too little rest for a report" if gate else "too short for a report")
     result, scored = _with_coefficients(history[-1], model, regressors, unit)
     if not any(math.isfinite(p) for p in result.probability.values()):
-        from selfcal.engines.library import outside_priors
-
-        raise UserError(outside_priors(tables.axes[0]))
+        raise OutsidePriors
     judged = Judged({}, None)
     if not gate:
         used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
