@@ -11,7 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from selfcal.diagnosis import integrity
-from selfcal.diagnosis.causes import noise, periodic, regressors, step
+from selfcal.diagnosis.causes import motion, noise, periodic, regressors, step
+from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import Statistic, combined, judged
@@ -84,15 +85,19 @@ def diagnose_record(
     any, Stopped goes on to the caller.
     """
     advance("fit")
+    handled, mask = motion.handled(record.axes, record.rate_hz)
+    quiet = {name: integrity.masked(state, mask) if handled else state for name, state in record.axes.items()}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        states = dict(zip(record.axes, pool.map(lambda state: state.refit(), record.axes.values()), strict=True))
+        states = dict(zip(quiet, pool.map(lambda state: state.refit(), quiet.values()), strict=True))
+        shown = [name for name in handled if name in axes]
+        spoilt = dict(zip(shown, pool.map(lambda name: record.axes[name].refit(), shown), strict=True))
     # An axis below its stated lattice is judged by nobody, and explains nobody.
     left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
     states = {name: state for name, state in states.items() if name not in left_out}
     axes = [name for name in axes if name not in left_out]
     record = replace(record, axes=states)
-    found = {name: Diagnosed(states[name], states[name]) for name in axes}
-    record = _integrity(record, found, advance)
+    found = {name: Diagnosed(spoilt.get(name, states[name]), states[name]) for name in axes}
+    record = _integrity(record, found, handled, advance)
     done: set[str] = set()
 
     def walk(name: str) -> None:
@@ -145,7 +150,10 @@ def _wild(state: State, record: Record) -> float:
     return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
 
 
-def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
+def _integrity(
+    record: Record, found: Mapping[str, Diagnosed], handled: Mapping[str, Moved], advance: Callable[[str], None]
+) -> Record:
+    """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
         masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
@@ -155,24 +163,23 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], advance: Callable
         quieted = pool.map(lambda state: _provisional(state, record, advance), states.values())
         quiet = dict(zip(states, quieted, strict=True))
     wild = {name: _wild(state, record) for name, state in quiet.items()}
-    moved = integrity.motion(replace(record, axes=quiet), wild) if len(states) > 1 else {}
+    moved, mask = integrity.motion(replace(record, axes=quiet), wild)
     if moved:
         # A jump of several axes is loud on them as well. Motion is loud beside the jump that fits it best.
         quiet |= {name: _provisional(quiet[name], record, advance, (step.looks,)) for name in moved}
-        moved = integrity.motion(replace(record, axes=quiet), wild)
-    if moved:
-        mask = next(iter(moved.values()))[1]
-        for name in states:
-            states[name] = integrity.masked(states[name], mask).refit()
+        moved, mask = integrity.motion(replace(record, axes=quiet), wild)
+    for name in states if moved else ():
+        states[name] = integrity.masked(states[name], mask).refit()
     bent = integrity.clock(record)
     for name, one in found.items():
         if bent is not None:
             others = tuple(other for other in found if other != name)
             one.findings.append(Finding(bent, 0, one.state, one.state, shared_with=others))
-        if name in moved:
-            one.findings.append(
-                Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
-            )
+        parts = [each[name] for each in (handled, moved) if name in each]
+        if parts:
+            shared = tuple(other for other in {**handled, **moved} if other != name)
+            look = motion.look_of(parts, record.rate_hz)
+            one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:

@@ -50,6 +50,8 @@ NEXT: Mapping[str, str] = {
 
 #: How an estimate's key is read out.
 LABELS = {"time_s": "at", "frequency_hz": "frequency", "width_hz": "half width"}
+#: Intervals that are read out.
+SHOWN = 6
 
 
 def _rounded(value: float, half: float) -> str:
@@ -71,6 +73,9 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             unit = "" if value["unit"] == "1" else f" {value['unit']}"
             spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
             parts.append(f"{label} {_rounded(value['median'], half)}{spread}{unit}")
+        elif isinstance(value, list) and value and isinstance(value[0], list):
+            more = f" and {len(value) - SHOWN} more" if len(value) > SHOWN else ""
+            parts.append(f"{label} {', '.join(f'{a:.6g} to {b:.6g} s' for a, b in value[:SHOWN])}{more}")
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
