@@ -65,7 +65,7 @@ def test_a_step_beside_a_gap(place: str) -> None:
     random = np.random.default_rng(391 + len(place))
     times: list[bool] = []
     sizes: list[bool] = []
-    for k in range(case_records(18, 180)):
+    for k in range(case_records(9, 180)):
         rate, gap = GRID[k % len(GRID)]
         t, y, begin, end, size = drawn(random, rate, gap)
         away = float(random.uniform(0.0, 60.0))

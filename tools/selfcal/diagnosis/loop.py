@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from selfcal.diagnosis import integrity
+from selfcal.diagnosis import integrity, score
 from selfcal.diagnosis.causes import motion, noise, periodic, regressors, step
 from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.record import Record
@@ -31,6 +31,8 @@ LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY = (periodic.looks, noise.colored, noise.variance_change)
 CERTAIN = 25.0
+#: Motion whose held-out gain lies so many standard deviations below 0 is none.
+HARM_SD = 2.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
@@ -176,9 +178,9 @@ def _integrity(
             others = tuple(other for other in found if other != name)
             one.findings.append(Finding(bent, 0, one.state, one.state, shared_with=others))
         parts = [each[name] for each in (handled, moved) if name in each]
-        if parts:
+        look = motion.look_of(parts, record.rate_hz) if parts else None
+        if look is not None and (name in handled or not _harms(look, one.state, states[name], record)):
             shared = tuple(other for other in {**handled, **moved} if other != name)
-            look = motion.look_of(parts, record.rate_hz)
             one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
@@ -197,6 +199,15 @@ def _integrity(
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
+
+
+def _harms(look: Look, before: State, after: State, record: Record) -> bool:
+    """Whether the rest of the record is predicted clearly worse without the samples that a finding leaves out."""
+    held_out, _ = score.gain(look, before, after, record)
+    if held_out is None:
+        return False
+    found = held_out["log_score_per_sample"]
+    return bool(found["after"] - found["before"] < -HARM_SD * found["sd"])
 
 
 def _rounds(
