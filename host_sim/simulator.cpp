@@ -158,6 +158,12 @@ std::vector<std::uint8_t> motion_mask(const Scene &scene) {
         const std::size_t end = std::min(scene.samples, begin + static_cast<std::size_t>(length_s * scene.rate_hz) + 1);
         std::fill_n(moving.begin() + static_cast<std::ptrdiff_t>(begin), end - begin, 1);
     }
+    for (std::size_t k = 0; k + 1 < scene.motion_times.size(); k += 2)
+        for (std::size_t i = 0; i < scene.samples; ++i) {
+            const double t = static_cast<double>(i) / scene.rate_hz;
+            if (t >= scene.motion_times[k] && t < scene.motion_times[k + 1])
+                moving[i] = 1;
+        }
     return moving;
 }
 

@@ -51,6 +51,7 @@ struct Scene {
     std::size_t bank_block = 1;  // recorded samples a bank interval, whose means a moving average is stated of
     std::size_t missing = 0;     // missing_samples: dropped in runs of 1 to 20, never the first or the last
     std::size_t motion_intervals = 0; // motion: this many, 2 to 10 s long
+    std::vector<double> motion_times; // motion: begin and end of each further one, s
 };
 
 struct Simulated {

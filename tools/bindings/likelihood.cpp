@@ -171,11 +171,18 @@ template <int D> struct Jump {
     }
 };
 
+// The filter's numbers from sample `start` on, until the next ones: F K (0 where the reading is missing), 1 / sqrt(s).
+template <int D> struct Gain {
+    std::size_t start;
+    double FK[D], scale;
+};
+
 // F is block diagonal, and a step costs of the order of D. PLAIN: F is diagonal. Else the last states are pairs, as far
 // as there are blocks of two.
 template <int D, bool PLAIN> struct Filter {
     const Input &in;
     const Sums &out;
+    std::vector<Gain<D>> *const gains; // null: nobody asks for them
     double h[D] = {}, below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
     double P[D][D], FK[D] = {};
     double s = 0.0, s_before = -1.0, r = -1.0, scale = 0.0, ln_now = 0.0;
@@ -191,7 +198,8 @@ template <int D, bool PLAIN> struct Filter {
     double G[columns_max][columns_max] = {}, ln_s = 0.0;
     std::size_t counted = 0;
 
-    Filter(const Input &input, const Sums &output) : in(input), out(output), even_to(0) {
+    Filter(const Input &input, const Sums &output, std::vector<Gain<D>> *kept = nullptr)
+        : in(input), out(output), gains(kept), even_to(0) {
         for (int i = 0; i < D; i++) {
             h[i] = in.h[i];
             on[i] = in.F[i * D + i];
@@ -283,6 +291,12 @@ template <int D, bool PLAIN> struct Filter {
         }
         covariance(i);
         held = i + 1;
+    }
+
+    void keep(std::size_t i) {
+        Gain<D> now{i, {}, scale};
+        std::memcpy(now.FK, FK, sizeof FK);
+        gains->push_back(now);
     }
 
     // X := F X + FK e
@@ -393,7 +407,7 @@ template <int D, bool PLAIN> struct Filter {
                 for (int g = 0; g < groups; g++)
                     for (std::size_t i = 0; i < length; i++)
                         read(i, g);
-            Lanes begun[groups][D];
+            Lanes begun[groups][D] = {};
             for (int lane = 0; lane < lanes; lane++) {
                 double next[D];
                 for (int a = 0; a < D; a++) {
@@ -464,8 +478,11 @@ template <int D, bool PLAIN> struct Filter {
             const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
             if (quiet >= settled_samples && alike(i))
                 held = even(i, stop);
-            else
+            else {
                 gain(i, stop);
+                if (gains != nullptr)
+                    keep(i);
+            }
             if (in.driver >= 0 && held < in.n)
                 P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[held] - in.r[i]);
             advance(i, held);
@@ -491,6 +508,114 @@ template <int D> void filter(std::size_t states, bool diagonal, const Input &in,
         filter<D + 1>(states, diagonal, in, out);
 }
 
+// A shift of the level that begins at sample k and stays, at every k, by one pass backwards over the filter's gains
+// (de Jong & Penzer 1998, JASA 93, 796). The shift is one state more, which F keeps and the filter does not know: with
+// h = [h, 1], g = [F K, 0] and L = F - g h' the innovations that it makes are h' L ... L e. Gaps, changes of the noise
+// and a covariance that has not settled are in the gains.
+struct Shifts {
+    double *A;       // [n] information: the sum of the squares of these innovations, whitened
+    double *B;       // [n, columns] their products with the whitened innovations of the record and of each column
+    double *impulse; // [n] the information of a single shifted sample
+};
+
+template <int D> struct Backward {
+    static constexpr int E = D + 1;
+    const Filter<D, false> &filter;
+    double h[E], below[E], on[E], above[E], N[E][E] = {}, R[columns_max][E] = {};
+    bool steady = false; // N stays as long as the gain does
+
+    explicit Backward(const Filter<D, false> &passed) : filter(passed) {
+        for (int a = 0; a < E; a++) {
+            h[a] = a < D ? filter.h[a] : 1.0;
+            below[a] = a < D ? filter.below[a] : 0.0;
+            on[a] = a < D ? filter.on[a] : 1.0;
+            above[a] = a < D ? filter.above[a] : 0.0;
+        }
+    }
+
+    // x := F' x
+    void transposed(double (&x)[E]) const {
+        double left = 0.0;
+        for (int a = 0; a < E; a++) {
+            const double here = x[a], right = a < D ? below[a + 1] * x[a + 1] : 0.0;
+            x[a] = (a > 0 ? above[a - 1] * left : 0.0) + on[a] * here + right;
+            left = here;
+        }
+    }
+
+    // N := h h' / s + L' N L
+    void information(const double (&g)[E], double energy) {
+        double M[E][E], change = 0.0, most = 0.0;
+        for (int a = 0; a < E; a++) {
+            double Ng = 0.0;
+            for (int b = 0; b < E; b++)
+                Ng += N[a][b] * g[b];
+            std::memcpy(M[a], N[a], sizeof M[a]);
+            transposed(M[a]);
+            for (int b = 0; b < E; b++)
+                M[a][b] -= Ng * h[b];
+        }
+        for (int b = 0; b < E; b++) {
+            double column[E], gM = 0.0;
+            for (int a = 0; a < E; a++) {
+                column[a] = M[a][b];
+                gM += g[a] * M[a][b];
+            }
+            transposed(column);
+            for (int a = 0; a <= b; a++) {
+                const double next = column[a] + h[a] * (energy * h[b] - gM);
+                change = std::max(change, std::fabs(next - N[a][b]));
+                most = std::max(most, std::fabs(next));
+                N[a][b] = N[b][a] = next;
+            }
+        }
+        steady = change <= 1e-15 * most;
+    }
+
+    void run(const std::vector<Gain<D>> &gains, const Shifts &out) {
+        const Input &in = filter.in;
+        std::size_t end = in.n;
+        for (std::size_t k = gains.size(); k-- > 0; end = gains[k].start) {
+            double g[E] = {};
+            std::memcpy(g, gains[k].FK, sizeof gains[k].FK);
+            steady = false;
+            for (std::size_t i = end; i-- > gains[k].start;) {
+                const bool present = std::isfinite(in.y[i]);
+                const double scale = present ? gains[k].scale : 0.0;
+                double single = scale * scale; // by the gain's effect on later readings
+                for (int a = 0; a < D; a++)
+                    for (int b = 0; b < D; b++)
+                        single += g[a] * N[a][b] * g[b];
+                if (!steady)
+                    information(g, scale * scale);
+                for (int c = 0; c < in.columns; c++) {
+                    double gR = present ? -scale * filter.out.white[i * in.columns + c] : 0.0;
+                    for (int a = 0; a < D; a++)
+                        gR += g[a] * R[c][a];
+                    transposed(R[c]);
+                    for (int a = 0; a < E; a++) {
+                        R[c][a] -= gR * h[a];
+                        R[c][a] = std::fabs(R[c][a]) < 1e-250 ? 0.0 : R[c][a];
+                    }
+                    out.B[i * in.columns + c] = R[c][D];
+                }
+                out.A[i] = N[D][D];
+                out.impulse[i] = present ? single : 0.0;
+            }
+        }
+    }
+};
+
+template <int D> void shifted(std::size_t states, const Input &in, const Sums &out, const Shifts &shifts) {
+    if (states == D) {
+        std::vector<Gain<D>> gains;
+        const auto filter = std::make_unique<Filter<D, false>>(in, out, &gains);
+        filter->run();
+        Backward<D>(*filter).run(gains, shifts);
+    } else if constexpr (D < states_max)
+        shifted<D + 1>(states, in, out, shifts);
+}
+
 double *fresh(std::size_t size) { return new double[size > 0 ? size : 1]; }
 
 Out array(double *data, std::vector<std::size_t> shape) {
@@ -498,8 +623,9 @@ Out array(double *data, std::vector<std::size_t> shape) {
     return {data, shape.size(), shape.data(), owner};
 }
 
-nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
-              const Matrix &P0, double R, int driver, const std::vector<std::size_t> &marks, bool innovations) {
+// Whether F is diagonal. Throws where sizes or the form of F do not fit.
+bool check(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
+           const Matrix &P0, int driver) {
     const std::size_t n = y.shape(0), d = h.shape(0), p = z.shape(0);
     if (d < 1 || d > states_max || p + 1 > columns_max)
         throw std::invalid_argument("1 to 24 states and at most 39 columns");
@@ -508,9 +634,6 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
         throw std::invalid_argument("shapes do not fit");
     if (driver < -1 || driver >= static_cast<int>(d))
         throw std::invalid_argument("driver must be a state, or -1");
-    for (std::size_t k = 0; k < marks.size(); k++)
-        if (marks[k] > n || (k > 0 && marks[k] < marks[k - 1]))
-            throw std::invalid_argument("marks must rise, up to the length of y");
     bool diagonal = true;
     for (std::size_t a = 0; a < d; a++)
         for (std::size_t b = 0; b < d; b++)
@@ -519,6 +642,16 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
                 if ((a + d) / 2 != (b + d) / 2) // pairs counted from the end
                     throw std::invalid_argument("F must be diagonal, with blocks of two states at its end");
             }
+    return diagonal;
+}
+
+nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
+              const Matrix &P0, double R, int driver, const std::vector<std::size_t> &marks, bool innovations) {
+    const bool diagonal = check(y, z, r, F, Q, h, P0, driver);
+    const std::size_t n = y.shape(0), d = h.shape(0), p = z.shape(0);
+    for (std::size_t k = 0; k < marks.size(); k++)
+        if (marks[k] > n || (k > 0 && marks[k] < marks[k - 1]))
+            throw std::invalid_argument("marks must rise, up to the length of y");
     const int c = static_cast<int>(p) + 1;
     const std::size_t m = marks.size();
     Sums out{fresh(m * c * c),
@@ -540,11 +673,31 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
     return nb::make_tuple(G, D, counted, x, white, s);
 }
 
+nb::tuple shifts(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
+                 const Matrix &P0, double R, int driver) {
+    check(y, z, r, F, Q, h, P0, driver);
+    const std::size_t n = y.shape(0), d = h.shape(0), c = z.shape(0) + 1;
+    std::vector<double> D(1), counted(1), x(c * d), white(n * c);
+    const std::size_t end = n;
+    Out G = array(fresh(c * c), {c, c}), A = array(fresh(n), {n}), B = array(fresh(n * c), {n, c});
+    Out impulse = array(fresh(n), {n});
+    const Sums out{G.data(), D.data(), counted.data(), x.data(), white.data(), nullptr};
+    const Shifts made{A.data(), B.data(), impulse.data()};
+    const Input in{y.data(), z.data(),  r.data(), n, static_cast<int>(c), F.data(), Q.data(),
+                   h.data(), P0.data(), R,        driver, &end, 1};
+    {
+        nb::gil_scoped_release released;
+        shifted<1>(d, in, out, made);
+    }
+    return nb::make_tuple(G, D[0], A, B, impulse);
+}
+
 } // namespace
 
 NB_MODULE(_likelihood, m) {
     using namespace nb::literals;
     m.def("run", &run, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a, "marks"_a, "innovations"_a);
+    m.def("shifts", &shifts, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a);
     m.attr("STATES_MAX") = states_max;
     m.attr("COLUMNS_MAX") = columns_max;
 }

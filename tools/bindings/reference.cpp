@@ -254,7 +254,8 @@ NB_MODULE(_reference, m) {
         .def_rw("filter_taps", &sr::Scene::filter_taps)
         .def_rw("bank_block", &sr::Scene::bank_block)
         .def_rw("missing", &sr::Scene::missing)
-        .def_rw("motion_intervals", &sr::Scene::motion_intervals);
+        .def_rw("motion_intervals", &sr::Scene::motion_intervals)
+        .def_rw("motion_times", &sr::Scene::motion_times);
     nb::class_<sr::Axis>(m, "Axis")
         .def(nb::init<>())
         .def_prop_rw(

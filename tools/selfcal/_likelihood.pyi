@@ -28,3 +28,14 @@ def run(
     NDArray[np.float64],
     NDArray[np.float64],
 ]: ...
+def shifts(
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    r: NDArray[np.float64],
+    F: NDArray[np.float64],
+    Q: NDArray[np.float64],
+    h: NDArray[np.float64],
+    P0: NDArray[np.float64],
+    R: float,
+    driver: int,
+) -> tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...

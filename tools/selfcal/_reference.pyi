@@ -91,6 +91,7 @@ class Scene:
     bank_block: int
     missing: int
     motion_intervals: int
+    motion_times: list[float]
     def __init__(self) -> None: ...
 
 class Axis:

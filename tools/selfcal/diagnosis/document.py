@@ -12,11 +12,15 @@ from selfcal.diagnosis import findable, words
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
+from selfcal.diagnosis.state import Look
 from selfcal.document import recording_entry
 from selfcal.ending import Stopped
+from selfcal.errors import UserError
 from selfcal.recording import SIDE_CHANNELS, Recording
+from selfcal.regressors import coefficient_unit
 
 SCHEMA = "selfcal.diagnose/1"
+G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 
 def to_document(
@@ -95,7 +99,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
     return {
         "cause": look.cause,
         "judged_at_hz": record.rate_hz,
-        "words": words.sentence(look.cause, estimate),
+        "words": " ".join(filter(None, [words.sentence(look.cause, estimate), _plausibility(look)])),
         "evidence_gain_nats": look.gain,
         "net_nats": min(look.net, look.gain),  # a search of less than one look is paid for by nothing
         "estimate": estimate,
@@ -122,6 +126,18 @@ def later(value: Any, start_s: float) -> Any:
     if isinstance(value, list | tuple):
         return [later(entry, start_s) for entry in value]
     return value + start_s
+
+
+def _plausibility(look: Look) -> str:
+    """How a gyroscope that follows an accelerometer compares with parts."""
+    coefficient = look.estimate.get("coefficient")
+    if look.cause != "cross_axis" or coefficient is None:
+        return ""
+    try:
+        size = unit_module.factor(str(coefficient["unit"]), G_SENSITIVITY_UNIT)
+    except UserError:
+        return ""
+    return words.plausibility(size * float(coefficient["median"]))
 
 
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:

@@ -229,6 +229,10 @@ def _truth(one: Diagnosed) -> dict[str, Any]:
     return truth
 
 
+def _seconds(value: float) -> str:
+    return f"{value:.4f}".rstrip("0").rstrip(".")
+
+
 def _digits(value: float) -> float:
     return float(f"{value:.6g}")
 
@@ -292,7 +296,10 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
             yield look.cause, look.gain, {"fraction": median["fraction"]}
         elif look.cause == "variance_change":  # the simulator's ratio is of variances
             yield look.cause, look.gain, {"time_s": median["time_s"], "ratio": median["ratio"] ** 2}
-        elif look.cause in ("missing_samples", "motion"):
+        elif look.cause == "motion":
+            times = "+".join(f"{_seconds(a)}-{_seconds(b)}" for a, b in look.estimate["intervals"])
+            yield look.cause, look.gain, {"intervals": times}
+        elif look.cause == "missing_samples":
             yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 
 

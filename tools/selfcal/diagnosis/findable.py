@@ -44,10 +44,8 @@ def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, A
         columns[f"axis_{name}"] = values
     least = {cause: _least(state, values, NET_LEAST) for cause, values in columns.items()}
     add("ramp", slope=(least["ramp"], f"{state.unit}/s"))
-    _, A, response = step.scan(state.series, state.best)
-    add(
-        "step", amplitude=(least["step"] * math.sqrt(_gain_for(lambda gain: step.worth(gain, response, A))), state.unit)
-    )
+    steps = step.scan(state.series, state.best)
+    add("step", amplitude=(least["step"] * math.sqrt(_gain_for(steps.worth)), state.unit))
     add(
         "periodic",
         amplitude=(

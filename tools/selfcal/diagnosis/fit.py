@@ -62,8 +62,11 @@ class Sums:
     x: Array  # [1 + p, states]: predicted state of the next sample, of the record and of each column
 
     def coefficients(self) -> tuple[Array, Array, float]:
-        """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares."""
+        """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares. The last is
+        infinite where the filter overflowed."""
         A, B = self.G[1:, 1:], self.G[1:, 0]
+        if not np.isfinite(self.G).all():
+            return np.zeros(B.size), np.zeros(A.shape), math.inf
         # A column of zeros, a step later than these samples, has no coefficient.
         size = np.sqrt(np.maximum(np.diag(A), 0.0))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 1e-150)
@@ -112,6 +115,25 @@ def run(
     return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
 
 
+@dataclass(frozen=True)
+class Shifts:
+    """Shifts of the level that begin at each sample and stay, before the columns are taken out, relative to the white
+    noise. `sums`: of the record. `A` [n]: information of each. `B` [n, 1 + p]: its products with the whitened record
+    and columns. `impulse` [n]: information of a single shifted sample, 0 where it is missing."""
+
+    sums: Sums
+    A: Array
+    B: Array
+    impulse: Array
+
+
+def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
+    """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
+    m = matrices(terms, theta, series.dt, series.duration_s)
+    G, D, A, B, impulse = _likelihood.shifts(series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver)
+    return Shifts(Sums(G, D, float(series.n), np.empty(0)), A, B, impulse)
+
+
 def ln_likelihood(sums: Sums) -> float:
     """At the best sigma and coefficients."""
     rss = sums.coefficients()[2]
@@ -141,7 +163,9 @@ def refit(series: Series, known: Fit) -> Fit:
         length = float(np.linalg.norm(slope))
         if 0.5 * length**2 < series.ftol:
             return finish(series, known.terms, np.clip(theta, limits[:, 0], limits[:, 1]))
-        ahead = theta - known.spread @ slope * min(1.0, 3.0 / length)
+        ahead = np.clip(theta - known.spread @ slope * min(1.0, 3.0 / length), limits[:, 0], limits[:, 1])
+        if np.allclose(ahead, theta, rtol=0.0, atol=1e-6):  # at a limit, and the slope points beyond it
+            return finish(series, known.terms, theta)
         there = cost(ahead)
         if there >= here:
             break
@@ -150,22 +174,29 @@ def refit(series: Series, known: Fit) -> Fit:
 
 
 def _spread(series: Series, found: Fit) -> Array:
-    """A root of the covariance of theta, by second differences; 4 at most for what the record hardly knows."""
+    """A root of the covariance of theta, by second differences; 4 at most for what the record hardly knows.
+
+    Its columns point inwards where theta is at a limit."""
     cost, limits = _cost(series, found.terms)
     k = found.theta.size
-    h = np.where(found.theta + 0.2 <= limits[:, 1], 0.2, -0.2) * np.where(limits[:, 1] - limits[:, 0] < 1.0, 0.05, 1.0)
-    middle = cost(found.theta)
+    h = 0.2 * np.where(limits[:, 1] - limits[:, 0] < 1.0, 0.05, 1.0)
+    centre = np.clip(found.theta, limits[:, 0] + h, limits[:, 1] - h)
+    middle = cost(centre)
     moves = np.diag(h)
-    ahead = [cost(found.theta + move) for move in moves]
-    back = [cost(found.theta - move) for move in moves]
+    ahead = [cost(centre + move) for move in moves]
+    back = [cost(centre - move) for move in moves]
     H = np.empty((k, k))
     for i in range(k):
         H[i, i] = (ahead[i] - 2.0 * middle + back[i]) / h[i] ** 2
         for j in range(i):
-            both = cost(found.theta + moves[i] + moves[j])
+            both = cost(centre + moves[i] + moves[j])
             H[i, j] = H[j, i] = (both - ahead[i] - ahead[j] + middle) / (h[i] * h[j])
+    if not np.isfinite(H).all():
+        return 4.0 * np.eye(k)
     values, vectors = np.linalg.eigh(H)
     spread: Array = vectors / np.sqrt(np.maximum(values, 1.0 / 16.0))
+    room = (centre - found.theta) @ spread
+    spread *= np.where(room < 0.0, -1.0, 1.0)
     return spread
 
 

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from selfcal.diagnosis import integrity, work
-from selfcal.diagnosis.causes import noise, periodic, regressors, step
+from selfcal.diagnosis import integrity, score, work
+from selfcal.diagnosis.causes import motion, noise, periodic, regressors, step
+from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import Statistic, combined, judged
@@ -28,6 +29,8 @@ LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY = (periodic.looks, noise.colored, noise.variance_change)
 CERTAIN = 25.0
+#: Motion whose held-out gain lies so many standard deviations below 0 is none.
+HARM_SD = 2.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
 #: Why an axis is not done.
@@ -91,7 +94,11 @@ def diagnose_record(
     are `unfinished`. So is an axis whose work is spent (work.py), with what was found until then."""
     found = {} if found is None else found
     advance("fit")
-    states = dict(zip(record.axes, work.each(lambda state: state.refit(), record.axes.values()), strict=True))
+    handled, mask = motion.handled(record.axes, record.rate_hz)
+    quiet = {name: integrity.masked(state, mask) if handled else state for name, state in record.axes.items()}
+    states = dict(zip(quiet, work.each(lambda state: state.refit(), quiet.values()), strict=True))
+    shown = [name for name in handled if name in axes]
+    spoilt = dict(zip(shown, work.each(lambda name: record.axes[name].refit(), shown), strict=True))
     # An axis below its stated lattice is judged by nobody, and explains nobody.
     left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
     states = {name: state for name, state in states.items() if name not in left_out}
@@ -99,8 +106,8 @@ def diagnose_record(
     works = {name: work.of_axis(state.y.size) for name, state in states.items()}
     for name in axes:
         if name not in left_out:
-            found[name] = Diagnosed(states[name], states[name], record, unfinished=INTERRUPTED)
-    record = _integrity(record, found, advance, works)
+            found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
+    record = _integrity(record, found, handled, advance, works)
 
     def walk(name: str) -> None:
         one, spent = found[name], ""
@@ -160,9 +167,11 @@ def _wild(state: State, record: Record) -> float:
 def _integrity(
     record: Record,
     found: Mapping[str, Diagnosed],
+    handled: Mapping[str, Moved],
     advance: Callable[[str], None],
     works: Mapping[str, work.Work],
 ) -> Record:
+    """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
     gone = integrity.missing(record)
     if gone is not None and gone[1].any():
         masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
@@ -175,27 +184,26 @@ def _integrity(
 
     quiet = dict(zip(states, work.each(quieted, states), strict=True))
     wild = {name: _wild(state, record) for name, state in quiet.items()}
-    moved = integrity.motion(replace(record, axes=quiet), wild) if len(states) > 1 else {}
+    moved, mask = integrity.motion(replace(record, axes=quiet), wild)
     if moved:
         # A jump of several axes is loud on them as well. Motion is loud beside the jump that fits it best.
         quiet |= {name: _provisional(quiet[name], record, advance, (step.looks,)) for name in moved}
-        moved = integrity.motion(replace(record, axes=quiet), wild)
-    if moved:
-        mask = next(iter(moved.values()))[1]
-        for name in states:
-            states[name] = integrity.masked(states[name], mask).refit()
+        moved, mask = integrity.motion(replace(record, axes=quiet), wild)
+    for name in states if moved else ():
+        states[name] = integrity.masked(states[name], mask).refit()
     changed = integrity.rate_change(record)
     for name, one in found.items():
         if changed is not None:
             others = tuple(other for other in found if other != name)
             one.findings.append(Finding(changed, 0, one.state, one.state, shared_with=others))
-        for look in (integrity.held_samples(record, name), integrity.stuck(record, name)):
-            if look is not None:
-                one.findings.append(Finding(look, 0, one.state, one.state))
-        if name in moved:
-            one.findings.append(
-                Finding(moved[name][0], 0, one.state, states[name], shared_with=tuple(k for k in moved if k != name))
-            )
+        for found_at in (integrity.held_samples(record, name), integrity.stuck(record, name)):
+            if found_at is not None:
+                one.findings.append(Finding(found_at, 0, one.state, one.state))
+        parts = [each[name] for each in (handled, moved) if name in each]
+        look = motion.look_of(parts, record.rate_hz) if parts else None
+        if look is not None and (name in handled or not _harms(look, one.state, states[name], record)):
+            shared = tuple(other for other in {**handled, **moved} if other != name)
+            one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))
         if gone is not None:
             one.findings.append(Finding(gone[0], 0, one.state, states[name]))
     for name in states:
@@ -213,6 +221,15 @@ def _integrity(
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
+
+
+def _harms(look: Look, before: State, after: State, record: Record) -> bool:
+    """Whether the rest of the record is predicted clearly worse without the samples that a finding leaves out."""
+    held_out, _ = score.gain(look, before, after, record)
+    if held_out is None:
+        return False
+    found = held_out["log_score_per_sample"]
+    return bool(found["after"] - found["before"] < -HARM_SD * found["sd"])
 
 
 def _rounds(

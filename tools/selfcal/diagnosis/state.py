@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from selfcal.diagnosis.fit import FTOL, Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.errors import UserError
 from selfcal.result import HALF_90, of_mixture
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
@@ -88,10 +89,14 @@ class State:
         return tuple(terms for terms in self.bases() if terms not in far)
 
     def refit(self, **changes: Any) -> State:
-        """The state with `changes`, fitted."""
+        """The state with `changes`, fitted. UserError where no model has a likelihood."""
         state = replace(self, **changes)
         series = state.series
         fits = tuple(curved(series, _fit_from(series, terms, self.fits)) for terms in state.bases())
+        if not math.isfinite(best(fits).ln_likelihood):
+            raise UserError(
+                f"{self.axis}: no noise model fits these readings: leave out the time in which the sensor did not rest"
+            )
         state = replace(state, fits=fits)
         chosen = state.best
         _, white, s = run(series, chosen.terms, chosen.theta, innovations=True)

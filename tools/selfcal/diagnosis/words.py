@@ -60,6 +60,9 @@ LABELS = {
     "frequency_hz": "frequency",
     "width_hz": "half width",
 }
+#: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
+#: coefficient so many times larger is no leak of that kind.
+G_SENSITIVITY, IMPLAUSIBLE = 0.02, 50.0
 
 
 def _rounded(value: float, half: float) -> str:
@@ -104,3 +107,14 @@ def inflation_sentence(inflation: Mapping[str, float]) -> str:
         if not 0.95 < factor < 1.05
     ]
     return f"Without it, plain white noise and random walk come out wrong: {', '.join(told)}." if told else ""
+
+
+def plausibility(coefficient: float) -> str:
+    """How a gyroscope's coefficient on an accelerometer, deg/s per m/s^2, compares with parts; empty if plausible."""
+    times = abs(coefficient) / G_SENSITIVITY
+    if times < IMPLAUSIBLE:
+        return ""
+    return (
+        f"That is {times:.2g} times the largest sensitivity to acceleration of any part ({G_SENSITIVITY:g} deg/s per "
+        "m/s^2): rather one cause moves both axes, such as vibration, temperature or the supply."
+    )

@@ -252,6 +252,10 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
         setting = _Setting(axis.N, sd, scene.samples / scene.rate_hz, scene.samples, axis.bias)
         record: dict[str, Any] = {}
         for key, entry in keys.items():
+            if key == "intervals" and "-" in given.get(key, ""):
+                record[key] = _intervals(given[key])
+                scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
+                continue
             value = _number(name, key, given[key]) if key in given else entry.default(setting)
             whole = entry.field in ("missing", "motion_intervals")
             record[key] = int(value) if whole else value
@@ -265,6 +269,20 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
             axis.cross_axis = model.axes.index(record["other"])
         applied["axes"][axis_name] = record
     return applied
+
+
+def _intervals(text: str) -> list[list[float]]:
+    """Times of motion, s: BEGIN-END+BEGIN-END..."""
+    found = []
+    for pair in text.split("+"):
+        try:
+            begin, end = map(float, pair.split("-"))
+        except ValueError:
+            begin = end = math.nan
+        if not 0.0 <= begin < end < math.inf:
+            raise UserError(f"--effect motion: write intervals=BEGIN-END+BEGIN-END in seconds, not '{text}'")
+        found.append([begin, end])
+    return found
 
 
 def _number(effect: str, key: str, text: str) -> float:
