@@ -6,7 +6,8 @@
  * The report leaves the drift open, and this doubt must not look like a fault of the model. So the filter allows the
  * most drift that is plausible: the 95 % quantile of the drift parameter, under a law with a walk if one has 1 % of the
  * probability, else under one with a drift. Too much drift makes z negatively correlated: only positive correlation
- * counts.
+ * counts. A slow effect of a channel has widened that quantile as well: its score is far below the score under the
+ * true drift, and a warm-up may pass (tests/README.md has the power).
  *
  * State of the filter, relative to sigma_v: the level (the bias, with the walk if there is one), then the Gauss-Markov
  * terms. The innovation nu has variance S. If the model holds, z = nu / sqrt(S) is white with variance 1.

@@ -2,10 +2,12 @@
 clean ones and ones with an effect.
 
     python tests/adequacy_rates.py --records 50 --hours 10 --seed 1 [--effect NAME --size S] [--handle] [--out FILE]
+    python tests/adequacy_rates.py --records 60 --hours 2 --effect temperature --size 1.25 --shape warm_600 [--law LAW]
 
 Each record has six axes at 1 Hz, each with a law drawn from those of the default model and parameters from its priors.
 An effect is on gx alone, whose drift is small. Clean ones have a temperature that warms up and wanders, a supply that
-steps, and gaps: none of them moves the bias. The library in float runs as on a module, with a report before each epoch.
+steps, and gaps: none of them moves the bias. With `--shape` the temperature changes by 12 degC in a known way, and gx
+is alone, of the law `--law`. The library in float runs as on a module, with a report before each epoch.
 `--handle`: the model handles steps and changes of the variance. Prints the flags by suspicion, and the changes.
 `--out` takes every judgement.
 """
@@ -16,6 +18,7 @@ import argparse
 import json
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,14 +34,28 @@ from selfcal.wire import choices
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 LAWS = ("constant", "random_walk", "gauss_markov")
 SUSPECTS = choices("GX_ADEQUACY", "suspicion")
+#: Temperatures of `--shape`, degC, at t [n] in s: two warm-ups with their time constants, an hour's cycle, a rise.
+SHAPES: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "warm_600": lambda t: 12.0 * -np.expm1(-t / 600.0),
+    "warm_1800": lambda t: 12.0 * -np.expm1(-t / 1800.0),
+    "cycle": lambda t: 6.0 * np.sin(2.0 * np.pi * t / 3600.0),
+    "rise": lambda t: 12.0 * t / t.size,
+}
+#: Of the axis with an effect: drifts that hide little.
+QUIET = {
+    "constant": {"N": 0.04, "bias": 0.1},
+    "random_walk": {"N": 0.04, "K": 2e-4, "bias": 0.1},
+    "gauss_markov": {"N": 0.04, "sigma_m": 0.01, "alpha": 2e-3, "bias": 0.1},
+}
 
 
-def channels_of(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """[n, 2]: temperature in degC and supply in V."""
-    t = np.arange(n)
+def channels_of(rng: np.random.Generator, n: int, shape: str = "") -> NDArray[np.float64]:
+    """[n, 2]: temperature in degC, drawn or of one of SHAPES, and supply in V."""
+    t = np.arange(float(n))
     warm = 25.0 + rng.uniform(0, 15) * (1.0 - np.exp(-t / rng.uniform(300, 3000)))
     day = rng.uniform(0, 5) * np.sin(2 * np.pi * (t / rng.uniform(5000, 90000) + rng.uniform()))
-    temp = np.round((warm + day + 0.02 * rng.standard_normal(n)) / 0.005) * 0.005
+    true = 25.0 + SHAPES[shape](t) if shape else warm + day
+    temp = np.round((true + 0.02 * rng.standard_normal(n)) / 0.005) * 0.005
     supply = 5.0 + 0.002 * rng.standard_normal(n) + 0.1 * (t > rng.uniform(0, n))
     return np.column_stack([temp, supply])
 
@@ -90,18 +107,18 @@ def with_effect(
 
 
 def record(
-    tables: Tables, model: Model, hours: float, seed: int, effect: str, size: float
+    tables: Tables, model: Model, hours: float, seed: int, effect: str, size: float, shape: str = "", own: str = ""
 ) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
-    """Judgements and changes of one record; an effect is on gx alone."""
+    """Judgements and changes of one record; an effect is on gx alone, whose drift has the law `own`."""
     rng = np.random.default_rng(seed)
     n = round(hours * 3600)
-    channels = channels_of(rng, n)
+    channels = channels_of(rng, n, shape)
     columns = []
-    for axis in AXES:
+    for axis in (table.name for table in tables.axes):
         law = LAWS[rng.integers(3)]
         truth = draw(model.group_of(axis), law, rng)
-        if effect and axis == "gx":  # one whose drift hides little
-            law, truth = "random_walk", {"N": 0.04, "K": 2e-4, "bias": 0.1}
+        if effect and axis == "gx":
+            law, truth = own, QUIET[own]
         y = simulate_bank_samples(law, truth, 1.0, n, int(rng.integers(2**31)))[0]
         if effect and axis == "gx":
             y = with_effect(y, effect, size, truth["N"], channels, rng)
@@ -122,11 +139,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--effect", default="")
     parser.add_argument("--size", type=float, default=1.0)
+    parser.add_argument("--shape", default="", choices=["", *SHAPES])
+    parser.add_argument("--law", default="random_walk", choices=list(QUIET))
     parser.add_argument("--handle", action="store_true")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     model = replace(Model.load(None), handling=Handling(steps=given.handle, variance_changes=given.handle))
-    tables = make_tables(model, 1.0, AXES)
+    tables = make_tables(model, 1.0, AXES[:1] if given.shape else AXES)
     flags: Counter[str] = Counter()
     changes: Counter[str] = Counter()
     delays: list[float] = []
@@ -134,7 +153,9 @@ def main() -> None:
     rows = []
     first: list[float] = []
     for k in range(given.records):
-        told, found = record(tables, model, given.hours, given.seed + k, given.effect, given.size)
+        told, found = record(
+            tables, model, given.hours, given.seed + k, given.effect, given.size, given.shape, given.law
+        )
         for axis, at, cause, size, _ in found:
             late = at - round(given.hours * 1800)
             where = "" if not given.effect else "right" if axis == 0 and 0 <= late < 600 else "other"

@@ -1,4 +1,5 @@
-"""No law is lost: records from the whole prior, up to 10^6 bank samples, on the nodes of each target.
+"""No law is lost: records from the whole prior, up to 10^6 bank samples, on the nodes of each target. And the module's
+power against a temperature.
 
 Truth: the default nodes of the same record (16, 16 x 12), which are held to dense nodes in double. What an evidence of
 -inf means is the contract of SELFCAL_OFF_GRID in lib/selfcal.h: the priors exclude the law, or all laws are flagged.
@@ -14,7 +15,9 @@ import pytest
 from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.laws import PLACES
-from selfcal.tables import Tables
+from selfcal.tables import Tables, make_tables
+from selfcal.verbs.montecarlo import simulate_bank_samples
+from selfcal.wire import choices
 
 from agreement import LIMITS, MODEL, REPORT_LIMIT, Floats, a_record, exact_report, model_of, push, tables_of
 from conftest import case_records, worst_difference
@@ -22,6 +25,7 @@ from conftest import case_records, worst_difference
 #: To a law excluded by its priors all the noise that they allow is less likely by so many nats (tests/README.md).
 EXCLUDED = 13.0
 TARGETS = tuple(MODEL.nodes)
+SUSPECTS = choices("GX_ADEQUACY", "suspicion")
 
 
 def excluded(tables: Tables, y: Floats, law: str) -> bool:
@@ -107,3 +111,21 @@ def test_a_lost_law_flags_the_report() -> None:
     assert report.log_evidence["moving_average"] == -math.inf
     for law, parameters in report.parameters.items():
         assert all(estimate.off_grid for estimate in parameters.values()), law
+
+
+def flagged(coefficient: float, seed: int) -> set[str]:
+    """Suspicions of the module's judgements of 2 h of a gyro whose temperature goes through a cycle of 1 h, ±6 degC."""
+    n, rng = 7200, np.random.default_rng([seed, 39])
+    temperature = 25.0 + 6.0 * np.sin(2.0 * math.pi * np.arange(n) / 3600.0) + 0.02 * rng.standard_normal(n)
+    y, _ = simulate_bank_samples("random_walk", {"N": 0.04, "K": 2e-4, "bias": 0.1}, 1.0, n, seed)
+    channels = np.column_stack([temperature, np.full(n, 5.0)]).astype(np.float32)
+    readings = (y + coefficient * temperature)[:, None].astype(np.float32)
+    told, _ = Bank(make_tables(MODEL, 1.0, ("gx",))).raw.watch(readings, np.zeros(n, np.uint64), channels)
+    return {SUSPECTS[suspect] for _, _, state, suspect, _, _ in told if state == 2}
+
+
+def test_the_module_names_a_temperature_cycle() -> None:
+    """The power that tests/README.md states: of 0.03 deg/s per degC every record is flagged, by that name. Without the
+    effect one of 200 may be."""
+    assert all(flagged(0.03, seed) == {"temperature"} for seed in range(300, 300 + case_records(4, 60)))
+    assert sum(bool(flagged(0.0, seed)) for seed in range(500, 500 + case_records(4, 200))) <= 1
