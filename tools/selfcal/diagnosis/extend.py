@@ -299,6 +299,8 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
         elif look.cause == "motion":
             times = "+".join(f"{_seconds(a)}-{_seconds(b)}" for a, b in look.estimate["intervals"])
             yield look.cause, look.gain, {"intervals": times}
+        elif look.cause == "stuck":
+            yield look.cause, look.gain, {"intervals": len(look.estimate["intervals"])}
         elif look.cause == "missing_samples":
             yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 

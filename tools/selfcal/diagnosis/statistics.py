@@ -144,6 +144,8 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None
         read = codes[np.isfinite(codes)].astype(np.int64)
         odd = int((read & 1).sum())
         if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
+            # A code that never comes leaves its readings to others.
+            found["equal_readings"] = sum(equal) / math.sqrt(n)
             found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
     return found
 

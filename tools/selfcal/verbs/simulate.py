@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from selfcal import _reference, recording, units
@@ -74,7 +75,16 @@ _EFFECTS: dict[str, dict[str, _Key]] = {
         "amplitude": _Key("motion_amplitude", lambda s: 20.0 * s.sd),
     },
     "missing_samples": {"missing": _Key("missing", lambda s: max(1, round(0.02 * s.samples)))},
+    # Of the logger and the bus: put into the finished readings by _read_out().
+    "stuck": {"intervals": _Key("", lambda s: 2)},
+    "held_samples": {"rate_hz": _Key("", lambda s: 0.2 * s.samples / s.duration_s)},
+    "rate_change": {
+        "time_s": _Key("", lambda s: s.duration_s / 2.0),
+        "after_hz": _Key("", lambda s: 0.5 * s.samples / s.duration_s),
+    },
 }
+#: Effects of the whole recording: they have no axis.
+_COMMON = ("missing_samples", "rate_change")
 #: Values an effect's key may have, where not every number will do: test and what the complaint says.
 _LIMITS: dict[str, tuple[Callable[[float], bool], str]] = {
     "lag1": (lambda v: -1.0 < v < 1.0, "between -1 and 1"),
@@ -84,6 +94,8 @@ _LIMITS: dict[str, tuple[Callable[[float], bool], str]] = {
     "limit": (lambda v: v > 0.0, "above 0"),
     "intervals": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
     "missing": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
+    "rate_hz": (lambda v: v > 0.0, "above 0"),
+    "after_hz": (lambda v: v > 0.0, "above 0"),
 }
 
 
@@ -114,6 +126,7 @@ def simulate(
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
         values, temperature, supply, present, bias_now = _reference.simulate(scene, axes)
+        changed = _read_out(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, _DRAWS + len(axes)))
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
         truth[name] |= {
             "bias_now": now,
@@ -131,11 +144,58 @@ def simulate(
     }
     columns = {name: (model.group_of(name).unit, row[present]) for name, row in zip(model.axes, values, strict=True)}
     columns |= {"temp": ("degC", temperature[present]), "supply": ("V", supply[present])}
-    lattice = {name: axis.lsb for name, axis in zip(model.axes, axes, strict=True) if axis.lsb > 0.0}
     stamps = None if present.all() else np.flatnonzero(present) / scene.rate_hz
+    if changed is not None:
+        stamps, columns = _slower(np.flatnonzero(present) / scene.rate_hz, columns, *changed)
+    lattice = {name: axis.lsb for name, axis in zip(model.axes, axes, strict=True) if axis.lsb > 0.0}
     with Console(stderr=True).status(f"writing {scene.samples:,} samples"):
         recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})
-    return {**meta, "samples": int(present.sum()), "rate_hz": scene.rate_hz}
+    rows = int(present.sum()) if stamps is None else stamps.size
+    return {**meta, "samples": rows, "rate_hz": scene.rate_hz}
+
+
+def _read_out(
+    applied: Sequence[Mapping[str, Any]],
+    model: Model,
+    axes: Sequence[_reference.Axis],
+    values: NDArray[np.float64],
+    rate_hz: float,
+    random: _reference.Random,
+) -> tuple[float, int] | None:
+    """Put the faults of the bus and the logger into `values` [axes, n]. Returns the time of a change of the rate,
+    s, and how many readings make one from there on; None without."""
+    n, changed = values.shape[1], None
+    for effect in applied:
+        for name, keys in effect["axes"].items():
+            place = model.axes.index(name)
+            row = values[place]
+            if effect["id"] == "stuck":
+                piece = n // keys["intervals"]
+                for k in range(keys["intervals"]):
+                    start = k * piece + int(random.uniform() * 0.8 * piece)
+                    row[start : start + max(1, piece // 10)] = row[start]
+            elif effect["id"] == "held_samples":
+                cell = np.floor(np.arange(n) * min(keys["rate_hz"] / rate_hz, 1.0)).astype(np.int64)
+                lsb = axes[place].lsb
+                mean = np.bincount(cell, row) / np.bincount(cell)
+                row[:] = (np.rint(mean / lsb) * lsb if lsb > 0.0 else mean)[cell]
+            elif effect["id"] == "rate_change":
+                changed = (keys["time_s"], max(1, round(rate_hz / keys["after_hz"])))
+    return changed
+
+
+def _slower(
+    stamps: NDArray[np.float64], columns: Mapping[str, tuple[str, NDArray[np.float64]]], time_s: float, block: int
+) -> tuple[NDArray[np.float64], dict[str, tuple[str, NDArray[np.float64]]]]:
+    """Means of `block` rows from `time_s` on, at the time of the last."""
+    first = int(np.searchsorted(stamps, time_s))
+    end = first + (stamps.size - first) // block * block
+
+    def taken(row: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([row[:first], row[first:end].reshape(-1, block).mean(axis=1)])
+
+    slower = np.concatenate([stamps[:first], stamps[first:end].reshape(-1, block)[:, -1]])
+    return slower, {name: (unit, taken(row)) for name, (unit, row) in columns.items()}
 
 
 def show(meta: Mapping[str, Any], output: Path | str) -> None:
@@ -234,7 +294,7 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
     if name not in _EFFECTS:
         raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(_EFFECTS)})")
     keys = _EFFECTS[name]
-    names = [*keys, *(["other"] if name == "cross_axis" else []), *([] if name == "missing_samples" else ["axis"])]
+    names = [*keys, *(["other"] if name == "cross_axis" else []), *([] if name in _COMMON else ["axis"])]
     given: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -257,9 +317,10 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
                 scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
                 continue
             value = _number(name, key, given[key]) if key in given else entry.default(setting)
-            whole = entry.field in ("missing", "motion_intervals")
+            whole = key in ("missing", "intervals")
             record[key] = int(value) if whole else value
-            setattr(scene if whole else axis, entry.field, record[key])
+            if entry.field:
+                setattr(scene if whole else axis, entry.field, record[key])
         if name == "cross_axis":
             following = group.axes[(group.axes.index(axis_name) + 1) % len(group.axes)]
             record["other"] = given.get("other", following)
