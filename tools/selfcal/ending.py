@@ -12,7 +12,7 @@ from types import FrameType
 from typing import NoReturn
 
 #: How long results may still be worked out after a signal, s.
-GRACE_S = 0.8
+GRACE_S = 0.6
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -69,12 +69,13 @@ def gated(recording: Recording, model: Model) -> Recording:
     table = table_of(recording, model, axes)
     samples = np.column_stack([as_float(recording.in_unit(name, model.group_of(name).unit)) for name in axes])
     samples = np.ascontiguousarray(samples, np.float32)
-    used = _resting(samples, recording.missing_before, table)
+    used, ended = _resting(samples, recording.missing_before, table)
     if used.any():
         at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
-        interval = (at - at[np.argmax(used)]) // tables.block
-        moved = np.unique(interval[~used])
-        used &= ~np.isin(interval, moved)
+        at -= at[np.argmax(used)]
+        interval = at // tables.block
+        moved = np.concatenate([interval[~used], (at[ended] + 1) // tables.block])
+        used &= ~np.isin(interval, np.unique(moved))
     if int(used.sum()) < 2:
         raise UserError(
             f"{recording.path}: --gate leaves no interval of rest: the sensor moves, or its noise is above N of `gate` "
@@ -83,17 +84,23 @@ def gated(recording: Recording, model: Model) -> Recording:
     return recording.with_rows(used, moving=True)
 
 
-def _resting(samples: NDArray[np.float32], missing_before: NDArray[np.int64], table: GateTable) -> NDArray[np.bool_]:
-    """bool[n]: whether the bank takes each of samples [n, axes]."""
+def _resting(
+    samples: NDArray[np.float32], missing_before: NDArray[np.int64], table: GateTable
+) -> tuple[NDArray[np.bool_], list[int]]:
+    """Whether the bank takes each of samples [n, axes]; and rows behind which a gap ended the rest: the interval in
+    progress there is dropped."""
     learning = Learning(table)
     gate, n = learning.gate, len(samples)
     used = np.zeros(n, bool)
     edges = np.append(np.flatnonzero(missing_before), n)
+    ended: list[int] = []
     resting = in_step = False
     k = 0
     while k < n:
         if missing_before[k]:
             resting = bool(gate.skip(int(missing_before[k])))
+            if not resting and k:
+                ended.append(k - 1)
         position = int(gate.last()["position"])
         end = min(k + table.window - position, int(edges[np.searchsorted(edges, k, side="right")]))
         rest = learning.push(samples[k:end])
@@ -101,4 +108,4 @@ def _resting(samples: NDArray[np.float32], missing_before: NDArray[np.int64], ta
         in_step = in_step or (position == 0 and bool(taken[0]))
         used[k:end] = taken & in_step
         resting, k = bool(rest[-1]), end
-    return used
+    return used, ended

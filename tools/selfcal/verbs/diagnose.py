@@ -149,15 +149,17 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
 def _joined(
     names: Sequence[str], first: Mapping[str, Diagnosed], seen: Mapping[str, Diagnosed]
 ) -> dict[str, Diagnosed]:
-    """What there is to report of each axis: what every sample shows, if that is done or shows a cause; else the first
-    look."""
+    """What there is to report of each axis: what every sample shows, if that was not interrupted; else the first look,
+    if that was not; else what either shows."""
     found: dict[str, Diagnosed] = {}
     for name in names:
-        ends = [one for one in (seen.get(name), first.get(name)) if one and (one.findings or not one.unfinished)]
-        if ends:
-            later = seen[name].unfinished if name in seen else INTERRUPTED
-            done = ends[0] is seen.get(name)
-            found[name] = ends[0] if done else replace(ends[0], unfinished=f"every sample: {later or INTERRUPTED}")
+        looks = [one for one in (seen.get(name), first.get(name)) if one and (one.findings or not one.unfinished)]
+        looks.sort(key=lambda one: one.unfinished == INTERRUPTED)
+        if looks:
+            found[name] = looks[0]
+            if looks[0] is not seen.get(name):
+                reason = seen[name].unfinished if name in seen else INTERRUPTED
+                found[name] = replace(looks[0], unfinished=f"every sample: {reason}")
     return found
 
 
