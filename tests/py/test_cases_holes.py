@@ -135,7 +135,7 @@ spread(partial(slow, Path(sys.argv[1])), range(4), settings={{}}, piece=1)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM] if case_records(0, 1) else [signal.SIGKILL])
 def test_workers_end_with_their_command(tmp_path: Path, number: signal.Signals) -> None:
     """However it ends: none is left to work for nobody."""
     program = PROGRAM.format(tests=str(Path(__file__).parent))

@@ -141,9 +141,8 @@ def _cluster(
     try:
         client: Any = distributed.Client(scheduler, timeout=PATIENCE_S)
     except Exception as error:  # each kind of address has errors of its own
-        raise UserError(
-            f"--scheduler {printable(scheduler)}: no Dask scheduler answers ({first_line(error)}): start one with `dask scheduler`"
-        ) from error
+        said = f"--scheduler {printable(scheduler)}: no Dask scheduler answers ({first_line(error)})"
+        raise UserError(f"{said}: start one with `dask scheduler`") from error
     with client:
         futures = client.map(partial(_piece, function), waiting, pure=False)
         for _, answer in distributed.as_completed(futures, with_results=True):
