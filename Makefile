@@ -25,9 +25,10 @@
 #   make lock [UPGRADE=1 | UPGRADE=name]
 #                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
-# Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c).
+# Settings: PYTHON (3.11 or later), UNITY_ROOT (a Unity of your own: the folder with unity.c), BROWSER=0 (no chromium).
 
 PYTHON ?= python3
+BROWSER ?= 1
 BUILD := build
 VENV := .venv
 BIN := $(VENV)/bin
@@ -63,7 +64,7 @@ setup:
 	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 system $(PACKAGE) $(UNITY)
 
 system:
-	@PYTHON="$(PYTHON)" tools/setup/system.sh
+	@PYTHON="$(PYTHON)" BROWSER="$(BROWSER)" tools/setup/system.sh
 
 python: $(PACKAGE)
 

@@ -135,7 +135,7 @@ spread(partial(slow, Path(sys.argv[1])), range(4), settings={{}}, piece=1)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM] if case_records(0, 1) else [signal.SIGKILL])
 def test_workers_end_with_their_command(tmp_path: Path, number: signal.Signals) -> None:
     """However it ends: none is left to work for nobody."""
     program = PROGRAM.format(tests=str(Path(__file__).parent))
@@ -169,6 +169,16 @@ def test_a_killed_rival_is_no_answer() -> None:
     group = Model.load().group_of("gx")
     problem = Problem(np.zeros(50), 1.0, group, ("constant",))
     assert measured(cast(Any, Deadly()), problem, "deg/s") == {"title": "deadly", "error": "it ended without an answer"}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="DASK ABSENT: make setup-cluster")
+@pytest.mark.parametrize("address", ["tls://127.0.0.1:9", "ucx://127.0.0.1:9", "inproc://1", "nowhere", "x://y", "\n"])
+def test_a_scheduler_that_cannot_be_is_one_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each kind of address fails in its own way."""
+    monkeypatch.setattr("selfcal.spread.PATIENCE_S", 0.5)
+    with pytest.raises(UserError, match=r"^--scheduler .*: no Dask scheduler answers \(.*\): start one with") as caught:
+        spread(uneven, range(2), settings={}, scheduler=address)
+    assert "\n" not in str(caught.value)
 
 
 # ------------------------------------------------------------------------------------------------------ files that lie
@@ -303,3 +313,22 @@ def test_a_small_r_file_takes_little_memory(tmp_path: Path, kind: str) -> None:
     assert ("a sequence of 6e+06 numbers" if kind == "sequences" else "it unpacks to more than 64 MiB") in said
     assert "\n" not in said
     assert peak < 450e6
+
+
+def test_changed_r_files(tmp_path: Path) -> None:
+    """Numbers, integers and compact sequences in one file, plain and packed: no exception but the one line."""
+    numbers = r_word(0x402) + r_symbol("gx") + r_word(14, 8) + struct.pack(">8d", *range(8))
+    integers = r_word(0x402) + r_symbol("gy") + r_word(13, 8, *range(8))
+    sound = r_file(numbers + integers + r_sequence("t", 8.0))
+    stated = {"units": {"gx": "deg/s", "gy": "deg/s", "t": "s"}}
+    path = tmp_path / "log.rda"
+    path.write_bytes(sound)
+    assert load(path, **stated).samples == 8
+    chance = random.Random("r")
+    refused = 0
+    trials = case_records(60, 2000)
+    for k in range(trials):
+        made = mutations(sound, chance)
+        path.write_bytes(lzma.compress(made, preset=0) if k % 3 == 2 else made)
+        refused += refused_in_one_line(lambda: load(path, **stated), path) != ""
+    assert refused > trials / 4

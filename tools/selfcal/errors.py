@@ -35,7 +35,8 @@ def remark(text: str) -> str:
     The forms are `#` to the line's end, `/* */`, `<!-- -->` and a DBC file's `"..."`.
     """
     apart = re.sub(r"\*(?=/)|/(?=\*)|-(?=-)", r"\g<0> ", printable(text))
-    return apart.replace('"', "'")
+    apart = apart.replace('"', "'")
+    return f"{apart} " if apart.endswith("\\") else apart
 
 
 def short(text: str) -> str:

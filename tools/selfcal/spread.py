@@ -25,7 +25,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from selfcal.errors import UserError, first_line
+from selfcal.errors import UserError, first_line, printable
 from selfcal.output import whole
 
 #: Whatever a function makes a record of; it is pickled.
@@ -141,9 +141,8 @@ def _cluster(
     try:
         client: Any = distributed.Client(scheduler, timeout=PATIENCE_S)
     except Exception as error:  # each kind of address has errors of its own
-        raise UserError(
-            f"--scheduler {scheduler}: no Dask scheduler answers ({first_line(error)}): start one with `dask scheduler`"
-        ) from error
+        said = f"--scheduler {printable(scheduler)}: no Dask scheduler answers ({first_line(error)})"
+        raise UserError(f"{said}: start one with `dask scheduler`") from error
     with client:
         futures = client.map(partial(_piece, function), waiting, pure=False)
         for _, answer in distributed.as_completed(futures, with_results=True):

@@ -146,7 +146,7 @@ class _Part:
 
 def _within(parts: Sequence[_Part], most: int) -> list[str]:
     """The texts, without pictures of the weakest findings if they would go beyond `most` bytes."""
-    size = sum(len(part.text.encode()) for part in parts)
+    size = sum(len(part.text.encode(errors="backslashreplace")) for part in parts)
     dropped: set[int] = set()
     for k in sorted(range(len(parts)), key=lambda k: parts[k].nats):
         if size <= most or math.isinf(parts[k].nats):

@@ -33,6 +33,8 @@ CORES = {
 }
 #: Cores whose samples are processed in integers.
 WITHOUT_FPU = ("cortex-m0",)
+#: Bytes of the part's RAM that its image leaves for a model's nodes: 32 KB less 11 to 12 KB of the rest.
+ROOM = {"cortex-m0": 21_000}
 
 
 def codegen(
@@ -49,16 +51,36 @@ def codegen(
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
     is a subset of the model's. `start`: the file that `diagnose --json` wrote with the model; its posteriors become the
     priors (warm.py). Says on stderr what of the model is left out.
-    Raises UserError for a bad model file or a folder that cannot be written.
+    Raises UserError for a bad model file, one that the target has no RAM for, or a folder that cannot be written.
     """
     loaded = Model.load(model)
     known = None if start is None else load_start(start, loaded)
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     tables = warmed(tables, known)
+    _check_room(loaded, tables, target)
     write_tables(loaded, tables, Path(output), target, known.of if known is not None else "")
     for said in _left_out(loaded, tables, target):
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables
+
+
+def _check_room(model: Model, tables: Tables, target: str) -> None:
+    core, needed = core_of(target), bank_bytes(tables)
+    if needed > ROOM.get(core, needed):
+        counts = {"axes": len(tables.axes), "regressors": len(tables.regressors), "nodes": tables.nodes}
+        said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        small = "" if target == f"{core}-small" else f", or --target {core}-small"
+        raise UserError(
+            f"{model.path}: {said} take {needed / 1000:.1f} KB of RAM, of which the {core} has {ROOM[core] / 1000:.0f} "
+            f"KB for them: leave out axes, regressors or nodes{small}"
+        )
+
+
+def bank_bytes(tables: Tables) -> int:
+    """SELFCAL_MODEL_BYTES of the integer build for a core of 32 bits but for alignment (lib/selfcal_layout.h)."""
+    axes, p = len(tables.axes), len(tables.regressors)
+    regressors = 4 * (p + 1) * (p + 4) + axes * (8 * p + 24) if p else 0
+    return tables.nodes * (56 + 20 * axes + regressors) + tables.term_nodes * (104 + 24 * p + 40 * axes)
 
 
 def _left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
