@@ -75,7 +75,12 @@ class Transport(StrEnum):
     can = "can"
 
 
-Log = Annotated[Path, typer.Argument(metavar="LOG", help=f"Recording: {READ}", show_default=False)]
+Log = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...", help=f"Recording: {READ}; several files are joined by their time stamps", show_default=False
+    ),
+]
 ModelFile = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
 ]
@@ -100,6 +105,8 @@ Scale = Annotated[
     list[str] | None,
     typer.Option("--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB of LSB columns (repeat for more)"),
 ]
+NoTime = Annotated[bool, typer.Option("--no-time", help="Leave the time column out; takes --rate")]
+SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Skip lines of a text that are no rows, and count them")]
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
@@ -140,6 +147,8 @@ def identify(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -161,6 +170,8 @@ def identify(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
 
@@ -187,6 +198,8 @@ def diagnose(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """What the model gets wrong in a recording at rest, why, and what mending it gains."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -205,6 +218,8 @@ def diagnose(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     verb.show(result, to_stderr=str(json) == "-")
     Held().check()
@@ -262,6 +277,8 @@ def rivals(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -296,6 +313,8 @@ def rivals(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     verb.show(result, to_stderr=str(json) == "-")
 
@@ -339,6 +358,8 @@ def replay(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -361,6 +382,8 @@ def replay(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     show(result, to_stderr=str(json) == "-")
 

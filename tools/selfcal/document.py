@@ -49,6 +49,8 @@ def recording_entry(recording: Recording) -> dict[str, Any]:
         "rate_hz": recording.rate_hz,
         "samples": recording.samples,
         "duration_s": recording.duration_s,
+        **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
+        **({"notes": list(recording.notes)} if recording.notes else {}),
     }
 
 
@@ -81,6 +83,7 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
                 "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
                 "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
+                **_own_rate(recording, name),
                 "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
                 "allan": _allan(axis),
                 **regressors_entry(axis.scored),
@@ -88,6 +91,12 @@ def to_document(recording: Recording, found: Mapping[str, Identified | UserError
             for name, axis in found.items()
         },
     }
+
+
+def _own_rate(recording: Recording, name: str) -> dict[str, float]:
+    """The sampling rate of an axis that has its own."""
+    own = recording.columns[name].clock
+    return {} if own is None else {"rate_hz": own.rate_hz}
 
 
 def parameters_entry(axis: Identified) -> dict[str, Any]:

@@ -502,10 +502,13 @@ def _least(size: Mapping[str, Any]) -> str:
 
 def _reproduce(document: Mapping[str, Any], options: Options) -> Iterator[str]:
     def given(*left_out: str) -> str:
-        return "".join(f" {name} {shlex.quote(value)}" for name, value in options if name not in left_out)
+        wanted = [(name, value) for name, value in options if name not in left_out]
+        return "".join(f" {name} {shlex.quote(value)}" if value else f" {name}" for name, value in wanted)
 
-    log = shlex.quote(str(document["recording"]["path"]))
-    how_read = ("--rate", "--column", "--unit", "--scale")  # a simulated recording states all that
+    recording = document["recording"]
+    log = shlex.join(recording.get("paths", [recording["path"]]))
+    # A simulated recording states all that.
+    how_read = ("--rate", "--column", "--unit", "--scale", "--no-time", "--skip-bad")
     lines = [
         f"selfcal diagnose {log}{given()} --report report.html --json report.json --write-model extended.yaml",
         "selfcal simulate extended.yaml -o simulated.npz --seed 1",

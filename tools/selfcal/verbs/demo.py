@@ -52,6 +52,7 @@ def demo(
     model = Model.load()
     recording = load(path)
     names = chosen_axes(recording, model, ())
+    recording = recording.along(*names)
     with Console(stderr=True).status("building the firmware"):
         firmware = build(model, recording.rate_hz, names)
     more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]

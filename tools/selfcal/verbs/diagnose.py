@@ -19,7 +19,7 @@ from selfcal.ending import Stopped, held
 from selfcal.errors import UserError, printable
 from selfcal.model import Model
 from selfcal.output import write_text
-from selfcal.recording import Recording, Scale, load
+from selfcal.recording import Recording, Scale, list_of, load
 from selfcal.verbs.identify import chosen_axes, identify_axis
 
 #: Why an axis has no result.
@@ -28,7 +28,7 @@ INTERRUPTED = "interrupted before it was done"
 
 
 def diagnose(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -41,6 +41,8 @@ def diagnose(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
@@ -53,12 +55,12 @@ def diagnose(
     """
     if fail_on is not None and fail_on not in ("inadequate", *WORDS):
         raise UserError(f"--fail-on: there is no cause '{fail_on}' (inadequate, {', '.join(WORDS)})")
-    check_writable(json, report, write_model, inputs=(log, model))
+    check_writable(json, report, write_model, inputs=(*list_of(log), model))
     loaded = Model.load(model)
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
-    record = of_recording(recording, loaded, decimate)
+    record = of_recording(recording, loaded, decimate, names)
     judged = [name for name in names if name in record.axes]
     errors = {name: why_left_out(recording, loaded, name) for name in names if name not in judged}
     console = Console(stderr=True)
@@ -91,7 +93,13 @@ def diagnose(
     if report is not None:
         from selfcal.diagnosis.page import write_page
 
-        write_page(report, document, record, found, _given(axes, model, decimate, rate, columns, units, scale))
+        write_page(
+            report,
+            document,
+            record,
+            found,
+            _given(axes, model, decimate, rate, columns, units, scale, no_time, skip_bad),
+        )
     if json is not None:
         write_json(document, json)
     return document
@@ -126,6 +134,8 @@ def _given(
     columns: Mapping[str, str] | None,
     units: Mapping[str, str] | None,
     scale: Mapping[str, Scale] | None,
+    no_time: bool,
+    skip_bad: bool,
 ) -> list[tuple[str, str]]:
     """The command line's options that decide what is found, as they were given."""
     given = [("--axis", name) for name in axes]
@@ -137,6 +147,8 @@ def _given(
     for name, (size, unit) in (scale or {}).items():
         text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
         given.append(("--scale", f"{name}={text}" if name else text))
+    given += [("--no-time", "")] if no_time else []
+    given += [("--skip-bad", "")] if skip_bad else []
     return given
 
 

@@ -23,7 +23,7 @@ from selfcal.errors import UserError
 from selfcal.export import FORMS, write_export
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
-from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.recording import Recording, Scale, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.result import AxisResult, in_unit
 from selfcal.tables import make_tables
@@ -35,7 +35,7 @@ SLOW = ("flicker", "colored_noise", "ramp", "step")
 
 
 def identify(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -50,6 +50,8 @@ def identify(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
@@ -61,7 +63,7 @@ def identify(
     Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
     UserError for what the user can put right, and if no axis has a result.
     """
-    check_writable(json, plot, None if export is None else export[1], inputs=(log, model))
+    check_writable(json, plot, None if export is None else export[1], inputs=(*list_of(log), model))
     if plot is not None:
         check_picture(plot)
     if export is not None and export[0] not in FORMS:
@@ -75,7 +77,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
@@ -160,6 +162,7 @@ def identify_axis(
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it. With regressors every subset of
     them is scored; `advance` is called after each. `draw`: with the Allan deviation of the samples."""
+    recording = recording.along(name)
     group = model.group_of(name)
     regressors = offered(model, name)
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)

@@ -30,7 +30,7 @@ from selfcal.errors import UserError, note
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
-from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, load
+from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, list_of, load
 from selfcal.regressors import (
     Choice,
     Inclusion,
@@ -87,7 +87,7 @@ TARGETS = {
 
 
 def replay(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -103,6 +103,8 @@ def replay(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
@@ -127,7 +129,7 @@ def replay(
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
     if plot is not None:
         check_picture(plot)
-    check_writable(json, plot, inputs=(log, model, start))
+    check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
     known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
@@ -135,8 +137,9 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     names = chosen_axes(recording, loaded_model, axes)
+    recording = recording.along(*names)
     for name in names:
         if loaded_model.group_of(name).unit != axis_unit(name):
             raise UserError(
@@ -461,6 +464,7 @@ def _document(
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
     """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
+    recording = recording.along(name)
     regressors = offered(model, name)
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))
     group, unit = model.group_of(name), recording.columns[name].unit
