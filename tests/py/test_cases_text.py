@@ -36,20 +36,14 @@ def text_of(
     form: str,
     separator: str = ",",
 ) -> Path:
-    rows = (
-        separator.join([form] * len(columns))
-        if "%" in form and form.count("%") == 1
-        else form
-    )
+    rows = separator.join([form] * len(columns)) if "%" in form and form.count("%") == 1 else form
     with path.open("w", encoding="utf-8") as file:
         file.write(header + "\n")
         file.writelines(rows % row + "\n" for row in zip(*columns, strict=True))
     return path
 
 
-def noise_of(
-    log: Path | Sequence[Path], axis: str, **options: Any
-) -> tuple[float, int, dict[str, Any]]:
+def noise_of(log: Path | Sequence[Path], axis: str, **options: Any) -> tuple[float, int, dict[str, Any]]:
     """N of the likeliest law, the number of means, and the axis' document."""
     document = identify(log, axes=[axis], **options)
     found = document["axes"][axis]
@@ -61,9 +55,7 @@ def noise_of(
     )
 
 
-def assert_noise(
-    log: Path | Sequence[Path], axis: str, truth: float, **options: Any
-) -> dict[str, Any]:
+def assert_noise(log: Path | Sequence[Path], axis: str, truth: float, **options: Any) -> dict[str, Any]:
     n, means, found = noise_of(log, axis, **options)
     assert n / truth == pytest.approx(1.0, abs=4.0 / math.sqrt(2.0 * means)), n
     return found
@@ -113,10 +105,7 @@ def test_two_rates_in_one_table(tmp_path: Path) -> None:
     )
     assert_noise(log, "gx", 0.5 / math.sqrt(200.0))
     found = assert_noise(log, "az", 0.02 / math.sqrt(50.0))
-    assert (
-        found["rate_hz"] == pytest.approx(50.0)
-        and found["samples_kept_out"]["missing"] == 0
-    )
+    assert found["rate_hz"] == pytest.approx(50.0) and found["samples_kept_out"]["missing"] == 0
     verdicts = {name: axis["verdict"] for name, axis in diagnose(log, decimate=2.0)["axes"].items()}
     assert verdicts == {"gx": "adequate", "az": "adequate"}
 
@@ -138,9 +127,7 @@ def test_readings_in_g_under_a_heading_of_acceleration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("unit", "tick", "rate", "wraps"), [("us", 1e-6, 7.0, 1), ("ms", 1e-3, 0.05, 1),
                                                              ("us", 1e-6, 2.0, 3), ("s", 1e-6, 5.0, 1)])  # fmt: skip
 @pytest.mark.parametrize("form", ["csv", "npz"])
-def test_a_counter_of_32_bits_wraps(
-    tmp_path: Path, unit: str, tick: float, rate: float, wraps: int, form: str
-) -> None:
+def test_a_counter_of_32_bits_wraps(tmp_path: Path, unit: str, tick: float, rate: float, wraps: int, form: str) -> None:
     """The counter starts so that it wraps where it is said; a sample lost at the wrap is counted."""
     span = 2**32
     n = int(span * tick * (wraps - 0.25) * rate)
@@ -152,9 +139,7 @@ def test_a_counter_of_32_bits_wraps(
     stamps = ticks[keep] * (1e-6 if unit == "s" else 1)
     gyro = white(n, 0.1, 3)[keep]
     if form == "csv":
-        log = text_of(
-            tmp_path / "log.csv", f"t[{unit}],gx[deg/s]", (stamps, gyro), "%.6f,%.5f"
-        )
+        log = text_of(tmp_path / "log.csv", f"t[{unit}],gx[deg/s]", (stamps, gyro), "%.6f,%.5f")
     else:
         log = tmp_path / "log.npz"
         counter = stamps if unit == "s" else stamps.astype(np.uint32)
@@ -172,9 +157,7 @@ def test_another_step_back_is_refused(tmp_path: Path, back: float) -> None:
     """A clock that was set, and a counter that would have wrapped by another number of ticks."""
     time = 6000.0 + np.arange(3000) / 10.0
     time[1000:] -= back
-    log = text_of(
-        tmp_path / "log.csv", "t[s],gx[deg/s]", (time, white(3000, 0.1, 1)), "%.4f,%.5f"
-    )
+    log = text_of(tmp_path / "log.csv", "t[s],gx[deg/s]", (time, white(3000, 0.1, 1)), "%.4f,%.5f")
     with pytest.raises(UserError, match="line 1002: column 't': time runs backwards"):
         load(log)
 
@@ -184,12 +167,9 @@ def bursts(rate: float, size: int, late_s: float, n: int, seed: int) -> Floats:
     stamped 0.5 to 1.5 % of the packet's interval apart."""
     random = np.random.default_rng(seed)
     at = np.arange(n)
-    packet = (at // size + 1) * size / rate + random.exponential(late_s, n // size + 1)[
-        at // size
-    ]
+    packet = (at // size + 1) * size / rate + random.exponential(late_s, n // size + 1)[at // size]
     return np.maximum.accumulate(
-        np.sort(packet + at % size * random.uniform(0.005, 0.015, n) * size / rate)
-        + 1e-6 * at
+        np.sort(packet + at % size * random.uniform(0.005, 0.015, n) * size / rate) + 1e-6 * at
     )
 
 
@@ -214,9 +194,7 @@ def test_stamps_in_bursts_have_a_steady_count(
     )
     recording = load(log, rate=rate if stated else None)
     assert recording.rate_hz == pytest.approx(rate, rel=20.0 * late_s / (n / rate))
-    assert int(recording.missing_before.sum()) == pytest.approx(
-        lost, abs=2 + 2 * size + 5.0 * late_s * rate
-    )
+    assert int(recording.missing_before.sum()) == pytest.approx(lost, abs=2 + 2 * size + 5.0 * late_s * rate)
 
 
 def test_stamps_of_no_steady_count_are_no_bursts(tmp_path: Path) -> None:
@@ -241,11 +219,7 @@ def test_dates_and_times(tmp_path: Path) -> None:
     start = np.datetime64("2024-05-31T23:59:58.500")
     n = 400
     for mark, zone in (("T", "Z"), (" ", ""), ("T", "+02:00"), ("T", "")):
-        stamps = [
-            str(start + np.timedelta64(k * 40 + k * 7 % 5, "ms")).replace("T", mark)
-            + zone
-            for k in range(n)
-        ]
+        stamps = [str(start + np.timedelta64(k * 40 + k * 7 % 5, "ms")).replace("T", mark) + zone for k in range(n)]
         log = text_of(
             tmp_path / "log.csv",
             "timestamp,gx[deg/s]",
@@ -254,9 +228,7 @@ def test_dates_and_times(tmp_path: Path) -> None:
         )
         assert load(log).rate_hz == pytest.approx(25.0, rel=2e-4)  # 2 ms in 16 s
     log.write_text(log.read_text().replace(stamps[7], "yesterday"))
-    with pytest.raises(
-        UserError, match="line 9: column 't': 'yesterday' is no date like the first"
-    ):
+    with pytest.raises(UserError, match="line 9: column 't': 'yesterday' is no date like the first"):
         load(log)
     assert load(log, skip_bad=True).missing_before.sum() == 1
 
@@ -264,9 +236,7 @@ def test_dates_and_times(tmp_path: Path) -> None:
 def test_no_time_takes_the_stated_rate(tmp_path: Path) -> None:
     n = 500
     stamps = np.random.default_rng(1).uniform(0.0, 1.0, n)
-    log = text_of(
-        tmp_path / "log.csv", "t[s],gx[deg/s]", (stamps, white(n, 0.1, 1)), "%.4f"
-    )
+    log = text_of(tmp_path / "log.csv", "t[s],gx[deg/s]", (stamps, white(n, 0.1, 1)), "%.4f")
     with pytest.raises(UserError, match="time runs backwards"):
         load(log, rate=20.0)
     with pytest.raises(UserError, match="give --rate HZ"):
@@ -279,9 +249,7 @@ def test_no_time_takes_the_stated_rate(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cell", ["", "nan", "NaN", " ", "NA", "null", '""'])
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_cells_without_a_number_are_missing_for_their_axis_alone(
-    tmp_path: Path, cell: str, separator: str
-) -> None:
+def test_cells_without_a_number_are_missing_for_their_axis_alone(tmp_path: Path, cell: str, separator: str) -> None:
     """Two axes of 20 Hz; 40 cells of gx are empty. ay is as without them. A mean
     of 20 samples without one moves by 1/20 of its sd, 40 of 300 means: N by 0.5 %, 1 sd."""
     n, rate = 6000, 20.0
@@ -294,12 +262,8 @@ def test_cells_without_a_number_are_missing_for_their_axis_alone(
     log = text_of(tmp_path / "log.csv", separator.join(("t[s]", "gx[deg/s]", "ay[m/s^2]")),
                   (np.arange(n) / rate, gx, ay), separator.join(("%.3f", "%s", "%.5f")))  # fmt: skip
     recording = load(log)
-    assert recording.notes == (
-        f"of {n} rows cells without a number, taken as missing samples: gx 40",
-    )
-    assert (
-        recording.rate_hz == pytest.approx(rate) and recording.missing_before.sum() == 0
-    )
+    assert recording.notes == (f"of {n} rows cells without a number, taken as missing samples: gx 40",)
+    assert recording.rate_hz == pytest.approx(rate) and recording.missing_before.sum() == 0
     own = recording.along("gx")
     assert own.samples == n - 40 and own.missing_before.sum() == 40
     if (cell, separator) != ("", ","):
@@ -309,9 +273,7 @@ def test_cells_without_a_number_are_missing_for_their_axis_alone(
     assert after["ay"] == before["ay"]
     for law, value in before["gx"]["parameters"].items():
         median = after["gx"]["parameters"][law]["N"]["median"]
-        assert median == pytest.approx(
-            value["N"]["median"], rel=4.0 * math.sqrt(40 / n / 300)
-        )
+        assert median == pytest.approx(value["N"]["median"], rel=4.0 * math.sqrt(40 / n / 300))
 
 
 def test_the_engines_agree_about_an_axis_with_missing_cells(tmp_path: Path) -> None:
@@ -321,24 +283,14 @@ def test_the_engines_agree_about_an_axis_with_missing_cells(tmp_path: Path) -> N
     gx[:7] = gx[100:131] = math.nan
     log = text_of(tmp_path / "log.csv", "t[s],gx[deg/s],gy[deg/s]",
                   (np.arange(n) / rate, gx, white(n, 0.1, 2)), "%.3f,%.5f,%.5f")  # fmt: skip
-    one, other = (
-        identify(log, axes=["gx"], engine=engine)["axes"]["gx"]
-        for engine in ("library", "reference")
-    )
+    one, other = (identify(log, axes=["gx"], engine=engine)["axes"]["gx"] for engine in ("library", "reference"))
     for law, probability in one["hypotheses"].items():
         assert probability == pytest.approx(other["hypotheses"][law], abs=0.01)
-    assert (
-        one["samples_kept_out"] == other["samples_kept_out"]
-        and one["samples_kept_out"]["missing"] == 38
-    )
+    assert one["samples_kept_out"] == other["samples_kept_out"] and one["samples_kept_out"]["missing"] == 38
 
 
-@pytest.mark.parametrize(
-    ("every", "phase", "lost"), [(2, 1, 0.0), (10, 3, 0.02), (7, 0, 0.0)]
-)
-def test_a_regular_pattern_of_empty_cells_is_a_slower_axis(
-    tmp_path: Path, every: int, phase: int, lost: float
-) -> None:
+@pytest.mark.parametrize(("every", "phase", "lost"), [(2, 1, 0.0), (10, 3, 0.02), (7, 0, 0.0)])
+def test_a_regular_pattern_of_empty_cells_is_a_slower_axis(tmp_path: Path, every: int, phase: int, lost: float) -> None:
     """`lost`: share of the slower axis' samples that the logger lost; each is one missing sample of its own."""
     n, rate = 24_000, 80.0
     there = np.arange(n) % every == phase
@@ -370,17 +322,12 @@ def test_a_slow_temperature_is_bridged(tmp_path: Path) -> None:
                   (np.arange(n) / 50.0, white(n, 0.1, 1), temperature), "%.3f,%.5f,%s")  # fmt: skip
     recording = load(log)
     assert recording.samples == n
-    assert recording.in_unit("temp", "degC") == pytest.approx(
-        20.0 + 0.01 * np.arange(n), abs=1e-6
-    )
+    assert recording.in_unit("temp", "degC") == pytest.approx(20.0 + 0.01 * np.arange(n), abs=1e-6)
 
 
 def test_a_dead_column_is_left_out_by_name(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
-    log.write_text(
-        "t[s],gx[deg/s],gy[deg/s]\n"
-        + "".join(f"{k / 10},{0.1 * (-1) ** k},\n" for k in range(50))
-    )
+    log.write_text("t[s],gx[deg/s],gy[deg/s]\n" + "".join(f"{k / 10},{0.1 * (-1) ** k},\n" for k in range(50)))
     recording = load(log)
     assert list(recording.columns) == ["gx"]
     assert recording.notes == ("column 'gy' holds no number and is left out",)
@@ -432,9 +379,7 @@ def test_lines_before_the_header(tmp_path: Path, header: str) -> None:
     [("t[s] gx[deg/s]", "  "), ("t [s]   gx [rad s^-1]", " \t ".strip("\t")), ("t[s]\tgx[deg/s]", "\t"),
      ("t[s];gx[deg/s]", ";"), ("t[s]; gx[deg/s]", "; ")],
 )  # fmt: skip
-def test_separators_and_suffixes(
-    tmp_path: Path, name: str, header: str, separator: str
-) -> None:
+def test_separators_and_suffixes(tmp_path: Path, name: str, header: str, separator: str) -> None:
     import gzip
 
     log = tmp_path / name
@@ -447,22 +392,13 @@ def test_a_column_that_nobody_asked_for_stops_nothing(tmp_path: Path) -> None:
     """Texts, no unit, an unknown one, no name, twice the same name, a known unit with a word in it."""
     log = tmp_path / "log.csv"
     extra = "note,mag,age[parsec],,flag,flag,aux[V],gyro[0]"
-    rows = "".join(
-        f"{line},start,1,2,3,4,5,{'on' if k == 40 else 1.5},7\n"
-        for k, line in enumerate(ROWS.split())
-    )
-    log.write_text(
-        f"t[s],gx[deg/s],temp,{extra}\n" + rows.replace(",start", ",21,start")
-    )
+    rows = "".join(f"{line},start,1,2,3,4,5,{'on' if k == 40 else 1.5},7\n" for k, line in enumerate(ROWS.split()))
+    log.write_text(f"t[s],gx[deg/s],temp,{extra}\n" + rows.replace(",start", ",21,start"))
     recording = load(log)
     assert list(recording.columns) == ["gx"]
     assert recording.columns["gx"].values == pytest.approx(GYRO, abs=1e-5)
-    assert recording.notes == (
-        "column 'temp' has no unit and is left out: write temp[degC]",
-    )
-    with pytest.raises(
-        UserError, match="line 2: column 'note': 'start' is not a number"
-    ):
+    assert recording.notes == ("column 'temp' has no unit and is left out: write temp[degC]",)
+    with pytest.raises(UserError, match="line 2: column 'note': 'start' is not a number"):
         load(log, units={"note": "V"})
     with pytest.raises(UserError, match="column 'gx': infinite"):
         log.write_text(log.read_text().replace(f"{GYRO[20]:.5f}", "inf"))
@@ -493,27 +429,16 @@ def test_a_file_of_other_lines_is_refused_all_the_same(tmp_path: Path) -> None:
     """Nothing is kept of lines that are skipped beyond their number, and that has an end."""
     log = tmp_path / "log.csv"
     log.write_text("t[s],gx[deg/s]\n0,1\n1,2\n" + "x\n" * 100_000)
-    with pytest.raises(
-        UserError, match=r"line \d+: \d+ lines so far are no rows of its columns"
-    ):
+    with pytest.raises(UserError, match=r"line \d+: \d+ lines so far are no rows of its columns"):
         load(log, skip_bad=True)
 
 
 def test_more_rates_than_a_recording_has(tmp_path: Path) -> None:
     """Patterns of empty cells are bounded before their clocks are worked out."""
     names = [f"m{k}" for k in range(12)]
-    rows = (
-        ",".join([str(row), *("1" if row % (k + 2) == 0 else "" for k in range(12))])
-        for row in range(600)
-    )
+    rows = (",".join([str(row), *("1" if row % (k + 2) == 0 else "" for k in range(12))]) for row in range(600))
     log = tmp_path / "log.csv"
-    log.write_text(
-        "t[s],"
-        + ",".join(f"{name}[g]" for name in names)
-        + "\n"
-        + "\n".join(rows)
-        + "\n"
-    )
+    log.write_text("t[s]," + ",".join(f"{name}[g]" for name in names) + "\n" + "\n".join(rows) + "\n")
     with pytest.raises(UserError, match="more than 8 patterns of empty cells"):
         load(log, sensors=names)
 
@@ -521,9 +446,7 @@ def test_more_rates_than_a_recording_has(tmp_path: Path) -> None:
 # --------------------------------------------------------------------------------------------------------- two files
 
 
-def two_files(
-    folder: Path, later_s: float, rates: tuple[float, float], epoch: float = 0.0
-) -> list[Path]:
+def two_files(folder: Path, later_s: float, rates: tuple[float, float], epoch: float = 0.0) -> list[Path]:
     """A gyro's file, and an accelerometer's that begins later; 300 s each."""
     found = []
     for name, heading, rate, start, sd in (
@@ -540,9 +463,7 @@ def two_files(
     ("later_s", "rates"),
     [(0.0, (100.0, 25.0)), (-3.2, (52.0, 104.0)), (0.004, (50.0, 50.0))],
 )
-def test_two_files_of_one_recording(
-    tmp_path: Path, later_s: float, rates: tuple[float, float]
-) -> None:
+def test_two_files_of_one_recording(tmp_path: Path, later_s: float, rates: tuple[float, float]) -> None:
     logs = two_files(tmp_path, later_s, rates, epoch=1.7e9)
     recording = load(logs)
     for name, rate in zip(("gx", "az"), rates, strict=True):
@@ -569,9 +490,7 @@ def test_two_files_with_one_clock_are_one_table(tmp_path: Path) -> None:
         (lambda folder: two_files(folder, 1e6, (10.0, 10.0)), "do not overlap in time"),
     ],
 )
-def test_files_that_are_not_of_one_recording(
-    tmp_path: Path, make: Callable[[Path], list[Path]], what: str
-) -> None:
+def test_files_that_are_not_of_one_recording(tmp_path: Path, make: Callable[[Path], list[Path]], what: str) -> None:
     with pytest.raises(UserError, match=what):
         load(make(tmp_path))
 
@@ -590,9 +509,7 @@ def tilted(norm: float, seed: int, noise: float, n: int = 2000) -> dict[str, Flo
     }
 
 
-def gravity_log(
-    folder: Path, unit: str, values: dict[str, Floats], rate: float = 20.0
-) -> Path:
+def gravity_log(folder: Path, unit: str, values: dict[str, Floats], rate: float = 20.0) -> Path:
     save(folder / "log.npz", {name: (unit, one) for name, one in values.items()}, rate)
     return folder / "log.npz"
 
@@ -614,16 +531,8 @@ def test_gravity_names_the_unit(tmp_path: Path, heading: str, true: str) -> None
             match=f"so the unit is {true.replace('^', '.')}: give --unit ax={true[:1]}",
         ):
             load(log)
-        assert (
-            load(log, units=dict.fromkeys(("ax", "ay", "az"), true)).columns["ax"].unit
-            == true
-        )
-        assert (
-            load(log, units=dict.fromkeys(("ax", "ay", "az"), heading))
-            .columns["ax"]
-            .unit
-            == heading
-        )
+        assert load(log, units=dict.fromkeys(("ax", "ay", "az"), true)).columns["ax"].unit == true
+        assert load(log, units=dict.fromkeys(("ax", "ay", "az"), heading)).columns["ax"].unit == heading
 
 
 def test_gravity_is_not_looked_for_in_motion_or_with_two_axes(tmp_path: Path) -> None:

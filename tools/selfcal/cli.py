@@ -12,7 +12,7 @@ import typer
 from typer.exceptions import TyperException
 
 from selfcal.ending import Held, install, last_signal
-from selfcal.errors import UserError, printable
+from selfcal.errors import UserError, called, printable
 from selfcal.suffixes import READ, WRITTEN
 
 app = typer.Typer(
@@ -285,7 +285,7 @@ def rivals(
     from selfcal.verbs import rivals as verb
 
     if (log is None) == (records is None):
-        raise UserError("rivals takes a recording, or --records N for simulated ones: selfcal rivals LOG")
+        raise UserError(f"rivals takes a recording, or --records N for simulated ones: {called()} rivals LOG")
     if records is not None:
         result = verb.ensemble(
             records,
@@ -622,7 +622,7 @@ def _usage(error: TyperException) -> str:
     wanted = getattr(getattr(error, "param", None), "help", None) if said.startswith("Missing") else None
     context = getattr(error, "ctx", None)
     verb = f" {context.info_name}" if context is not None and context.parent is not None else ""
-    return f"{said}{f' ({wanted})' if wanted else ''}; see `selfcal{verb} --help`"
+    return f"{said}{f' ({wanted})' if wanted else ''}; see `{called()}{verb} --help`"
 
 
 def _fail(message: str) -> NoReturn:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 from selfcal import units
 from selfcal.allan import Sampled
 from selfcal.checks import Judged, allan_limit
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
 from selfcal.regressors import Scored
@@ -50,8 +51,15 @@ def recording_entry(recording: Recording) -> dict[str, Any]:
         "samples": recording.samples,
         "duration_s": recording.duration_s,
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
+        **({"options": [list(one) for one in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),
     }
+
+
+def as_typed(recording: Mapping[str, Any]) -> str:
+    """The files of a document's `recording`, and the options that read them, as a shell takes them."""
+    options = [word for name, value in recording.get("options", ()) for word in (name, value) if word]
+    return printable(shlex.join([*recording.get("paths", [recording["path"]]), *options]))
 
 
 def to_document(recording: Recording, found: Mapping[str, Identified | UserError]) -> dict[str, Any]:

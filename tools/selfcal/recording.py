@@ -100,6 +100,8 @@ class Recording:
     notes: tuple[str, ...] = ()
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()
+    #: Options of the command line that it was read with, and their values, empty for a switch.
+    options: tuple[tuple[str, str], ...] = ()
 
     @property
     def samples(self) -> int:
@@ -225,9 +227,29 @@ def load(
     found = [_load(one, rate, header, skip_bad) for one, header in zip(paths, headers, strict=True)]
     recording = found[0] if len(found) == 1 else _joined(found, headers)
     _check_gravity(recording, headers[0])
+    recording = replace(recording, options=_options(rate, columns, units, by_name, no_time, skip_bad))
     for text in recording.notes:
         note(f"{recording.path}: {text}")
     return recording
+
+
+def _options(
+    rate: float | None,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    scale: Mapping[str, Scale],
+    no_time: bool,
+    skip_bad: bool,
+) -> tuple[tuple[str, str], ...]:
+    """How a recording is read, as the command line says it."""
+    given = [] if rate is None else [("--rate", f"{rate:.15g}")]
+    for option, pairs in (("--column", columns), ("--unit", units)):
+        given += [(option, f"{name}={value}") for name, value in pairs.items()]
+    for name, (size, unit) in scale.items():
+        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
+        given.append(("--scale", f"{name}={text}" if name else text))
+    given += [(option, "") for option, wanted in (("--no-time", no_time), ("--skip-bad", skip_bad)) if wanted]
+    return tuple(given)
 
 
 def list_of(paths: Path | str | Sequence[Path | str]) -> list[Path]:

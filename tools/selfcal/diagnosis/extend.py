@@ -62,7 +62,7 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     tree["simulate"] = {
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
-        "axes": {name: _truth(one) for name, one in found.items()},
+        "axes": {name: fitted_law(one) for name, one in found.items()},
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
@@ -183,7 +183,7 @@ def _color(tree: dict[str, Any], one: Diagnosed) -> None:
     _law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
 
 
-def _truth(one: Diagnosed) -> dict[str, Any]:
+def fitted_law(one: Diagnosed) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias."""
     fit = one.state.best
     N = fit.sigma * math.sqrt(fit.dt)

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.dbc_file import NODES
-from selfcal.errors import UserError
+from selfcal.errors import UserError, called
 from selfcal.model import Model
 from selfcal.recording import load
 from selfcal.verbs.identify import chosen_axes
@@ -71,7 +71,7 @@ def demo(
             if wire:
                 print(
                     f"{recording.path}: {recording.duration_s:g} s, {speed:g} times real time\n"
-                    f"watch it by:  selfcal monitor {watch.format(wire)}\nCtrl-C ends it",
+                    f"watch it by:  {called()} monitor {watch.format(wire)}\nCtrl-C ends it",
                     flush=True,
                 )
             try:

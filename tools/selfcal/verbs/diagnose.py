@@ -98,7 +98,7 @@ def diagnose(
             document,
             record,
             found,
-            _given(axes, model, decimate, rate, columns, units, scale, no_time, skip_bad),
+            _given(axes, model, decimate, recording),
         )
     if json is not None:
         write_json(document, json)
@@ -127,29 +127,13 @@ def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] 
 
 
 def _given(
-    axes: Sequence[str],
-    model: Path | str | None,
-    decimate: float | None,
-    rate: float | None,
-    columns: Mapping[str, str] | None,
-    units: Mapping[str, str] | None,
-    scale: Mapping[str, Scale] | None,
-    no_time: bool,
-    skip_bad: bool,
+    axes: Sequence[str], model: Path | str | None, decimate: float | None, recording: Recording
 ) -> list[tuple[str, str]]:
     """The command line's options that decide what is found, as they were given."""
     given = [("--axis", name) for name in axes]
     given += [] if model is None else [("--model", str(model))]
-    for option, value in (("--decimate", decimate), ("--rate", rate)):
-        given += [] if value is None else [(option, f"{value:.15g}")]
-    for option, pairs in (("--column", columns), ("--unit", units)):
-        given += [(option, f"{name}={value}") for name, value in (pairs or {}).items()]
-    for name, (size, unit) in (scale or {}).items():
-        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
-        given.append(("--scale", f"{name}={text}" if name else text))
-    given += [("--no-time", "")] if no_time else []
-    given += [("--skip-bad", "")] if skip_bad else []
-    return given
+    given += [] if decimate is None else [("--decimate", f"{decimate:.15g}")]
+    return [*given, *recording.options]
 
 
 def failing(document: Mapping[str, Any], wanted: str) -> bool:

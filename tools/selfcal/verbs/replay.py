@@ -24,9 +24,9 @@ from rich.console import Console
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_lattice
 from selfcal.dbc_file import HYPOTHESES
-from selfcal.document import Identified, check_writable, to_document, write_json
+from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
 from selfcal.ending import held
-from selfcal.errors import UserError, note
+from selfcal.errors import UserError, called, note
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
@@ -446,6 +446,7 @@ def _document(
         except UserError as error:
             found[name] = error
     document = to_document(recording, found)
+    again = f"{called()} diagnose {as_typed(document['recording'])}"
     for name, axis in document["axes"].items():
         axis["module_reason"] = why.get(name)
         if "error" not in axis:
@@ -455,7 +456,7 @@ def _document(
             if told is not None and told.change is not None and told.state != "inadequate":
                 note(f"{name}: the module says {told.change}; the checks here look at the record as one")
             if told is not None and told.state == "inadequate":
-                note(f"{name}: the module says {told}; why, and what mends it: selfcal diagnose {recording.path}")
+                note(f"{name}: the module says {told}; why, and what mends it: {again}")
     if gate:
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
