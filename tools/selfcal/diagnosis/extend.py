@@ -280,8 +280,8 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
             yield look.cause, look.gain, {key: median[key] for key in ("frequency_hz", "amplitude")}
         elif look.cause == "outliers":
             yield look.cause, look.gain, {"fraction": median["fraction"]}
-        elif look.cause == "variance_change":  # the simulator's ratio is of variances
-            yield look.cause, look.gain, {"time_s": median["time_s"], "ratio": median["ratio"] ** 2}
+        elif look.cause == "variance_change":
+            yield look.cause, look.gain, {key: median[key] for key in ("time_s", "ratio")}
         elif look.cause in ("missing_samples", "motion"):
             yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 
