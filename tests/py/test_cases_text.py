@@ -558,3 +558,41 @@ def test_gravity_has_a_clean_twin(tmp_path: Path) -> None:
         )
         recording: Recording = load(gravity_log(tmp_path, unit, values))
         assert recording.notes == ()
+
+
+# ----------------------------------------------------------------------------------------------- clean twins of clocks
+
+
+def test_scattered_missing_cells_make_no_slower_axis(tmp_path: Path) -> None:
+    """From 1 to 45 % of the cells of gx at random, single or in runs: the axis keeps the rate of the table."""
+    for seed in range(case_records(20, 200)):
+        random = np.random.default_rng([4, seed])
+        n, rate = 2000, random.uniform(1.0, 400.0)
+        gone = random.random(n) < random.uniform(0.01, 0.45)
+        if seed % 2:
+            start = random.integers(10, 1000)
+            gone[:] = False
+            gone[start : start + random.integers(2, 900)] = True
+        gx = np.where(gone, np.nan, white(n, 0.1, seed))
+        np.savez(tmp_path / "log.npz", **{"t[s]": np.arange(n) / rate, "gx[deg/s]": gx, "gy[deg/s]": white(n, 0.1, 1)})
+        recording = load(tmp_path / "log.npz")
+        own = recording.along("gx")
+        assert recording.columns["gx"].clock is None
+        assert own.rate_hz == pytest.approx(rate, rel=1e-6)
+        assert own.samples + own.missing_before.sum() == n - np.argmax(~gone[::-1])
+
+
+def test_sound_stamps_are_neither_bursts_nor_wraps(tmp_path: Path) -> None:
+    """Jitter up to 20 % of the interval and samples lost at random up to 5 %: the losses are counted to 1 % of the
+    samples, and the rate is right to their share."""
+    for seed in range(case_records(20, 200)):
+        random = np.random.default_rng([5, seed])
+        n, rate = 4000, random.uniform(1.0, 400.0)
+        kept = np.flatnonzero(random.random(n) >= random.uniform(0.0, 0.05))
+        time = (kept + random.uniform(0.0, 0.2) * random.standard_normal(kept.size).clip(-1.5, 1.5)) / rate
+        np.savez(tmp_path / "log.npz", **{"t[s]": time, "gx[deg/s]": white(kept.size, 0.1, seed)})
+        recording = load(tmp_path / "log.npz")
+        lost = kept[-1] - kept[0] + 1 - kept.size
+        assert int(recording.missing_before.sum()) == pytest.approx(lost, abs=0.01 * n)
+        assert recording.rate_hz == pytest.approx(rate, rel=0.011)
+        assert recording.notes == ()
