@@ -182,7 +182,7 @@ calibration: setup
 # Records of each kind of disturbed log; `make test` looks at a few.
 cases: setup
 	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
-	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py
+	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py tests/py/test_docs.py
 
 campaigns: setup
 	@rm -f $(BUILD)/campaigns.txt

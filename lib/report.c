@@ -285,6 +285,10 @@ selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *se
         ((unsigned)mask & ~(unsigned)selfcal_regressors_mask(self->model, axis)) != 0U) {
         return SELFCAL_BAD_ARGUMENT;
     }
+    memset(report, 0, sizeof *report); /* nothing of another axis stays, whatever comes */
+    report->axis = axis;
+    report->bias_mean = NAN;
+    report->bias_sd = NAN;
     if (selfcal_retired(self, axis)) {
         return SELFCAL_AXIS_RETIRED;
     }
@@ -302,8 +306,6 @@ selfcal_status_t selfcal_report_begin_subset(selfcal_work_t *work, selfcal_t *se
     work->unknowns = unknowns;
     work->coefficients = coefficients;
     work->stage = GATHER;
-    memset(report, 0, sizeof *report);
-    report->axis = axis;
     know_nothing(work, report);
     return SELFCAL_OK;
 }

@@ -542,7 +542,8 @@ typedef struct {
 typedef struct selfcal_work selfcal_work_t;
 
 /* Start a report on one axis. SELFCAL_TOO_SHORT if there are too few samples. Of a bank that forgets, the first step
- * that looks at its sums says so too. */
+ * that looks at its sums says so too. A report that does not begin leaves its axis in `report` and no number of
+ * another: the bias is NaN, probabilities are 0. */
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report);
 
 /* The same with the regressors of `mask` in use, a bit each: one subset, whose ln_evidence compares with the others'.

@@ -45,7 +45,13 @@ static void bad_arguments_change_nothing(void) {
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_skip(NULL, 1));
     push(0.1F, 0.01F);
     push(0.1F, 0.01F);
+    /* A report that cannot begin leaves nothing of another axis. */
+    memset(&report, 1, sizeof report);
     TEST_ASSERT_EQUAL(SELFCAL_TOO_SHORT, selfcal_report(&work, &bank, 0, &report));
+    TEST_ASSERT_EQUAL(0, report.axis);
+    TEST_ASSERT_EQUAL(0, report.n);
+    TEST_ASSERT_TRUE(isnan(report.bias_mean) && isnan(report.bias_sd));
+    TEST_ASSERT_EQUAL_FLOAT(0.0F, report.hypothesis[0].probability);
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_report(&work, &bank, AXES, &report));
     selfcal_node_view_t view;
     selfcal_wide_t ln_p;

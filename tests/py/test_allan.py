@@ -11,6 +11,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,6 +206,21 @@ def test_recordings_leave_the_model_where_it_does_not_fit(
     assert (tmp_path / "run.png").stat().st_size > 20_000
     if run == 1:  # at 300 s the issue's model was 1.52 times too high
         assert document["axes"]["gy"]["checks"]["allan_256s"]["value"] == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_legend_is_within_the_picture(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one axis the picture is as narrow as it gets."""
+    kept: list[Any] = []
+    monkeypatch.setattr("selfcal.allan_plot.save_picture", lambda figure, path, dpi: kept.append(figure))
+    rng = np.random.default_rng(6)
+    columns = {name: ("deg/s", 0.04 * rng.standard_normal(2000)) for name in ("gx", "gy", "gz")[:count]}
+    save(tmp_path / "log.npz", columns, 10.0)
+    identify(tmp_path / "log.npz", plot=tmp_path / "out.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    legend, whole = figure.legends[0].get_window_extent(), figure.bbox
+    assert legend.x0 >= whole.x0 and legend.x1 <= whole.x1 and legend.y0 >= whole.y0
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])

@@ -92,8 +92,8 @@ def test_verbs_are_functions() -> None:
         (["nonsense"], "No such command 'nonsense'; see `selfcal --help`"),
         (
             ["identify"],
-            "Missing argument 'LOG' (Recording: .csv, .tsv, .txt, .npz, .mat, .rda, .rdata, .rds; .gz of text); "
-            "see `selfcal identify --help`",
+            "Missing argument 'LOG...' (Recording: .csv, .tsv, .txt, .log, .npz, .mat, .rda, .rdata, .rds; .gz of text"
+            "; several files are joined by their time stamps); see `selfcal identify --help`",
         ),
         (["identify", "."], ".: is a folder: name a recording in it (.csv, "),
         (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),
@@ -189,7 +189,7 @@ BAD = {
     "empty": ("", "bad.csv: the file is empty"),
     "header only": ("t[s],gx[deg/s]\n", "bad.csv: line 1: there is a header but no rows"),
     "text cell": ("t[s],gx[deg/s]\n0,1\n1,x\n", "bad.csv: line 3: column 'gx': 'x' is not a number"),
-    "NaN": ("t[s],gx[deg/s]\n0,1\n1,nan\n", "bad.csv: line 3: column 'gx': not a number (NaN)"),
+    "no stamp": ("t[s],gx[deg/s]\n0,1\n,2\n", "bad.csv: line 3: column 't': no time stamp (an empty cell or NaN)"),
     "infinity": ("t[s],gx[deg/s]\n0,1\n1,inf\n", "bad.csv: line 3: column 'gx': infinite"),
     "time backwards": ("t[s],gx[deg/s]\n0,1\n-1,2\n", "bad.csv: line 3: column 't': time runs backwards"),
     "missing unit": ("t[s],gx\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has no unit"),

@@ -1,6 +1,7 @@
 """What the documents say that is made from a source elsewhere.
 
-`.venv/bin/python tests/py/test_docs.py` writes the outputs in tools/README.md anew.
+`.venv/bin/python tests/py/test_docs.py` writes the outputs in README.md and tools/README.md anew. Every command of a
+document is run by a test, or UNTRIED says why not; all are parsed.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,7 +17,14 @@ import tempfile
 import textwrap
 from pathlib import Path
 
+import pytest
+import typer
+
+from selfcal.cli import app
 from selfcal.verbs.codegen import codegen
+
+from conftest import CASE_RECORDS, SHARED_DATA
+from conftest import COMMAND as PROGRAM
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = (
@@ -23,20 +32,55 @@ DOCUMENTS = (
     *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md"),
 )
 WALKTHROUGH = ROOT / "tools" / "README.md"
+TOUR = ROOT / "README.md"
+#: Beginnings of commands that no test runs as printed, and why.
+UNTRIED = {
+    "identify path/to/log.csv": "a place of the reader's own",
+    "identify adis_16405_imu1.rda": "a file of the R package imudata; test_recording.py reads its form",
+    "monitor ": "a module on a port, or its log; test_monitor.py",
+    "demo": "runs until it is stopped; test_monitor_hostile.py and test_replay_can.py start it",
+    "command ": "a module with a key; test_firmware_commands.py",
+    "replay ": "QEMU; test_firmware.py",
+    "rivals ": "minutes; test_rivals.py",
+    "worth": "minutes; test_worth.py",
+    "navigate": "minutes; test_navigate.py",
+}
+#: Those that take minutes, or the real recordings: in `make cases` alone.
+SLOW = ("montecarlo", "identify ../shared/data", "diagnose ../shared/data")
 #: Columns of a document.
 WIDTH = 120
 COMMAND = "    .venv/bin/selfcal "
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
+def checkout(folder: Path) -> Path:
+    """`folder` as a checkout with its package installed, for the commands of a document."""
+    (folder / ".venv" / "bin").mkdir(parents=True, exist_ok=True)
+    (folder / ".venv" / "bin" / "selfcal").symlink_to(PROGRAM[0])
+    for name in ("lib", "tools", "tests"):
+        (folder / name).symlink_to(ROOT / name)
+    shared = folder.parent / "shared"
+    if SHARED_DATA.exists() and not shared.exists():
+        shared.mkdir()
+        (shared / "data").symlink_to(SHARED_DATA)
+    return folder
+
+
+def excused(command: str) -> bool:
+    """Whether a command, without the program's name, is not run here."""
+    slow = command.startswith(SLOW) and not (CASE_RECORDS and SHARED_DATA.exists())
+    return slow or command.startswith(tuple(UNTRIED))
+
+
 def executed(text: str, folder: Path) -> str:
     """A document whose indented commands are run in `folder`, one after the other, each with its output below it, long
-    lines wrapped. A command that has no output in the document gets none."""
+    lines wrapped. A command that has no output in the document gets none. `cp` is run as well."""
+    checkout(folder)
     lines, found, at = text.splitlines(), list[str](), 0
     while at < len(lines):
         found.append(lines[at])
         at += 1
-        if not found[-1].startswith(COMMAND):
+        if not found[-1].startswith((COMMAND, "    cp ")):
             continue
         command = found[-1]
         while command.endswith("\\"):
@@ -44,9 +88,12 @@ def executed(text: str, folder: Path) -> str:
             found.append(lines[at])
             at += 1
         end = at
-        while end < len(lines) and not lines[end].startswith(COMMAND) and (not lines[end] or lines[end][:4] == "    "):
+        while end < len(lines) and not lines[end].startswith((COMMAND, "    cp ", "    make ")):
+            if lines[end] and lines[end][:4] != "    ":
+                break
             end += 1
-        command = command.replace(COMMAND, f"{sys.executable} -m selfcal.cli ").replace("tools/", f"{ROOT}/tools/")
+        if excused(command.removeprefix(COMMAND)):
+            continue
         done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, (command, done.stderr)
         if any(lines[at:end]):
@@ -54,6 +101,13 @@ def executed(text: str, folder: Path) -> str:
             found += ["", *printed, ""]
             at = end
     return "\n".join(found) + "\n"
+
+
+def commands_of(text: str, before: str = " *") -> list[str]:
+    """Every command of a text that stands after `before`, without the program's name, its lines joined."""
+    joined = re.sub(r"\\\n\s*", "", text)
+    found = re.findall(rf"^{before}\.venv/bin/selfcal ([a-z].*)$", joined, re.MULTILINE)
+    return [re.split(r"\s+(?:#|\||>|&&)\s?|; ", one)[0].strip() for one in found]
 
 
 def wrapped(line: str) -> list[str]:
@@ -89,6 +143,58 @@ def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
     ]
     told = re.search(r"has gained ([0-9.]+) nats", text)
     assert told is not None and math.isclose(float(told[1]), best[1] - best[0], rel_tol=0.01)
+
+
+def test_the_tour_is_as_printed(tmp_path: Path) -> None:
+    """README.md from top to bottom: its recordings, diagnosis and counts."""
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    text = TOUR.read_text(encoding="utf-8")
+    assert_alike(text, executed(text, folder))
+    assert (folder / "report.html").exists() and (folder / "my_tables" / "selfcal_model.c").exists()
+    found = json.loads((folder / "my.json").read_text(encoding="utf-8"))["axes"]
+    assert all("error" not in axis for axis in found.values())
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkout with a reader's files: a model of its own, an extended one, a recording of ten minutes."""
+    folder = checkout(tmp_path_factory.mktemp("desk") / "checkout")
+    model = (ROOT / "tests" / "data" / "simulated_adis16405.yaml").read_text(encoding="utf-8")
+    short_one = model.replace("duration_s: 3600.0", "duration_s: 600.0")
+    assert short_one != model
+    for name in ("my.yaml", "extended.yaml"):
+        (folder / name).write_text(short_one, encoding="utf-8")
+    shell(".venv/bin/selfcal simulate my.yaml -o log.csv --seed 2; cp log.csv part.csv", folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_every_command_of_the_documents_runs(name: str, request: pytest.FixtureRequest) -> None:
+    """Where its output is compared, or here in `make cases`, or UNTRIED says why not; all are parsed."""
+    text = (ROOT / name).read_text(encoding="utf-8")
+    ran = commands_of(text, "    ") if (ROOT / name) in (TOUR, WALKTHROUGH) else []
+    if name == "lib/README.md":
+        ran = commands_of("".join(blocks(ROOT / name, "sh")[:3]))
+    parser = typer.main.get_command(app)
+    for command in commands_of(text):
+        words = shlex.split(command)
+        verb = parser.commands[words[0]]  # type: ignore[attr-defined]
+        verb.make_context(words[0], words[1:])
+        if CASE_RECORDS and command not in ran and not excused(command):
+            shell(f".venv/bin/selfcal {command}", request.getfixturevalue("desk"))
+
+
+def test_the_sizes_of_the_images_are_those_of_the_bench() -> None:
+    """port/README.md against the table of tests/README.md, in KB."""
+    table = (ROOT / "tests" / "README.md").read_text(encoding="utf-8").partition("**whole image**, bytes")[2]
+    sizes = [[int(cell.replace(",", "")) for cell in re.findall(r"\d+,\d+", line)] for line in table.splitlines()[1:4]]
+    told = re.search(r"take ([\d.]+) KB of flash and ([\d.]+) KB of RAM beside ([\d.]+) KB of stack on the "
+                     r"`stm32f405`,\s+([\d.]+) KB and ([\d.]+) KB beside ([\d.]+) KB on the `cortex-m0`",
+                     (ROOT / "port" / "README.md").read_text(encoding="utf-8"))  # fmt: skip
+    assert told is not None
+    for place, said in enumerate(told.groups()):
+        assert float(said) == round(sizes[place % 3][place // 3] / 1000.0, 1)
 
 
 def test_the_python_example_runs(tmp_path: Path) -> None:
@@ -187,4 +293,7 @@ def test_lines_of_the_documents_fit() -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
-        WALKTHROUGH.write_text(executed(WALKTHROUGH.read_text(encoding="utf-8"), Path(name)), encoding="utf-8")
+        for number, document in enumerate((WALKTHROUGH, TOUR)):
+            folder = Path(name) / str(number) / "checkout"
+            folder.mkdir(parents=True)
+            document.write_text(executed(document.read_text(encoding="utf-8"), folder), encoding="utf-8")

@@ -46,7 +46,7 @@ EFFECTS = {
     "colored_noise": ("lag1=0.4", 1.0),
     "quantization": ("lsb=0.3", 10.0),
     "outliers": ("fraction=0.005", 1.0),
-    "variance_change": ("time_s=1000,ratio=4", 1.0),
+    "variance_change": ("time_s=1000,ratio=2", 1.0),
     "saturation": ("limit=0.13", 1.0),
     "missing_samples": ("missing=60", 1.0),
     "motion": ("intervals=5,amplitude=0.8", 10.0),

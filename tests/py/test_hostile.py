@@ -99,9 +99,12 @@ def verdict(read: Callable[[], Any], path: Path) -> str:
 
 
 def sound(recording: Recording) -> None:
-    for column in recording.columns.values():
-        assert column.values.shape == recording.missing_before.shape
-        assert np.isfinite(column.values).all()
+    for name, column in recording.columns.items():
+        assert column.values.shape == recording.clock_of(name).missing_before.shape
+        assert not np.isinf(column.values).any() and np.isfinite(column.values).any()
+        along = recording.along(name)
+        assert np.isfinite(along.columns[name].values).all() and (along.missing_before >= 0).all()
+        assert along.samples == along.columns[name].values.size
     assert recording.samples >= 2 and (recording.missing_before >= 0).all()
     assert limits.LEAST_RATE_HZ <= recording.rate_hz <= limits.MOST_RATE_HZ
     assert np.isfinite(recording.duration_s)

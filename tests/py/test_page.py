@@ -277,6 +277,80 @@ def test_the_findings_stand_at_the_top(case: Case) -> None:
     assert any(label.startswith("Before: standard deviations") and "outside" in label for label in pictures_of)
 
 
+def cells_of(text: str, name: str) -> list[list[str]]:
+    """The rows of the table of this name, as texts."""
+    table = re.search(rf'aria-label="{name}"><table>(.*?)</table>', text, re.DOTALL)
+    assert table is not None, name
+    rows = re.findall(r"<tr>(.*?)</tr>", table[1], re.DOTALL)
+    return [[re.sub("<[^>]*>", "", one) for one in re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)] for row in rows]
+
+
+def an_estimate(median: float, unit: str) -> dict[str, Any]:
+    return {"median": median, "q05": 0.9 * median, "q95": 1.1 * median, "unit": unit, "identified": True}
+
+
+def test_causes_by_axis_and_the_noise_stand_at_the_top(case: Case) -> None:
+    """The matrix has the document's evidence, the table its posterior; without one, the fit that the record is made of:
+    white noise of 0.05 deg/s at 2 Hz."""
+    known = {
+        "hypotheses": {"constant": 0.2, "random_walk": 0.8},
+        "parameters": {
+            "random_walk": {"N": an_estimate(0.035, "deg/s/sqrt(Hz)"), "K": an_estimate(0.002, "deg/s^2/sqrt(Hz)")},
+            "constant": {"N": an_estimate(9.0, "deg/s/sqrt(Hz)")},
+        },
+    }
+    axes = case.document["axes"]
+    text = page({**case.document, "axes": {**axes, "gx": {**axes["gx"], "posterior": known}}}, case.record, case.found)
+    heads, *rows = cells_of(text, "Causes by axis")
+    assert heads == ["cause", "gx", "gy"]
+    shown = {row[0].replace(" ", "_"): row[1:] for row in rows}
+    for finding in axes["gx"]["findings"]:
+        if finding["evidence_gain_nats"] > 20.0:
+            assert float(shown[finding["cause"]][0]) == pytest.approx(finding["evidence_gain_nats"], abs=0.5)
+    assert {row[1] for row in shown.values()} == {"–"}
+    gx, gy = cells_of(text, "Noise of each axis")[1:]
+    assert gx[:3] == ["gx", "random walk", "0.8"] and gx[3].startswith("0.035 (0.0315 to 0.0385) °/s/√Hz")
+    assert gx[4].startswith("0.002 (0.0018 to 0.0022)") and gx[5] == "–" and gx[6].endswith("points outside")
+    assert gy[2] == "fit" and float(gy[3].split()[0]) == pytest.approx(0.05 / math.sqrt(2.0), rel=0.05)
+
+
+def test_weak_findings_are_folded(case: Case) -> None:
+    """Below a hundredth of the largest evidence, in the list and in the axis' section. Their action stays with them."""
+    entry = case.document["axes"]["gx"]
+    first = {**entry["findings"][0], "shared_with": []}
+    sizes = {"strong": 5000.0, "near": 51.0, "weak": 49.0}
+    findings = [{**first, "cause": name, "words": f"A {name} one.", "record_next": f"Mend the {name} one.",
+                 "evidence_gain_nats": nats, "net_nats": nats} for name, nats in sizes.items()]  # fmt: skip
+    text = page({**case.document, "axes": {"gx": {**entry, "findings": findings}}}, case.record, case.found)
+    folded = "".join(re.findall(r"<details.*?</details>", text[: text.index("Whole record")], re.DOTALL))
+    for name in sizes:
+        assert (f"A {name} one." in folded) == (name == "weak")
+        assert f"<strong>Do:</strong> Mend the {name} one." in text
+    assert "1 weaker findings, each below 49" in text and "1% of the largest" in text
+    assert [row[0] for row in cells_of(text, "Causes by axis")] == ["cause", "strong", "near"]
+
+
+def test_an_allan_curve_that_still_leaves_its_band_is_told(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "The Allan curve still leaves its band" not in case.text
+    assert "leaves its band" not in "".join(cell for row in cells_of(case.text, "Noise of each axis") for cell in row)
+    made = pictures.figures
+
+    def lifted(*arguments: Any) -> Any:
+        overview, own = made(*arguments)
+        shifted = []
+        for figure in overview:
+            panel = figure.panels[-1]
+            higher = replace(panel, curves=[replace(panel.curves[0], y=3.0 * panel.curves[0].y), *panel.curves[1:]])
+            is_it = figure.name == "Allan deviation"
+            shifted.append(replace(figure, panels=[*figure.panels[:-1], higher]) if is_it else figure)
+        return shifted, own
+
+    monkeypatch.setattr(pictures, "figures", lifted)
+    text = page(case.document, case.record, case.found)
+    assert text.count("The Allan curve still leaves its band") == 2
+    assert [row[6].startswith("✗ leaves its band: ") for row in cells_of(text, "Noise of each axis")[1:]] == [True] * 2
+
+
 def test_every_part_of_the_page_is_there(case: Case) -> None:
     text = Page(case.text).text
     for heading in (
@@ -459,6 +533,26 @@ def test_a_browser_shows_it(browser: Any, address: str, width: int) -> None:
     )
     assert min(view.evaluate(size)) >= 9.0
     assert view.locator(".findings li").count() >= 2
+    view.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+def test_the_answer_is_on_the_first_screen(browser: Any, case: Case, tmp_path: Path, width: int, height: int) -> None:
+    """Six axes with six causes each: verdict, matrix and the table of the noise."""
+    axes = {}
+    for name in ("gx", "gy", "gz", "ax", "ay", "az"):
+        entry = case.document["axes"]["gx"]
+        kinds = ("periodic", "motion", "flicker", "step", "unexplained", "variance_change")
+        axes[name] = {**entry, "findings": [{**entry["findings"][0], "cause": kind} for kind in kinds]}
+    text = page({**case.document, "axes": axes}, case.record, dict.fromkeys(axes, case.found["gx"]))
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    view = browser.new_page(viewport={"width": width, "height": height})
+    view.goto((tmp_path / "report.html").as_uri())
+    for place in (".bad", ".matrix", ".glance:not(.matrix)"):
+        box = view.locator(place).first.bounding_box()
+        assert box["y"] + box["height"] <= height, (place, box)
+    assert view.locator(".matrix").evaluate("m => m.scrollWidth <= m.clientWidth")
+    assert view.evaluate("document.documentElement.scrollWidth") <= width
     view.close()
 
 

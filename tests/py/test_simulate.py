@@ -220,7 +220,7 @@ def test_noise_effects() -> None:
     blocks = coloured.reshape(-1, 200).mean(axis=1), plain.reshape(-1, 200).mean(axis=1)
     assert np.std(blocks[0] - blocks[1]) < 0.15 * np.std(blocks[1])  # only the 1.5 samples at each block's ends differ
 
-    changed = record(axis(N=1.0, variance_time_s=n / 2, variance_ratio=9.0), scene(n))
+    changed = record(axis(N=1.0, variance_time_s=n / 2, noise_ratio=3.0), scene(n))
     np.testing.assert_array_equal(changed[: n // 2], plain[: n // 2])
     np.testing.assert_allclose(changed[n // 2 :], 3.0 * plain[n // 2 :], rtol=1e-12)
 

@@ -60,7 +60,8 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
         Patch(color=MODEL, alpha=0.15, label="where the recording may lie"),
         Line2D([], [], color=OUTSIDE, marker="o", markersize=9, fillstyle="none", linestyle="", label="outside"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    # Four in a row are wider than the picture of one axis.
+    figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
     save_picture(figure, path, dpi=110)
 
 

@@ -14,7 +14,7 @@ import typer
 from typer.exceptions import TyperException
 
 from selfcal.ending import Held, install, last_signal, leave
-from selfcal.errors import UserError, note, printable
+from selfcal.errors import UserError, called, note, printable
 from selfcal.suffixes import READ, WRITTEN
 
 app = typer.Typer(
@@ -77,7 +77,12 @@ class Transport(StrEnum):
     can = "can"
 
 
-Log = Annotated[Path, typer.Argument(metavar="LOG", help=f"Recording: {READ}", show_default=False)]
+Log = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...", help=f"Recording: {READ}; several files are joined by their time stamps", show_default=False
+    ),
+]
 ModelFile = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
 ]
@@ -115,6 +120,8 @@ FailOn = Annotated[
         "--fail-on", metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it, 2 when one cannot be judged"
     ),
 ]
+NoTime = Annotated[bool, typer.Option("--no-time", help="Leave the time column out; takes --rate")]
+SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Skip lines of a text that are no rows, and count them")]
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
@@ -175,6 +182,8 @@ def identify(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -201,6 +210,8 @@ def identify(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
     _judge(result, fail_on)
@@ -233,6 +244,8 @@ def diagnose(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """What the model gets wrong in a recording at rest, why, and what mending it gains."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -255,6 +268,8 @@ def diagnose(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     verb.show(result, to_stderr=str(json) == "-")
     _judge(result, fail_on)
@@ -330,13 +345,15 @@ def rivals(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
     from selfcal.recording import parse_pairs, parse_scales
     from selfcal.verbs import rivals as verb
 
     if (log is None) == (records is None):
-        raise UserError("rivals takes a recording, or --records N for simulated ones: selfcal rivals LOG")
+        raise UserError(f"rivals takes a recording, or --records N for simulated ones: {called()} rivals LOG")
     if records is not None:
         result = verb.ensemble(
             records,
@@ -364,6 +381,8 @@ def rivals(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     verb.show(result, to_stderr=str(json) == "-")
 
@@ -409,6 +428,8 @@ def replay(
     column: Column = None,
     unit: Unit = None,
     scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -433,6 +454,8 @@ def replay(
         columns=parse_pairs("--column", column or ()),
         units=parse_pairs("--unit", unit or ()),
         scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
     )
     show(result, to_stderr=str(json) == "-")
 
@@ -671,7 +694,7 @@ def _usage(error: TyperException) -> str:
     wanted = getattr(getattr(error, "param", None), "help", None) if said.startswith("Missing") else None
     context = getattr(error, "ctx", None)
     verb = f" {context.info_name}" if context is not None and context.parent is not None else ""
-    return f"{said}{f' ({wanted})' if wanted else ''}; see `selfcal{verb} --help`"
+    return f"{said}{f' ({wanted})' if wanted else ''}; see `{called()}{verb} --help`"
 
 
 def _fail(message: str) -> NoReturn:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 from selfcal import units
 from selfcal.allan import Sampled
 from selfcal.checks import Judged, allan_limit
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
 from selfcal.regressors import Scored
@@ -50,7 +51,16 @@ def recording_entry(recording: Recording) -> dict[str, Any]:
         "samples": recording.samples,
         "duration_s": recording.duration_s,
         "start_s": recording.start_s,
+        **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
+        **({"options": [list(one) for one in recording.options]} if recording.options else {}),
+        **({"notes": list(recording.notes)} if recording.notes else {}),
     }
+
+
+def as_typed(recording: Mapping[str, Any]) -> str:
+    """The files of a document's `recording`, and the options that read them, as a shell takes them."""
+    options = [word for name, value in recording.get("options", ()) for word in (name, value) if word]
+    return printable(shlex.join([*recording.get("paths", [recording["path"]]), *options]))
 
 
 def to_document(
@@ -86,6 +96,7 @@ def to_document(
                 "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
                 "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
+                **_own_rate(recording, name),
                 "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
                 "allan": _allan(axis),
                 **regressors_entry(axis.scored),
@@ -99,6 +110,12 @@ def of_errors(schema: str, recording: Recording, reasons: Mapping[str, str]) -> 
     """The document of a recording no axis of which has a result."""
     axes = {name: {"error": reason} for name, reason in reasons.items()}
     return {"schema": schema, "recording": recording_entry(recording), "axes": axes}
+
+
+def _own_rate(recording: Recording, name: str) -> dict[str, float]:
+    """The sampling rate of an axis that has its own."""
+    own = recording.columns[name].clock
+    return {} if own is None else {"rate_hz": own.rate_hz}
 
 
 def parameters_entry(axis: Identified) -> dict[str, Any]:

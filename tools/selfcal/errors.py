@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 import reprlib
+import shlex
+import shutil
 import sys
+from pathlib import Path
 
 _SHOWN = reprlib.Repr()
 _SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother = 2, 40, 40
@@ -51,6 +54,16 @@ def shown(value: object) -> str:
         return printable(_SHOWN.repr(value))
     except ValueError:  # an integer of thousands of digits
         return f"a {type(value).__name__}"
+
+
+def called() -> str:
+    """The command as the user called it, so that a printed line runs when it is pasted."""
+    name = sys.argv[0]
+    if Path(name).name == "cli.py":
+        return f"{shlex.quote(sys.executable)} -m selfcal.cli"
+    if Path(name).name != "selfcal" or shutil.which("selfcal") == name:
+        return "selfcal"
+    return printable(shlex.quote(name))
 
 
 def first_line(error: BaseException) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.model import Model
-from selfcal.recording import Recording, as_float
+from selfcal.recording import Recording, as_float, bridged
 from selfcal.tables import GateTable, gate_table, make_tables
 
 
@@ -58,16 +58,19 @@ class Learning:
 
 
 def gated(recording: Recording, model: Model) -> Recording:
-    """The recording without the bank intervals in which the sensor moved, as the gate over all its axes sees it.
+    """The recording without the bank intervals in which the sensor moved, as the gate over its axes of one clock
+    sees it.
 
     The rule is that of selfcal_push_moving(): a sample counts if the gate said resting before it and with it, bank
     intervals begin with a window of the gate, and an interval with motion in it is dropped whole. Time passes as a gap;
     `moving` counts those samples. Raises UserError if too little rest is left, or the model has no gate.
     """
-    axes = tuple(name for name in model.axes if name in recording.columns)
+    axes = tuple(name for name in model.axes if name in recording.columns and recording.columns[name].clock is None)
     tables = make_tables(model, recording.rate_hz, axes)
     table = table_of(recording, model, axes)
-    samples = np.column_stack([as_float(recording.in_unit(name, model.group_of(name).unit)) for name in axes])
+    samples = np.column_stack(
+        [as_float(bridged(recording.in_unit(name, model.group_of(name).unit))) for name in axes]
+    )
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)
     if used.any():

@@ -31,6 +31,8 @@ MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
 MOST_MODEL_VALUES = 10_000
 #: Sampling rates, Hz.
 LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
+#: Sampling rates in one recording.
+MOST_CLOCKS = 8
 #: Samples that a recording spans, those missing included: each number up to here is a float64.
 LONGEST = 2**53
 

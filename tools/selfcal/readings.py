@@ -214,7 +214,9 @@ def _regridded(recording: Recording, time: Array, row: int, before_s: float, aft
     used = np.bincount(index, minlength=first)
     whole = np.flatnonzero(used == size)
     columns = {
-        name: Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
+        name: column
+        if column.clock is not None
+        else Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
         for name, column in recording.columns.items()
     }
     missing = np.diff(whole, prepend=-1) - 1
@@ -253,7 +255,10 @@ def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, flo
     ratio, rows = first
     at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
     missing = np.maximum(0, np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64) - 1)
-    columns = {name: Column(name, one.unit, one.values[rows]) for name, one in recording.columns.items()}
+    columns = {
+        name: one if one.clock is not None else Column(name, one.unit, one.values[rows])
+        for name, one in recording.columns.items()
+    }
     rate = recording.rate_hz / ratio
     thin = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None)
     return thin, rate

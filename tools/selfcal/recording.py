@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from selfcal import units
 from selfcal.array_files import Members, mat, npz, parse_meta, r_data
-from selfcal.errors import UserError, short, shown
+from selfcal.errors import UserError, note, short, shown
 from selfcal.limits import (
     LEAST_RATE_HZ,
-    LONGEST,
     LONGEST_HEADING,
+    MOST_CLOCKS,
     MOST_META_BYTES,
     MOST_NUMBERS,
     MOST_RATE_HZ,
@@ -34,9 +34,9 @@ from selfcal.limits import (
     reading,
 )
 from selfcal.output import together, whole
-from selfcal.sampling import Ambiguous, sampling
 from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
-from selfcal.text_table import TextTable
+from selfcal.text_table import TextTable, is_date
+from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
 
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -44,8 +44,19 @@ SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Unit of a scaled LSB column where the scale states none, by the column's first letter.
 _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
-#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
-_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
+#: Headings of other programs, and name and unit here: EuRoC and Kalibr, PX4's ulog2csv.
+_FOREIGN: Mapping[str, tuple[str, str | None]] = {
+    **{f"w_RS_S_{axis}": (f"g{axis}", None) for axis in "xyz"},
+    **{f"a_RS_S_{axis}": (f"a{axis}", None) for axis in "xyz"},
+    **{f"gyro_rad[{place}]": (f"g{axis}", "rad/s") for place, axis in enumerate("xyz")},
+    **{f"accelerometer_m_s2[{place}]": (f"a{axis}", "m/s^2") for place, axis in enumerate("xyz")},
+}
+#: Headings of a time column that states its unit, or holds dates.
+_TIMES = ("time", "timestamp")
+#: Where a sensor's axes stand at rest, 1 g is so long in these units; the share that it may be off, the share of the
+#: record that rests, and the seconds of a mean.
+_GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
+_GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
 
 #: What reads a file of arrays, by its suffix.
 _ARRAYS: Mapping[str, Callable[[Path], Members]] = dict(zip(ARRAYS, (npz, mat, r_data, r_data, r_data), strict=True))
@@ -60,11 +71,15 @@ _Fail = Callable[[int, int | None, str], NoReturn]
 
 @dataclass(frozen=True)
 class Column:
-    """One column: `values` float64[n] in `unit`, all finite."""
+    """One column: `values` float64[n] in `unit`, n the samples of its `clock`, by default the recording's.
+
+    An axis is NaN where it has no sample and another axis has; all other values are finite.
+    """
 
     name: str
     unit: str
     values: NDArray[np.float64]
+    clock: Clock | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +88,7 @@ class Recording:
 
     `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps. `start_s`: where in the file's
     recording the first row is, s. `moving`: how many of the missing samples are there, but were measured in motion.
+    `started_s`: the first stamp, s. `notes`: what a reader of the results must know of the file, one line each.
     """
 
     path: Path
@@ -83,6 +99,12 @@ class Recording:
     off_grid_s: NDArray[np.float64] | None = None
     start_s: float = 0.0
     moving: int = 0
+    started_s: float | None = None
+    notes: tuple[str, ...] = ()
+    #: The files, where there are several: `path` has them all for messages.
+    paths: tuple[Path, ...] = ()
+    #: Options of the command line that it was read with, and their values, empty for a switch.
+    options: tuple[tuple[str, str], ...] = ()
 
     @property
     def samples(self) -> int:
@@ -100,23 +122,43 @@ class Recording:
         return int(self.missing_before.sum()) - self.moving
 
     @property
+    def clock(self) -> Clock:
+        """The clock of all columns that have none of their own."""
+        return Clock(self.rate_hz, self.missing_before, self.off_grid_s)
+
+    @property
     def time_s(self) -> NDArray[np.float64]:
         """float64[n]: time since the first row on the even grid of the sampling rate, s."""
-        return (np.arange(self.samples) + np.cumsum(self.missing_before)) / self.rate_hz
+        return self.clock.time_s
+
+    def clock_of(self, name: str) -> Clock:
+        """The clock of a column."""
+        return self.columns[name].clock or self.clock
 
     def with_rows(self, kept: NDArray[np.bool_], *, moving: bool = False) -> Recording:
         """The recording of the rows `kept` [n] alone, two or more. The others count as missing, and as `moving` where
         that is why they are left out. Rows before the first and after the last that is kept are cut off."""
-        at = np.arange(self.samples) + np.cumsum(self.missing_before)
+        at = self.clock.place
         where = np.flatnonzero(kept)
         missing = np.diff(at[where], prepend=at[where[0]] - 1) - 1
         inner = where[-1] - where[0] + 1 - where.size if moving else 0
+        begin_s = float(at[where[0]] - at[0]) / self.rate_hz
+
+        def left(one: Column) -> Column:
+            """An axis with a clock of its own keeps the samples that the row before them keeps."""
+            if one.clock is None:
+                return replace(one, values=one.values[kept])
+            time = one.clock.time_s
+            rows = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, self.samples - 1)
+            own = np.flatnonzero(kept[rows] & (rows >= where[0]) & (time < self.time_s[where[-1]] + 1.0 / self.rate_hz))
+            return replace(one, values=one.values[own], clock=one.clock.of_rows(own, begin_s))
+
         return replace(
             self,
-            columns={name: replace(one, values=one.values[kept]) for name, one in self.columns.items()},
+            columns={name: left(one) for name, one in self.columns.items()},
             missing_before=missing,
             off_grid_s=None if self.off_grid_s is None else self.off_grid_s[kept],
-            start_s=self.start_s + float(at[where[0]] - at[0]) / self.rate_hz,
+            start_s=self.start_s + begin_s,
             moving=self.moving + int(inner),
         )
 
@@ -147,6 +189,52 @@ class Recording:
             raise UserError(f"{self.path}: column '{name}' is in {column.unit}, which cannot be converted to {unit}")
         return units.convert(column.values, column.unit, unit)
 
+    def along(self, *names: str) -> Recording:
+        """The recording by the clock of these axes: its rows are those in which one of them has a sample.
+
+        A row without one is missing. All other columns are bridged by straight lines where they have no sample.
+        Raises UserError for axes of several clocks.
+        """
+        own = {id(self.columns[name].clock) for name in names}
+        if len(own) > 1:
+            rates = ", ".join(f"{name} {self.clock_of(name).rate_hz:g} Hz" for name in names)
+            raise UserError(f"{self.path}: axes of several sampling rates ({rates}): choose those of one with --axis")
+        clock = self.clock_of(names[0])
+        used = np.logical_or.reduce([np.isfinite(self.columns[name].values) for name in names])
+        own_clock = self.columns[names[0]].clock
+        others = [column for name, column in self.columns.items() if name not in names]
+        if used.all() and all(one.clock is own_clock and np.isfinite(one.values).all() for one in others):
+            columns = self.columns
+        else:
+            time = clock.time_s[used]
+            columns = {
+                name: replace(one, values=one.values[used])
+                if name in names or (one.clock is own_clock and np.isfinite(one.values).all())
+                else replace(one, values=_bridged(self.clock_of(name), one.values, time))
+                for name, one in self.columns.items()
+            }
+        if own_clock is None and used.all():
+            return self if columns is self.columns else replace(self, columns=columns)
+        missing = np.diff(clock.place[used], prepend=-1) - 1
+        off_grid = None if clock.off_grid_s is None else clock.off_grid_s[used]
+        columns = {name: replace(one, clock=None) for name, one in columns.items()}
+        return replace(self, rate_hz=clock.rate_hz, columns=columns, missing_before=missing, off_grid_s=off_grid)
+
+
+def _bridged(clock: Clock, values: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """float64[n]: values of a clock at the times [n], s, by straight lines."""
+    known = np.isfinite(values)
+    return np.interp(time, clock.time_s[known], values[known])
+
+
+def bridged(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Missing values by straight lines."""
+    good = np.isfinite(values)
+    if good.all():
+        return values
+    where = np.arange(values.size)
+    return np.interp(where, where[good], values[good])
+
 
 def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:
     """As the firmware gets them: what float32 cannot hold becomes infinite and is kept out."""
@@ -162,31 +250,77 @@ class _Field:
     name: str
     unit: str
     lsb: float
+    #: Nobody asked for it: a fault of it leaves it out.
+    optional: bool = False
+    #: Its cells are dates.
+    dates: bool = False
 
 
 def load(
-    path: Path | str,
+    path: Path | str | Sequence[Path | str],
     rate: float | None = None,
     columns: Mapping[str, str] = _NOTHING,
     units: Mapping[str, str] = _NOTHING,
     scale: Mapping[str, Scale] | float | None = None,
     sensors: Collection[str] = SENSORS,
+    *,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> Recording:
-    """Read a recording.
+    """Read a recording; of several files one, joined by their time stamps.
 
     `rate`, Hz: needed without a `t` column; with one it must agree with it to 10 % and is taken as the true rate.
-    `columns`: name here -> header in the file; with it, other columns that state no unit are left out.
-    `units`: name here -> unit, for headers that state none or one that is not known.
+    `columns`: name here -> header in the file. `units`: name here -> unit; it takes the header's place.
     `scale`: size of one LSB, for all LSB columns or by name, with its unit (default deg/s for g*, m/s^2 for a*).
-    `sensors`: columns of which at least one must be there.
+    `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
+    is left out if it cannot be read.
+    `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
+    The recording's `notes` are printed on stderr.
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
     """
-    path = Path(path)
+    paths = list_of(path)
     by_name: Mapping[str, Scale] = {"": (float(scale), None)} if isinstance(scale, int | float) else scale or {}
     if rate is not None and not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
-    header = _Header(path, columns, units, by_name, sensors)
+    if len(paths) > 1 and (rate is not None or no_time):
+        raise UserError("several files are joined by their time stamps: leave --rate and --no-time out")
+    headers = [_Header(one, columns, units, by_name, sensors, no_time, several=len(paths) > 1) for one in paths]
+    found = [_load(one, rate, header, skip_bad) for one, header in zip(paths, headers, strict=True)]
+    recording = found[0] if len(found) == 1 else _joined(found, headers)
+    _check_gravity(recording, headers[0])
+    recording = replace(recording, options=_options(rate, columns, units, by_name, no_time, skip_bad))
+    for text in recording.notes:
+        note(f"{recording.path}: {text}")
+    return recording
+
+
+def _options(
+    rate: float | None,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    scale: Mapping[str, Scale],
+    no_time: bool,
+    skip_bad: bool,
+) -> tuple[tuple[str, str], ...]:
+    """How a recording is read, as the command line says it."""
+    given = [] if rate is None else [("--rate", f"{rate:.15g}")]
+    for option, pairs in (("--column", columns), ("--unit", units)):
+        given += [(option, f"{name}={value}") for name, value in pairs.items()]
+    for name, (size, unit) in scale.items():
+        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
+        given.append(("--scale", f"{name}={text}" if name else text))
+    given += [(option, "") for option, wanted in (("--no-time", no_time), ("--skip-bad", skip_bad)) if wanted]
+    return tuple(given)
+
+
+def list_of(paths: Path | str | Sequence[Path | str]) -> list[Path]:
+    """The files of a recording."""
+    return [Path(paths)] if isinstance(paths, Path | str) else [Path(one) for one in paths]
+
+
+def _load(path: Path, rate: float | None, header: _Header, skip_bad: bool) -> Recording:
+    """One file."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
     suffix = path.suffix.lower()
@@ -197,9 +331,85 @@ def load(
                     raise UserError(f"{path}: the file is empty")
             return _load_arrays(path, rate, header, _ARRAYS[suffix](path))
         if path.name.lower().removesuffix(".gz").endswith(TEXT):
-            return _load_text(path, rate, header)
+            return _load_text(path, rate, header, skip_bad)
         path.open("rb").close()
     raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
+
+
+def _joined(found: Sequence[Recording], headers: Sequence[_Header]) -> Recording:
+    """Files of one recording as one: the columns of the fastest keep its clock, others have their own."""
+    main = max(found, key=lambda one: one.rate_hz)
+    paths = Path(" ".join(str(one.path) for one in found))
+    for header in headers:
+        header.check_options([name for one in found for name in one.columns])
+    for one in found:
+        if one.started_s is None or main.started_s is None:
+            raise UserError(f"{one.path}: there is no time column: several files are joined by their time stamps")
+        shift = one.started_s - main.started_s
+        if shift > main.duration_s or -shift > one.duration_s:
+            raise UserError(f"{paths}: the files do not overlap in time: are they of one recording?")
+    columns: dict[str, Column] = dict(main.columns)
+    notes = [*main.notes]
+    for one in found:
+        if one is main:
+            continue
+        assert one.started_s is not None and main.started_s is not None
+        shift = one.started_s - main.started_s
+        notes += one.notes
+        for name, column in one.columns.items():
+            if name in columns:
+                raise UserError(f"{paths}: column '{name}' is in more than one of them")
+            clock = replace(one.clock_of(name), start_s=one.clock_of(name).start_s + shift)
+            if clock.alike(main.clock):
+                columns[name] = replace(column, clock=None)
+            elif name in headers[0].sensors:
+                columns[name] = replace(column, clock=clock)
+            else:
+                columns[name] = replace(column, values=_bridged(clock, column.values, main.time_s), clock=None)
+    return replace(
+        main,
+        path=paths,
+        columns=columns,
+        notes=(*notes, *_rates(columns, main.rate_hz)),
+        paths=tuple(one.path for one in found),
+    )
+
+
+def _rates(columns: Mapping[str, Column], rate_hz: float) -> list[str]:
+    """A line on the axes that have clocks of their own."""
+    own = [(name, one.clock.rate_hz) for name, one in columns.items() if one.clock is not None]
+    told = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in own)
+    return [f"axes with a rate of their own: {told}; the others {rate_hz:.6g} Hz"] if own else []
+
+
+def _check_gravity(recording: Recording, header: _Header) -> None:
+    """Raise UserError for three accelerometers at rest that show 1 g of another unit than their headings'.
+
+    Nothing is checked where the user states a unit, or where gravity has the length of none."""
+    axes = [recording.columns[name] for name in ("ax", "ay", "az") if name in recording.columns]
+    if len(axes) < 3 or any(one.unit != axes[0].unit or one.name in header.decided for one in axes):
+        return
+    if not units.same_kind(axes[0].unit, "m/s^2") or axes[1].clock != axes[0].clock or axes[2].clock != axes[0].clock:
+        return
+    block = max(1, round(recording.clock_of("ax").rate_hz * _GRAVITY_S))
+    count = axes[0].values.size // block
+    means = np.array([one.values[: count * block].reshape(count, block).mean(axis=1) for one in axes])
+    means = means[:, np.isfinite(means).all(axis=0)]
+    if not means.size:
+        return
+    level = np.median(means, axis=1)
+    norm = float(np.linalg.norm(level))
+    rests = np.linalg.norm(means - level[:, None], axis=0) < _GRAVITY_OFF * norm
+    right = units.convert(1.0, "g", axes[0].unit)
+    if not norm > 0.0 or rests.mean() < _AT_REST or abs(norm / right - 1.0) < _GRAVITY_OFF:
+        return
+    for unit, length in _GRAVITY.items():
+        if abs(norm / length - 1.0) < _GRAVITY_OFF:
+            typed = " ".join(f"--unit {one.name}={unit}" for one in axes)
+            raise UserError(
+                f"{recording.path}: ax, ay, az are in {axes[0].unit} by their headings; at rest their norm is "
+                f"{norm:#.3g}, so the unit is {unit}: give {typed} (or their own unit, if it is right)"
+            )
 
 
 def save(
@@ -304,12 +514,28 @@ class _Header:
         stated: Mapping[str, str],
         scale: Mapping[str, Scale],
         sensors: Collection[str],
+        no_time: bool,
+        *,
+        several: bool,
     ) -> None:
         self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
+        self.no_time, self.several = no_time, several
+        self.notes: list[str] = []
+        #: Columns whose unit the user states, or scales.
+        self.decided = {*stated, *(scale if "" not in scale else sensors)}
 
-    def fields(self, keys: Sequence[str], where: str, described: Any) -> list[_Field]:
+    def knows(self, keys: Sequence[str]) -> bool:
+        """Whether one of these headings is a sensor's."""
+        wanted = self.columns.values()
+        return any(
+            key in wanted or name in wanted or name in self.sensors or key in _FOREIGN or name in _FOREIGN
+            for key in keys
+            for name in [_split(key)[0]]
+        )
+
+    def fields(self, keys: Sequence[str], where: str, described: Any, first: Sequence[str] = ()) -> list[_Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
-        what a meta text says of columns that are named plainly."""
+        what a meta text says of columns that are named plainly; `first`: the cells of the first row of a text."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
             raise UserError(f"{self.path}: meta: 'columns' must be a mapping of column names to unit and lsb")
         for key in keys:
@@ -317,20 +543,22 @@ class _Header:
                 what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
-        fields: list[_Field] = []
-        for key in keys:
-            plain, unit = _split(key)
-            entry = described.get(plain, {}) if unit is None else {}
-            unit = entry.get("unit", unit)
-            fields += self._field(key, renamed.get(key, plain), unit, entry.get("lsb"), where, mapped=key in renamed)
+        found: list[_Field] = []
+        for place, (key, (name, unit)) in enumerate(zip(keys, self._named(keys, renamed), strict=True)):
+            entry = described.get(_split(key)[0], {}) if unit is None else {}
+            dates = place < len(first) and is_date(first[place])
+            if not (name == "t" and self.no_time):
+                found += self._field(
+                    key, name, entry.get("unit", unit), entry.get("lsb"), where, mapped=key in renamed, dates=dates
+                )
+        names = [field.name for field in found]
+        fields = [field for field in found if not field.optional or names.count(field.name) == 1]
         names = [field.name for field in fields]
         for name in names:
             if names.count(name) > 1:
                 raise UserError(f"{self.path}: {where}column '{name}' appears twice")
-        for option, wanted in (("--unit", self.stated), ("--scale", self.scale)):
-            for name in wanted:
-                if name and name not in names:
-                    raise UserError(f"{self.path}: {where}there is no column '{name}' for {option}")
+        if not self.several:
+            self.check_options(names, where)
         if not any(name in self.sensors for name in names):
             raise UserError(
                 f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}';"
@@ -338,10 +566,34 @@ class _Header:
             )
         return fields
 
+    def check_options(self, names: Sequence[str], where: str = "") -> None:
+        """Raise UserError for an option about a column that is not there."""
+        for option, wanted in (("--unit", self.stated), ("--scale", self.scale)):
+            for name in wanted:
+                if name and name not in names and not (name == "t" and self.no_time):
+                    raise UserError(f"{self.path}: {where}there is no column '{name}' for {option}")
+
+    def _named(self, keys: Sequence[str], renamed: Mapping[str, str]) -> list[tuple[str, str | None]]:
+        """Name here, and unit by the heading, of each column."""
+        split = [_FOREIGN[key] if key in _FOREIGN and key not in renamed else _split(key) for key in keys]
+        split = [
+            (_FOREIGN[name][0], unit) if name in _FOREIGN and key not in renamed else (name, unit)
+            for key, (name, unit) in zip(keys, split, strict=True)
+        ]
+        names = [renamed.get(key, name) for key, (name, _) in zip(keys, split, strict=True)]
+        times = [place for place, name in enumerate(names) if name.lower() in _TIMES]
+        if "t" not in names and len(times) == 1:
+            names[times[0]] = "t"
+            if split[times[0]][1] is None and any(key in _FOREIGN and "[" in key for key in keys):
+                split[times[0]] = ("t", "us")  # PX4's
+        return [(name, unit) for name, (_, unit) in zip(names, split, strict=True)]
+
     def _renamed(self, keys: Sequence[str], where: str) -> dict[str, str]:
         renamed: dict[str, str] = {}
         for name, wanted in self.columns.items():
             matches = [key for key in keys if key == wanted] or [key for key in keys if _split(key)[0] == wanted]
+            if not matches and self.several:
+                continue
             if not matches:
                 raise UserError(f"{self.path}: {where}there is no column '{wanted}' for --column {name}={wanted}")
             if len(matches) > 1:
@@ -351,30 +603,39 @@ class _Header:
             renamed[matches[0]] = name
         return renamed
 
-    def _field(self, key: str, name: str, unit: Any, lsb: Any, where: str, mapped: bool) -> list[_Field]:
+    def _field(
+        self, key: str, name: str, unit: Any, lsb: Any, where: str, *, mapped: bool, dates: bool
+    ) -> list[_Field]:
         column = f"{self.path}: {where}column '{name}'"
-        if not name:
-            raise UserError(f"{self.path}: {where}a column has no name")
         stated = self.stated.get(name)
         if isinstance(unit, str):
             unit = units.plain(unit)
         if stated is not None:
             stated = units.plain(stated)
             if unit is not None and unit != stated and units.known(str(unit)):
-                raise UserError(f"{column} is in {unit} by its header, --unit says {stated}")
+                self.notes.append(f"column '{name}' is in {unit} by its heading, taken as {stated} by --unit")
             unit = stated
-        left_out = self.columns and not mapped and name != "t" and name not in self.sensors
-        if ("[" in name or "]" in name) and not (unit is None and left_out):
+        asked = mapped or name in self.stated or name in self.scale
+        optional = not asked and name != "t" and name not in self.sensors
+        dates = dates and name == "t" and unit is None
+        unit = "s" if dates else unit
+        known = isinstance(unit, str) and units.known(unit)
+        broken = ("[" in name or "]" in name) and not mapped
+        if broken and any(name.startswith(sensor) for sensor in ("t", *self.sensors)):
             raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
+        if optional and (not name or broken or not known or (unit == units.LSB and "" not in self.scale)):
+            example = dict(SIDE_CHANNELS.values()).get(name)
+            if example is not None:
+                what = f"has the unit '{short(str(unit))}'" if unit is not None else "has no unit"
+                self.notes.append(f"column '{name}' {what} and is left out: write {name}[{example}]")
+            return []
         if unit is None:
-            if left_out:
-                return []
-            known = {"t": "s", **dict(SIDE_CHANNELS.values()), **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
-            example = known.get(name, _LSB_UNITS.get(name[0]) if name in self.sensors else None)
-            hint = f"write {name}[{example or 'UNIT'}] in the header or give --unit {name}={example or 'UNIT'}"
-            leave = "" if example else ", or leave it out by naming what to read with --column NAME=HEADER"
-            raise UserError(f"{column} has no unit: {hint}{leave}")
-        if not isinstance(unit, str) or not units.known(unit):
+            usual = {"t": "s", **dict(SIDE_CHANNELS.values()), **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
+            example = usual.get(name, _LSB_UNITS.get(name[0])) or "UNIT"
+            raise UserError(
+                f"{column} has no unit: write {name}[{example}] in the header or give --unit {name}={example}"
+            )
+        if not known:
             known_units = f"(known: {', '.join(units.RECORDING_UNITS)})"
             raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}")
         size = 1.0
@@ -393,7 +654,8 @@ class _Header:
             raise UserError(f"{column}: the size of one LSB must be a number above 0")
         if name == "t" and not units.same_kind(unit, "s"):
             raise UserError(f"{column} is in {unit}, which is not a time (s, ms, us, ns)")
-        return [_Field(key, name, unit, size)]
+        side = name in dict(SIDE_CHANNELS.values())
+        return [_Field(key, name, unit, size, optional and not side, dates)]
 
 
 def _number(value: Any) -> float:
@@ -407,20 +669,25 @@ def _number(value: Any) -> float:
 # ----------------------------------------------------------------------------------------------------------- loaders
 
 
-def _load_text(path: Path, rate: float | None, header: _Header) -> Recording:
+def _load_text(path: Path, rate: float | None, header: _Header, skip_bad: bool) -> Recording:
     with ExitStack() as files:
-        table = TextTable(path, files)
+        table = TextTable(path, files, header.knows, skip_bad=skip_bad)
         meta = _meta_beside(path)
-        fields = header.fields(table.keys, table.where, {})
-        columns = table.columns([(field.key, field.name) for field in fields])
+        fields = header.fields(table.keys, table.where, {}, table.first)
+        dated = next((place for place, field in enumerate(fields) if field.dates), None)
+        read = table.columns([(field.key, field.name) for field in fields], [field.optional for field in fields], dated)
+    fields = [field for field, column in zip(fields, read, strict=True) if column is not None]
+    columns = [column for column in read if column is not None]
     if meta.get("rows", columns[0].size) != columns[0].size:
         what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
         raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
+    if table.skipped:
+        header.notes.append(f"{table.skipped} lines are no rows and were skipped")
 
     def fail(row: int, field: int | None, what: str) -> NoReturn:
         table.fail(row, None if field is None else fields[field].name, what)
 
-    return _checked(path, rate, meta, fields, columns, fail)
+    return _checked(path, rate, meta, fields, columns, fail, header, table.origin_s)
 
 
 def _meta_beside(path: Path) -> Mapping[str, Any]:
@@ -454,18 +721,28 @@ def _load_arrays(path: Path, rate: float | None, header: _Header, members: Membe
         column = "" if field is None else f"column '{fields[field].name}': "
         raise UserError(f"{path}: row {row + 1}: {column}{what}")
 
+    started = 0.0
+
     def as_read(number: int) -> NDArray[np.float64]:
+        nonlocal started
         array = arrays[fields[number].key].read()
         if fields[number].name == "t" and array.dtype.kind in "iu":
             # Time since an epoch in ns does not fit a float64; a difference of two int64 fits a uint64.
             back = array[1:] < array[:-1]
-            if back.any():
-                fail(int(np.argmax(back)) + 1, number, "time runs backwards")
             bits = array.astype(np.uint64 if array.dtype.kind == "u" else np.int64).view(np.uint64)
-            array = bits - bits[0]
+            started = float(array[0])
+            since = bits - bits[0]
+            if not back.any():
+                return np.asarray(since, np.float64)
+            # Only a counter that wraps goes back, and by less than 2^63.
+            steps = np.diff(since).view(np.int64)
+            if (steps[back] >= 0).any():
+                fail(int(np.argmax(back)) + 1, number, "time runs backwards")
+            return np.asarray(since.view(np.int64), np.float64)
         return array.astype(np.float64)
 
-    return _checked(path, rate, meta, fields, [as_read(number) for number in range(len(fields))], fail)
+    columns = [as_read(number) for number in range(len(fields))]
+    return _checked(path, rate, meta, fields, columns, fail, header, started)
 
 
 # ------------------------------------------------------------------------------------------------------ common checks
@@ -478,64 +755,138 @@ def _checked(
     fields: Sequence[_Field],
     table: Sequence[NDArray[np.float64]],
     fail: _Fail,
+    header: _Header,
+    started: float,
 ) -> Recording:
-    """The recording of raw columns `table`, float64[n] each. `fail(row, field, what)` raises for a row of the file."""
+    """The recording of raw columns `table`, float64[n] each, NaN where there is no sample. `fail(row, field, what)`
+    raises for a row of the file. `started`: what was taken off the stamps, in their unit."""
     columns: dict[str, Column] = {}
     for number, (field, raw) in enumerate(zip(fields, table, strict=True)):
-        finite = np.isfinite(raw)
-        if not finite.all():
-            row = int(np.argmin(finite))
-            fail(row, number, "not a number (NaN)" if np.isnan(raw[row]) else "infinite")
-        values = raw * field.lsb if field.lsb != 1.0 else raw
-        if not np.isfinite(values).all():
-            fail(int(np.argmin(np.isfinite(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
+        if np.isinf(raw).any():
+            fail(int(np.argmax(np.isinf(raw))), number, "infinite")
+        with np.errstate(over="ignore"):
+            values = raw * field.lsb if field.lsb != 1.0 else raw
+        if np.isinf(values).any():
+            fail(int(np.argmax(np.isinf(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
         columns[field.name] = Column(field.name, field.unit, values)
     _check_truth(path, meta)
     rows = table[0].size
     stamps = columns.pop("t", None)
-    off_grid = None
+    time = started_s = None
+    noise_s = 0.0
+
+    def fail_time(row: int, what: str) -> NoReturn:
+        fail(row, [field.name for field in fields].index("t"), what)
+
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(path, meta)
         if rate is None:
             raise UserError(f"{path}: there is no time column: add t[s] or give --rate HZ")
-        missing = np.zeros(rows, np.int64)
     else:
-        time = units.convert(stamps.values - stamps.values[0], stamps.unit, "s")
-        if not np.isfinite(time[-1]):
-            raise UserError(f"{path}: column 't' spans more than a number can hold")
-        number = [field.name for field in fields].index("t")
-        found, missing = _sampling(path, time, stamps, rate, lambda row, what: fail(row, number, what))
-        if rate is not None and (not 0.9 < found / rate < 1.1 or 2 * np.count_nonzero(missing) > missing.size):
-            raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}")
-        rate = found if rate is None else rate
-        if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
-            what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
-            raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
-        off_grid = time - (np.arange(rows) + np.cumsum(missing) - missing[0]) / rate
-    return Recording(path, rate, columns, missing, meta, off_grid)
+        unknown = np.isnan(stamps.values)
+        if unknown.any():
+            fail_time(int(np.argmax(unknown)), "no time stamp (an empty cell or NaN)")
+        time, wraps = unwrapped(units.convert(stamps.values - stamps.values[0], stamps.unit, "s"))
+        if wraps:
+            header.notes.append(
+                f"column 't' wraps {wraps} time{'s' if wraps > 1 else ''} like a 32-bit counter: undone"
+            )
+        started_s = float(units.convert(np.array([started + stamps.values[0]]), stamps.unit, "s")[0])
+        noise_s = float(
+            np.abs(units.convert(np.spacing(np.abs(stamps.values).max(keepdims=True)), stamps.unit, "s"))[0]
+        )
+    return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time)
 
 
-def _sampling(
-    path: Path, time: NDArray[np.float64], stamps: Column, rate: float | None, fail: Callable[[int, str], NoReturn]
-) -> tuple[float, NDArray[np.int64]]:
-    """Rate in Hz and missing_before[n] from time stamps float64[n] (s, from 0); `stamps` are those of the file."""
-    steps = np.diff(time)
-    if (steps < 0.0).any():
-        fail(int(np.argmax(steps < 0.0)) + 1, "time runs backwards")
-    repeats = steps == 0.0
-    few = time.size < _REPEATS_FROM or np.count_nonzero(repeats) < _REPEATS_LEAST * time.size
-    if repeats.any() and (few or repeats.all()):
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
-    noise = float(np.abs(units.convert(np.spacing(np.abs(stamps.values).max(keepdims=True)), stamps.unit, "s"))[0])
-    try:
-        dt, missing = sampling(time, noise, rate)
-    except Ambiguous as error:
-        raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
-    if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
-    if not 0.0 < dt < math.inf or not time[-1] / dt < LONGEST:
-        raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
-    return float(f"{1.0 / dt:.10g}"), missing
+def _on_clocks(
+    path: Path,
+    rate: float | None,
+    meta: Mapping[str, Any],
+    columns: Mapping[str, Column],
+    rows: int,
+    time: NDArray[np.float64] | None,
+    noise_s: float,
+    started_s: float | None,
+    header: _Header,
+    fail: Callable[[int, str], NoReturn],
+) -> Recording:
+    """The recording of columns with NaN in `rows` rows at the stamps `time`, s, or at `rate` without any.
+
+    Axes whose samples are spaced regularly, in two rows or more, get a clock of their own; the rows of the others are
+    those in which one of them has a sample.
+    """
+
+    def clock_at(at: NDArray[np.int64], rate: float | None) -> Clock:
+        if time is not None:
+            return clock_of(path, time[at], noise_s, rate, lambda row, what: fail(int(at[row]), what))
+        assert rate is not None
+        return clock_of_rows(at, rate)
+
+    axes: dict[str, NDArray[np.bool_]] = {}
+    for name, column in columns.items():
+        known = np.isfinite(column.values)
+        if not known.any():
+            header.notes.append(f"column '{name}' holds no number and is left out")
+        elif name in header.sensors:
+            axes[name] = known
+    columns = {name: column for name, column in columns.items() if name in axes or np.isfinite(column.values).any()}
+    if not axes:
+        raise UserError(f"{path}: no sensor column holds a number")
+    own: dict[bytes, list[str]] = {}
+    for name, known in axes.items():
+        if not known.all() and has_own_clock(np.flatnonzero(known)):
+            own.setdefault(np.packbits(known).tobytes(), []).append(name)
+    if len(own) > MOST_CLOCKS:
+        raise UserError(f"{path}: more than {MOST_CLOCKS} patterns of empty cells: no recording has so many rates")
+    clocked = {name: names for names in own.values() for name in names}
+    common = [known for name, known in axes.items() if name not in clocked]
+    if common:
+        at = np.flatnonzero(np.logical_or.reduce(common))
+    else:  # the fastest of them is the recording's
+        fastest = max(own.values(), key=lambda names: int(axes[names[0]].sum()))
+        at = np.flatnonzero(axes[fastest[0]])
+        clocked = {name: names for name, names in clocked.items() if names is not fastest}
+    if at.size < 2:
+        raise UserError(
+            f"{path}: {at.size} row{'s' if at.size > 1 else ''} with a sample, a recording needs two or more"
+        )
+    main = clock_at(at, rate)
+    begins = main.start_s
+    started_s = None if started_s is None else started_s + begins
+    clocks = {
+        id(names): clock_at(np.flatnonzero(axes[names[0]]), None if time is not None else rate)
+        for names in clocked.values()
+    }
+    made: dict[str, Column] = {}
+    missing: dict[str, int] = {}
+    for name, column in columns.items():
+        known = np.isfinite(column.values)
+        if name in clocked:
+            clock = clocks[id(clocked[name])]
+            made[name] = replace(
+                column, values=column.values[known], clock=replace(clock, start_s=clock.start_s - begins)
+            )
+        elif name in axes:
+            made[name] = replace(column, values=column.values[at])
+            missing[name] = rows - int(known.sum())
+        else:
+            place = np.arange(rows, dtype=np.float64) if time is None else time
+            values = column.values if known.all() else np.interp(place, place[known], column.values[known])
+            made[name] = replace(column, values=values[at])
+    told = ", ".join(f"{name} {count}" for name, count in missing.items() if count)
+    if told:
+        header.notes.append(f"of {rows} rows cells without a number, taken as missing samples: {told}")
+    notes = (*header.notes, *_rates(made, main.rate_hz))
+    return Recording(
+        path,
+        main.rate_hz,
+        made,
+        main.missing_before,
+        meta,
+        main.off_grid_s,
+        started_s=started_s,
+        notes=notes,
+    )
 
 
 def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:

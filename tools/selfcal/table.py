@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from selfcal import units
-from selfcal.errors import printable
+from selfcal.document import as_typed
+from selfcal.errors import called, printable
 from selfcal.laws import RATIOS
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
@@ -136,7 +137,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
-        failed.append(f"why, and what mends it: selfcal diagnose {printable(recording['path'])}")
+        failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
     return table, [*kept, *failed]
 
 

@@ -1,16 +1,20 @@
-"""Recordings that are text: columns separated by commas, semicolons or tabs, under one header line.
+"""Recordings that are text: columns separated by commas, semicolons, tabs or blanks, under one header line.
 
-Lines before the header that are empty or begin with # are skipped. Where all are and numbers follow, the last of them
-is the header, as `numpy.savetxt` writes it. Between semicolons or tabs a comma is a decimal sign. The text is read in
+The header is the first line with a heading that the caller knows and no number; lines before it are skipped. Without
+one it is the first line that is no comment, or, where numbers follow comments, the last comment, as `numpy.savetxt`
+writes it. Between semicolons, tabs or blanks a comma is a decimal sign. An empty cell is NaN. The text is read in
 blocks: no more of it than one is in memory.
 """
 
 from __future__ import annotations
 
 import gzip
+import math
 import re
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
@@ -34,98 +38,163 @@ from selfcal.limits import (
 _SLOW_BYTES = 1 << 26
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
+#: Blanks that separate; those within the brackets of a unit and before them do not.
+_BLANKS = re.compile(r"\s+(?!\s|[\[(]|[^\[(]*[\])])")
+#: What begins a comment.
+_COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
 #: Nothing but numbers and what separates them.
 _ROW = re.compile(r"[-+.,;\t \"eE\d]*\d[-+.,;\t \"eE\d]*", re.ASCII)
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
+#: A cell that holds no sample.
+_MISSING = re.compile(r"(nan?|n/a|null|none)?", re.ASCII | re.IGNORECASE)
+#: A date with a time of day (ISO 8601), in quotes or not.
+_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
+#: Lines that may be skipped at least, and their share at most, before a file is no recording.
+_SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
+
+
+class _Bad(Exception):
+    """What is wrong with a row: the place of the column among those read (None: the whole row), and the text."""
+
+    def __init__(self, place: int | None, what: str) -> None:
+        self.place, self.what = place, what
 
 
 class TextTable:
-    """A table being read: `keys` are its headings, `where` the line they are on, for messages."""
+    """A table being read: `keys` are its headings, `first` the cells of its first row, `where` the header's line."""
 
-    def __init__(self, path: Path, files: ExitStack) -> None:
-        """Read as far as the header. `files` closes what is opened. Raises UserError."""
+    def __init__(
+        self, path: Path, files: ExitStack, knows: Callable[[Sequence[str]], bool], *, skip_bad: bool = False
+    ) -> None:
+        """Read as far as the header. `files` closes the file. `knows`: whether a line of headings has a known one.
+        `skip_bad`: leave out lines that are no row, and count them as `skipped`. Raises UserError."""
         self.path = path
         self._lines = _Lines(path, _opened(path, files))
-        header, number, self._row = self._header()
+        header, number, self._row = self._header(knows)
         self._batch = self._lines.rest or self._lines.more()
         if not self._batch:
             raise UserError(f"{path}: line {number}: there is a header but no rows")
-        self._separator = self._separated(header, number)
+        self._separator = self._separated(header, self._batch[0], number)
         self._decimal: str | None = None
+        self._skip_bad, self._skipped = skip_bad, list[int]()
+        self._origin: datetime | None = None
         self.where = f"line {number}: "
-        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(header.split(self._separator))]
+        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(self._cells(header))]
+        self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
+
+    @property
+    def skipped(self) -> int:
+        """Lines that were left out."""
+        return len(self._skipped)
+
+    @property
+    def origin_s(self) -> float:
+        """The first date, s since 1970; 0 without dates. A date without a zone counts as UTC."""
+        if self._origin is None:
+            return 0.0
+        return (self._origin if self._origin.tzinfo else self._origin.replace(tzinfo=UTC)).timestamp()
 
     def fail(self, row: int, column: str | None, what: str) -> NoReturn:
-        """Raise UserError for a row (from 0), and a column of it, of the file."""
-        column = "" if column is None else f"column '{column}': "
-        raise UserError(f"{self.path}: line {self._row + row}: {column}{what}")
+        """Raise UserError for a row (from 0), and a column of it, of the table that `columns` gave."""
+        # Line `row` of those kept; skipped line k has k kept ones fewer before it than lines.
+        row += bisect_right([at - k for k, at in enumerate(self._skipped)], row)
+        self._fail(row, column, what)
 
-    def columns(self, names: Sequence[tuple[str, str]]) -> list[NDArray[np.float64]]:
-        """The columns [n] of pairs (heading, name in messages), n at least 2. Raises UserError for the first fault."""
+    def _fail(self, line: int, column: str | None, what: str) -> NoReturn:
+        column = "" if column is None else f"column '{column}': "
+        raise UserError(f"{self.path}: line {self._row + line}: {column}{what}")
+
+    def columns(
+        self, names: Sequence[tuple[str, str]], optional: Sequence[bool] = (), time: int | None = None
+    ) -> list[NDArray[np.float64] | None]:
+        """The columns [n] of pairs (heading, name in messages), n at least 2; NaN where a cell is empty.
+
+        `optional`: such a column is None if a cell of it is no number. `time`: the place of a column of dates, which
+        becomes seconds since the first. Raises UserError for the first fault.
+        """
         index = [self.keys.index(key) for key, _ in names]
-        called = [name for _, name in names]
-        parts: list[list[NDArray[np.float64]]] = [[] for _ in index]
-        rows, blank, batch = 0, False, self._batch
+        parts: list[list[NDArray[np.float64]] | None] = [[] for _ in index]
+        lines, rows, blank, batch = 0, 0, False, self._batch
         while batch:
             filled = len(batch)
             while filled and not batch[filled - 1].strip():
                 filled -= 1
-            if blank and filled:
-                self.fail(rows, None, "an empty line")
+            if blank and filled and not self._skip_bad:
+                self._fail(lines, None, "an empty line")
             blank = blank or filled < len(batch)
-            batch = batch[:filled]
-            if (rows + filled) * len(index) > MOST_NUMBERS:
+            wanted = [place for place, part in enumerate(parts) if part is not None]
+            if (rows + filled) * len(wanted) > MOST_NUMBERS:
                 raise UserError(
                     f"{self.path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns, those "
                     "that --column names"
                 )
-            for part, column in zip(parts, self._parse(batch, rows, index, called).T, strict=True):
-                part.append(np.ascontiguousarray(column))
-            rows += filled
+            table = self._parse(batch[:filled], [index[place] for place in wanted], _place(wanted, time))
+            if table is None:
+                table = self._scan(batch[:filled], lines, index, names, optional, time, parts)
+                wanted = [place for place in wanted if parts[place] is not None]
+            for place, column in zip(wanted, table.T, strict=True):
+                cast(list[NDArray[np.float64]], parts[place]).append(np.ascontiguousarray(column))
+            lines += len(batch) if self._skip_bad else filled
+            rows += len(table)
             batch = self._lines.more()
-        if self._lines.unfinished and not blank:
+        kept = [part for part in parts if part is not None]
+        if self._lines.unfinished and not blank and not (self._skipped and self._skipped[-1] == lines - 1):
             # A line that was cut within its last number would be taken for another value.
             rows -= 1
-            for part in parts:
+            for part in kept:
                 part[-1] = part[-1][:-1]
-            note(f"{self.path}: line {self._row + rows} has no line end and may be cut off: left out")
+            note(f"{self.path}: line {self._row + lines - 1} has no line end and may be cut off: left out")
         if rows < 2:
             what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
             raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
-        return [np.concatenate(parts.pop(0)) for _ in index]
+        return [None if part is None else np.concatenate(part) for part in parts]
 
-    def _header(self) -> tuple[str, int, int]:
+    def _header(self, knows: Callable[[Sequence[str]], bool]) -> tuple[str, int, int]:
         """The header line, its number, and the first row's; the lines after it are the rest."""
-        comment, comment_number, seen = "", 0, 0
-        while batch := self._lines.more():
-            for place, line in enumerate(batch):
-                number = self._lines.number + place + 1
-                if not line.strip() or line.lstrip().startswith("#"):
-                    seen += 1
-                    if line.strip():
-                        comment, comment_number = line.strip(), number
-                    if seen > MOST_LEADING_LINES:
-                        raise UserError(f"{self.path}: line {number}: no header in the first {MOST_LEADING_LINES}")
-                    continue
-                if comment and _ROW.fullmatch(line):
-                    self._lines.rest = batch[place:]
-                    return comment.lstrip("# \t"), comment_number, number
-                self._lines.rest = batch[place + 1 :]
-                return line, number, number + 1
-        raise UserError(f"{self.path}: line 1: the file holds {'comments' if comment else 'empty lines'} only")
+        batch = self._lines.more()
+        comment, plain = -1, -1
+        for place, line in enumerate(batch):
+            if place >= MOST_LEADING_LINES + 1:
+                break
+            if not line.strip():
+                continue
+            bare = _COMMENT.sub("", line, count=1).strip()
+            if plain < 0:
+                if bare != line.strip():
+                    comment = place
+                else:
+                    plain = place
+            if _is_header(bare, batch[place + 1 : place + 2], knows):
+                return self._begins(batch, place, place + 1, bare)
+        if comment >= 0 and plain >= 0 and _ROW.fullmatch(batch[plain]):
+            return self._begins(batch, comment, plain, _COMMENT.sub("", batch[comment], count=1).strip())
+        if 0 <= plain < MOST_LEADING_LINES:
+            return self._begins(batch, plain, plain + 1, batch[plain])
+        if len(batch) > MOST_LEADING_LINES:
+            raise UserError(f"{self.path}: line {MOST_LEADING_LINES + 1}: no header in the first {MOST_LEADING_LINES}")
+        raise UserError(f"{self.path}: line 1: the file holds {'comments' if comment >= 0 else 'empty lines'} only")
 
-    def _separated(self, header: str, number: int) -> str:
+    def _begins(self, batch: list[str], header: int, row: int, text: str) -> tuple[str, int, int]:
+        """The header `text` in line `header` of the first batch, the first row in line `row`, both from 0."""
+        self._lines.rest = batch[row:]
+        return text, header + 1, row + 1
+
+    def _separated(self, header: str, row: str, number: int) -> str:
         """What separates columns: the one sign of the header that splits the first row in as many cells."""
         found = [sign for sign in _SEPARATORS if sign in header]
         if len(found) > 1:
-            row = self._batch[0]
             fitting = [sign for sign in found if row.count(sign) == header.count(sign)]
             if len(fitting) != 1:
                 signs = " or ".join(_SEPARATORS[sign] for sign in found)
                 raise UserError(f"{self.path}: line {number}: {signs} could separate the columns: keep one of them")
             found = fitting
+        if not found and 1 < len(_BLANKS.split(header.strip())) == len(row.split()):
+            return " "
         return found[0] if found else ","
+
+    def _cells(self, line: str) -> list[str]:
+        return _BLANKS.split(line.strip()) if self._separator == " " else line.split(self._separator)
 
     def _heading(self, cell: str, number: int, place: int) -> str:
         where = f"{self.path}: line {number}: column {place + 1}: "
@@ -138,57 +207,152 @@ class TextTable:
             raise UserError(f"{where}a heading of more than {LONGEST_HEADING} characters")
         return heading.strip()
 
-    def _parse(self, lines: list[str], row: int, index: Sequence[int], names: Sequence[str]) -> NDArray[np.float64]:
-        """float64[lines, index] of lines from `row` on."""
-        if not lines:
-            return np.empty((0, len(index)))
-        plain: list[str] | None = lines
+    def _parse(self, lines: list[str], index: Sequence[int], time: int | None) -> NDArray[np.float64] | None:
+        """float64[lines, index] of lines, the fast way; None if it takes the slow one. `time`: a column of dates."""
+        if not lines or not index:
+            return np.empty((len(lines), len(index)))
+        text = "\n".join(" ".join(line.split()) for line in lines) if self._separator == " " else "\n".join(lines)
         if self._separator != ",":
-            text = "\n".join(lines)
             point, comma = "." in text, "," in text
             if (point or self._decimal == ".") and (comma or self._decimal == ","):
-                plain = None  # which cells have which is for the slow way
-            elif comma:
-                self._decimal, plain = ",", text.replace(",", ".").split("\n")
+                return None  # which cells have which is for the slow way
+            if comma:
+                self._decimal, text = ",", text.replace(",", ".")
             elif point:
                 self._decimal = "."
-        width = len(self.keys)
-        if plain is not None and all(line.count(self._separator) == width - 1 for line in plain):
-            try:
-                table = np.loadtxt(plain, delimiter=self._separator, comments=None, usecols=index, ndmin=2)
-            except ValueError:
-                pass
-            else:
-                if len(table) == len(lines):
-                    return table
-        return self._scan(lines, row, index, names)
+        plain = _with_nan(text, self._separator).split("\n")
+        if not all(line.count(self._separator) == len(self.keys) - 1 for line in plain):
+            return None
+        dates: Mapping[int | str, Callable[[str], Any]] | None = None if time is None else {index[time]: self._date}
+        try:
+            with np.errstate(all="ignore"):
+                table = np.loadtxt(
+                    plain, delimiter=self._separator, comments=None, usecols=index, ndmin=2, converters=dates
+                )
+        except (ValueError, TypeError):
+            return None
+        return table if len(table) == len(lines) else None
 
-    def _scan(self, lines: list[str], row: int, index: Sequence[int], names: Sequence[str]) -> NDArray[np.float64]:
-        """The slow exact way, or the first fault. Columns that are not read may hold anything."""
-        table = np.empty((len(lines), len(index)))
+    def _scan(
+        self,
+        lines: list[str],
+        row: int,
+        index: Sequence[int],
+        names: Sequence[tuple[str, str]],
+        optional: Sequence[bool],
+        time: int | None,
+        parts: list[list[NDArray[np.float64]] | None],
+    ) -> NDArray[np.float64]:
+        """The slow exact way, or the first fault. An optional column that fails leaves `parts`."""
+        found: list[list[float]] = []
         for number, line in enumerate(lines):
-            cells = line.split(self._separator)
-            if len(cells) != len(self.keys):
-                what = f"{len(cells)} cells where the header has {len(self.keys)}" if line.strip() else "an empty line"
-                self.fail(row + number, None, what)
-            for place, (column, name) in enumerate(zip(index, names, strict=True)):
-                cell = _unquoted(cells[column])
-                if cell is None:
-                    self.fail(row + number, name, f"an unclosed quote: '{short(cells[column].strip())}'")
-                table[number, place] = self._number(cell, row + number, name)
-        return table
+            try:
+                cells = self._row_of(line)
+                values = []
+                for place, column in enumerate(index):
+                    if parts[place] is None:
+                        value = math.nan
+                    elif place < len(optional) and optional[place]:
+                        value = self._optional(cells[column], place, parts)
+                    else:
+                        value = self._value(cells[column], place, dated=place == time)
+                    values.append(value)
+                found.append(values)
+            except _Bad as bad:
+                if not self._skip_bad:
+                    self._fail(row + number, None if bad.place is None else names[bad.place][1], bad.what)
+                self._skipped.append(row + number)
+                if len(self._skipped) > _SKIPPED_LEAST + _SKIPPED_MOST * (row + number):
+                    raise UserError(
+                        f"{self.path}: line {self._row + row + number}: {len(self._skipped)} lines so far are no rows "
+                        f"of its columns; this one: {bad.what}"
+                    ) from None
+        table = np.array(found, np.float64).reshape(len(found), len(index))
+        return table[:, [place for place in range(len(index)) if parts[place] is not None]]
 
-    def _number(self, cell: str, row: int, name: str) -> float:
+    def _optional(self, cell: str, place: int, parts: list[list[NDArray[np.float64]] | None]) -> float:
+        try:
+            return self._value(cell, place)
+        except _Bad:
+            parts[place] = None
+            return math.nan
+
+    def _row_of(self, line: str) -> list[str]:
+        cells = self._cells(line)
+        if len(cells) != len(self.keys):
+            what = f"{len(cells)} cells where the header has {len(self.keys)}" if line.strip() else "an empty line"
+            raise _Bad(None, what)
+        return cells
+
+    def _value(self, text: str, place: int, dated: bool = False) -> float:
+        cell = _unquoted(text)
+        if cell is None:
+            raise _Bad(place, f"an unclosed quote: '{short(text.strip())}'")
+        if dated:
+            try:
+                return self._date(cell)
+            except (ValueError, TypeError):
+                raise _Bad(place, f"'{short(cell)}' is no date like the first") from None
+        if _MISSING.fullmatch(cell):
+            return math.nan
         for sign in ",.":
             if self._separator != "," and sign in cell:
                 if self._decimal not in (None, sign) or (sign == "," and "." in cell):
-                    self.fail(row, name, f"'{short(cell)}': both ',' and '.' are used as decimal sign")
+                    raise _Bad(place, f"'{short(cell)}': both ',' and '.' are used as decimal sign")
                 self._decimal = sign
                 cell = cell.replace(",", ".")
                 break
         if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
-            self.fail(row, name, f"'{short(cell)}' is not a number" if cell else "an empty cell")
+            raise _Bad(place, f"'{short(cell)}' is not a number")
         return float(cell)
+
+    def _date(self, cell: str) -> float:
+        """Seconds since the first date. Raises ValueError, and TypeError where one has a zone and the other has not."""
+        cell = cell.strip(' "')
+        if not _ISO.fullmatch(cell):
+            raise ValueError(cell)
+        moment = datetime.fromisoformat(cell)
+        if self._origin is None:
+            self._origin = moment
+        return (moment - self._origin).total_seconds()
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell is a date with a time of day."""
+    return _ISO.fullmatch(cell) is not None
+
+
+def _place(wanted: Sequence[int], place: int | None) -> int | None:
+    return None if place is None else wanted.index(place)
+
+
+def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]], bool]) -> bool:
+    """Whether a line has a known heading and no number, and the line `after` it, if any, numbers in as many cells."""
+    for sign in (*_SEPARATORS, " "):
+        if sign != " " and sign not in line:
+            continue
+        split = _BLANKS.split if sign == " " else lambda text, sign=sign: text.split(sign)
+        cells = [cell.strip(' "') for cell in split(line)]
+        if any(_NUMBER.fullmatch(cell) for cell in cells) or not knows(cells):
+            continue
+        row = split(after[0].strip()) if after else []
+        if not after or (len(row) == len(cells) and any(_ROW.fullmatch(cell.strip(' "')) for cell in row)):
+            return True
+    return False
+
+
+def _with_nan(text: str, separator: str) -> str:
+    """The lines of a text with `nan` in each empty cell."""
+    if separator == " ":
+        return text
+    for empty in (f"{separator}{separator}", f"{separator} {separator}"):
+        while empty in text:
+            text = text.replace(empty, f"{separator}nan{separator}")
+    for blank in (" ", "\r"):
+        if f"{separator}{blank}\n" in text:
+            text = text.replace(f"{separator}{blank}\n", f"{separator}\n")
+    text = text.replace(f"{separator}\n", f"{separator}nan\n").replace(f"\n{separator}", f"\nnan{separator}")
+    return ("nan" if text.startswith(separator) else "") + text + ("nan" if text.endswith(separator) else "")
 
 
 def _unquoted(cell: str) -> str | None:

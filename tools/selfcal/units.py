@@ -51,6 +51,7 @@ _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
     "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
     "m": (_dimension(length=1), 1.0),
+    "mm": (_dimension(length=1), 1e-3),
     "s": (_TIME, 1.0),
     "ms": (_TIME, 1e-3),
     "us": (_TIME, 1e-6),
@@ -75,8 +76,8 @@ _ZERO = {"degC": 273.15}
 
 #: What a recording's header may say, for error messages.
 RECORDING_UNITS = (
-    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "g", "mg", "ug", LSB, "degC", "K", "V", "mV",
-    "s", "ms", "us", "ns",
+    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "mm/s^2", "g", "mg", "ug", LSB, "degC", "K",
+    "V", "mV", "s", "ms", "us", "ns",
 )  # fmt: skip
 
 
@@ -94,12 +95,29 @@ _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d
 #: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
 _LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
 #: Signs that a data sheet has, as this module writes them.
-_SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u"})
+_SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "·": " "})
+#: A power without its sign, `s-1`, `s2`, and factors with blanks or stars between them.
+_POWER, _FACTORS = re.compile(r"(?<=[a-zA-Z])(-?\d)(?![\w.])", re.ASCII), re.compile(r"\s*[\s*]\s*")
 
 
 def plain(name: str) -> str:
-    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²` -> `m/s^2`; what it does not know stays."""
-    return name.translate(_SIGNS)
+    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`; other texts stay."""
+    spelled = name.strip().translate(_SIGNS)
+    if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
+        return spelled
+    product = _FACTORS.sub("*", _POWER.sub(r"^\1", spelled.replace("^", "")))
+    try:
+        meant = parse(product)
+    except UserError:
+        return spelled
+    return next(
+        (
+            one
+            for one in RECORDING_UNITS
+            if one != LSB and (same := parse(one)).dimension == meant.dimension and same.size == meant.size
+        ),
+        product,
+    )
 
 
 @cache

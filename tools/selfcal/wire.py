@@ -10,6 +10,7 @@ import errno
 import logging
 import math
 import os
+import shlex
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.dbc_file import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
-from selfcal.errors import UserError
+from selfcal.errors import UserError, called
 from selfcal.model import Model
 from selfcal.result import AxisResult, Estimate
 
@@ -833,7 +834,7 @@ def _check_port(interface: str, channel: str) -> None:
         raise UserError(f"{interface} {channel}: there is no such port ({serial_ports()})")
     if not path.is_char_device():
         kind = "a folder" if path.is_dir() else "a file"
-        more = f"; `selfcal monitor --read {name}` reads a log of frames" if path.is_file() else ""
+        more = f"; `{called()} monitor --read {shlex.quote(name)}` reads a log of frames" if path.is_file() else ""
         raise UserError(f"{interface} {channel}: this is {kind}, no serial port ({serial_ports()}){more}")
 
 

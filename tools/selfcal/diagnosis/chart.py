@@ -336,9 +336,10 @@ def _rows(panel: Panel, name: str, x: Array, columns: list[tuple[str, Array]]) -
     return scrolled(f"{name}, {panel.title}", caption, table)
 
 
-def scrolled(name: str, caption: str, rows: str) -> str:
-    """A table that scrolls by itself on a narrow screen, with the keyboard too. `rows`: its head and body, HTML."""
+def scrolled(name: str, caption: str, rows: str, look: str = "") -> str:
+    """A table that scrolls by itself on a narrow screen, with the keyboard too. `rows`: its head and body, HTML;
+    `look`: more classes of its style."""
     return (
-        f'<div class=scroll tabindex=0 role=group aria-label="{escape(name)}">'
+        f'<div class="{f"scroll {look}".strip()}" tabindex=0 role=group aria-label="{escape(name)}">'
         f"<table><caption><span>{escape(caption)}</span></caption>{rows}</table></div>"
     )

@@ -65,7 +65,7 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     tree["simulate"] = {
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
-        "axes": {name: _truth(one) for name, one in found.items()},
+        "axes": {name: fitted_law(one) for name, one in found.items()},
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
@@ -193,7 +193,7 @@ def _color(tree: dict[str, Any], one: Diagnosed) -> None:
     _law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
 
 
-def _truth(one: Diagnosed) -> dict[str, Any]:
+def fitted_law(one: Diagnosed) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias."""
     fit = one.state.best
     N = fit.sigma * math.sqrt(fit.dt)
@@ -294,8 +294,8 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
             yield look.cause, look.gain, {key: median[key] for key in ("frequency_hz", "amplitude")}
         elif look.cause == "outliers":
             yield look.cause, look.gain, {"fraction": median["fraction"]}
-        elif look.cause == "variance_change":  # the simulator's ratio is of variances
-            yield look.cause, look.gain, {"time_s": median["time_s"], "ratio": median["ratio"] ** 2}
+        elif look.cause == "variance_change":
+            yield look.cause, look.gain, {key: median[key] for key in ("time_s", "ratio")}
         elif look.cause == "motion":
             times = "+".join(f"{_seconds(a)}-{_seconds(b)}" for a, b in look.estimate["intervals"])
             yield look.cause, look.gain, {"intervals": times}

@@ -16,18 +16,26 @@ import yaml
 import selfcal
 from selfcal import units as unit_module
 from selfcal.diagnosis import pictures
-from selfcal.diagnosis.chart import Figure, draw, number, scrolled
+from selfcal.diagnosis.chart import Figure, draw, number, outside_of, scrolled
+from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.words import WORDS
 from selfcal.ending import Stopped
 from selfcal.output import write_text
+from selfcal.units import parameter_unit
 
 #: Bytes of the page without its style, at most.
 SIZE_MOST = 990_000
 LEFT_OUT = "<p>This picture is left out to keep the page small: ask for this axis alone with <code>--axis</code>.</p>"
-#: Findings told at the top of the page at most; the rest stand below.
+#: Findings with less than this share of the largest evidence of the page, or of their axis, are folded.
+FOLDED = 0.01
+#: Findings listed at the top of the page at most; the rest stand with their axes.
 TOP = 40
+#: Name of the figure that decides whether the Allan curve leaves its band, and the share of its points from which on it
+#: does. Each point of a fitting record lies outside the range of 20 with a probability of 2/21, and neighbours do so
+#: together: of 400 fitting records one had more than this share outside, nine more than a quarter.
+ALLAN, ALLAN_OUTSIDE = "Allan deviation", 0.35
 
 STYLE = """
 :root{color-scheme:light dark;--paper:#fff;--ink:#1b1f24;--soft:#555e68;--rule:#ccd2d9;--card:#f5f7f9;--blue:#0b4f9e;
@@ -81,6 +89,13 @@ caption span{display:inline-block;position:sticky;left:0;max-width:min(75ch,82vw
 th,td{border-bottom:1px solid var(--rule);padding:.25rem .7rem .25rem 0;text-align:left;vertical-align:top}
 thead th{border-bottom-width:2px}
 @media(max-width:600px){main>section>.scroll td{min-width:7.5rem}}
+.glance table{font-size:.85rem}.glance th,.glance td{padding:.12rem .8rem .12rem 0;white-space:nowrap}
+main>section>.glance td{min-width:0}.matrix caption{white-space:nowrap}
+.matrix td,.matrix thead th+th{text-align:right;min-width:2.6rem!important}
+@media(max-width:600px){h1{font-size:1.3rem;margin:.6rem 0 .2rem}h2{margin:1rem 0 .3rem}.glance table{font-size:.8rem}
+.glance th,.glance td{padding-right:.55rem}
+.matrix th,.matrix td{padding-right:.3rem}.matrix td,.matrix thead th+th{min-width:2.1rem!important}}
+summary h3{display:inline}
 pre{overflow-x:auto;background:var(--card);border:1px solid var(--rule);padding:10px;font-size:.85rem}
 code{font-size:.92em;overflow-wrap:anywhere}
 @media(max-width:600px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}.finding{padding:.2rem 10px 10px}}
@@ -127,10 +142,20 @@ def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagn
     axes = {axis: entry for axis, entry in document["axes"].items() if "error" not in entry}
     failed = {axis: str(entry["error"]) for axis, entry in document["axes"].items() if "error" in entry}
     sections: list[list[_Part]] = []
+    allan: dict[str, tuple[int, int]] = {}
     for k, (axis, entry) in enumerate(axes.items()):
-        sections.append(list(_axis(k, axis, entry, found[axis])))
+        unit = str(entry["unit"])
+        one = found[axis]
+        overview: Sequence[Figure]
+        own: Sequence[Sequence[Figure]]
+        try:
+            overview, own = pictures.figures(one, one.record, unit_module.factor(one.state.unit, unit), unit)
+        except Stopped:
+            overview, own = [], [[] for _ in one.findings]
+        allan[axis] = _allan_after(overview)
+        sections.append(list(_axis(k, axis, entry, one, overview, own, allan[axis])))
     rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, options), *_reading()]
-    parts = [_Part(text) for text in (*_summary(axes, failed), *_contents(axes))]
+    parts = [_Part(text) for text in (*_summary(axes, failed, found, allan), *_contents(axes))]
     parts += [part for section in sections for part in section]
     parts += [_Part(text) for text in rest]
     return _within(parts, SIZE_MOST)
@@ -181,7 +206,25 @@ def _cause(cause: str) -> str:
     return escape(cause.replace("_", " "))
 
 
-def _summary(axes: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> Iterator[str]:
+def _allan_after(figures: Sequence[Figure]) -> tuple[int, int]:
+    """Points of the Allan curve outside the band of the model as it ends, and points in all."""
+    for figure in figures:
+        if figure.name == ALLAN:
+            panel = figure.panels[-1]
+            return outside_of(panel.curves[0], panel.bands[0])
+    return 0, 0
+
+
+def _leaves(allan: tuple[int, int]) -> bool:
+    return allan[0] > ALLAN_OUTSIDE * allan[1]
+
+
+def _summary(
+    axes: Mapping[str, Mapping[str, Any]],
+    failed: Mapping[str, str],
+    found: Mapping[str, Diagnosed],
+    allan: Mapping[str, tuple[int, int]],
+) -> Iterator[str]:
     bad = [name for name, entry in axes.items() if entry["verdict"] != "adequate"]
     good = [name for name in axes if name not in bad]
     yield "<section aria-labelledby=findings><h2 id=findings>What was found</h2>"
@@ -198,14 +241,108 @@ def _summary(axes: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -
     for axis, error in failed.items():
         yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
     groups = _grouped(axes)
+    least = FOLDED * max((_strength(members) for members in groups), default=0.0)
+    strong = [members for members in groups if not _strength(members) < least]
+    if axes:
+        yield _matrix(axes, strong)
+        yield _noise(axes, found, allan)
     if groups:
         yield "<ol class=findings>"
-        for members in groups[:TOP]:
+        for members in strong[:TOP]:
             yield f"<li>{_told(members)}</li>"
         yield "</ol>"
-    if len(groups) > TOP:
-        yield f"<p>{len(groups) - TOP} weaker findings are told with their axes below.</p>"
+    weak = [*strong[TOP:], *groups[len(strong) :]]
+    if weak:
+        yield f"<details><summary>{len(weak)} weaker findings, each below {_whole(_strength(weak[0]) * 1.0001)} nats"
+        yield f" (folded from {FOLDED:.0%} of the largest on)</summary><ol class=findings>"
+        for members in weak:
+            yield f"<li>{_told(members)}</li>"
+        yield "</ol></details>"
     yield "</section>"
+
+
+def _strength(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> float:
+    return max(_nats(member[2]) for member in members)
+
+
+def _matrix(
+    axes: Mapping[str, Mapping[str, Any]], groups: Sequence[Sequence[tuple[str, int, Mapping[str, Any]]]]
+) -> str:
+    """Causes by axes: evidence, linked to the finding."""
+    if not groups:
+        return ""
+    cells: dict[str, dict[str, tuple[int, Mapping[str, Any]]]] = {}
+    for members in groups:
+        for axis, k, finding in members:
+            row = cells.setdefault(str(finding["cause"]), {})
+            if axis not in row or _nats(finding) > _nats(row[axis][1]):
+                row[axis] = (k, finding)
+
+    def cell(row: Mapping[str, tuple[int, Mapping[str, Any]]], axis: str) -> str:
+        if axis not in row:
+            return "<td class=soft>–</td>"
+        k, finding = row[axis]
+        nats = _nats(finding)
+        return f"<td><a href='#{_id(axis, k)}'>{f'{nats:.0f}' if 10.0 <= nats < 1e7 else number(nats, 2)}</a></td>"
+
+    heads = "".join(f"<th scope=col>{escape(axis)}</th>" for axis in axes)
+    body = "".join(
+        f"<tr><th scope=row>{_cause(cause)}</th>{''.join(cell(row, axis) for axis in axes)}</tr>"
+        for cause, row in cells.items()
+    )
+    table = f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody>"
+    return scrolled("Causes by axis", "Evidence of each cause, nats.", table, "glance matrix")
+
+
+def _noise(
+    axes: Mapping[str, Mapping[str, Any]], found: Mapping[str, Diagnosed], allan: Mapping[str, tuple[int, int]]
+) -> str:
+    """N, K and sigma_m of each axis under its likeliest law, beside the causes; the fit's where no report was made."""
+    rows = []
+    for axis, entry in axes.items():
+        known = entry.get("posterior")
+        if known and known.get("hypotheses"):
+            law, share = max(known["hypotheses"].items(), key=lambda one: one[1] or 0.0)
+            estimates = dict(known["parameters"].get(law, {}))
+            probability = number(float(share), 3)
+        else:
+            law, estimates = _fitted(found[axis], str(entry["unit"]))
+            probability = "fit"
+        cells = f"<th scope=row>{escape(axis)}</th><td>{escape(law.replace('_', ' '))}</td><td>{probability}</td>"
+        for name in ("N", "K", "sigma_m"):
+            cells += f"<td>{_interval(estimates.pop(name, None))}</td>"
+        outside, total = allan[axis]
+        sign = "<span class=bad>✗ leaves its band</span>: " if _leaves(allan[axis]) else ""
+        cells += f"<td>{sign}{outside} of {total} points outside</td>" if total else "<td>–</td>"
+        cells += f"<td>{'; '.join(f'{escape(name)} {_interval(one)}' for name, one in estimates.items()) or '–'}</td>"
+        rows.append(f"<tr>{cells}</tr>")
+    heads = "".join(
+        f"<th scope=col>{head}</th>"
+        for head in ("axis", "law", "P", "N", "K", "sigma_m", "Allan curve, after", "other")
+    )
+    table = f"<thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    caption = "Noise beside the causes, likeliest law: medians, 5 to 95 %."
+    return scrolled("Noise of each axis", caption, table, "glance")
+
+
+def _fitted(one: Diagnosed, unit: str) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The law of the diagnosis' own fit and its parameters in `unit`, without intervals."""
+    law = fitted_law(one)
+    factor = unit_module.factor(one.state.unit, unit)
+    return str(law["hypothesis"]), {
+        name: {"median": law[name] * (1.0 if name == "alpha" else factor), "unit": parameter_unit(name, unit)}
+        for name in ("N", "K", "sigma_m", "alpha")
+        if name in law
+    }
+
+
+def _interval(one: Mapping[str, Any] | None) -> str:
+    """A parameter with its 90 % interval, if it has one."""
+    if not one or one.get("median") is None:
+        return "–"
+    limits = f" ({number(one['q05'], 3)} to {number(one['q95'], 3)})" if one.get("q05") is not None else ""
+    sign = "" if one.get("identified", True) else "~"
+    return f"{sign}{number(one['median'], 3)}{limits} {escape(unit_module.typeset(str(one['unit'])))}"
 
 
 def _grouped(axes: Mapping[str, Mapping[str, Any]]) -> list[list[tuple[str, int, Mapping[str, Any]]]]:
@@ -243,6 +380,8 @@ def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
     text = f"<strong>{_cause(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
     if len(members) == 1 and first.get("inflation_words"):
         text += f" {escape(str(first['inflation_words']))}"
+    if first.get("record_next"):
+        text += f" <strong>Do:</strong> {escape(str(first['record_next']))}"
     return text
 
 
@@ -292,22 +431,31 @@ def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "</ul></nav>"
 
 
-def _axis(place: int, axis: str, entry: Mapping[str, Any], one: Diagnosed) -> Iterator[_Part]:
-    unit = str(entry["unit"])
+def _axis(
+    place: int,
+    axis: str,
+    entry: Mapping[str, Any],
+    one: Diagnosed,
+    overview: Sequence[Figure],
+    own: Sequence[Sequence[Figure]],
+    allan: tuple[int, int],
+) -> Iterator[_Part]:
     yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>")
     if entry.get("unfinished"):
         rate = number(entry["judged_at_hz"])
         yield _Part(f"<p><strong>Not finished.</strong> Judged at {rate} Hz; {escape(str(entry['unfinished']))}.</p>")
-    overview: Sequence[Figure]
-    own: Sequence[Sequence[Figure]]
-    try:
-        overview, own = pictures.figures(one, one.record, unit_module.factor(one.state.unit, unit), unit)
-    except Stopped:
+    if not overview:
         yield _Part("<p>There was no time left to draw its pictures.</p>")
-        overview, own = [], [[] for _ in one.findings]
+    if _leaves(allan):
+        yield _Part(
+            f"<p><strong>The Allan curve still leaves its band</strong> with the findings in the model: {allan[0]} of "
+            f"{allan[1]} points lie outside. The model does not describe these averaging times.</p>"
+        )
+    least = FOLDED * max((_nats(finding) for finding in entry["findings"]), default=0.0)
     for k, finding in enumerate(entry["findings"]):
         match = _match(finding, one.findings)
-        yield from _finding(_id(axis, k), finding, own[match] if match is not None else [])
+        shown = own[match] if match is not None else []
+        yield from _finding(_id(axis, k), finding, shown, folded=_nats(finding) < least)
     yield _Part("<h3>Whole record, measured against simulated</h3>")
     for figure in overview:
         yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}")
@@ -322,13 +470,15 @@ def _match(finding: Mapping[str, Any], candidates: Sequence[Finding]) -> int | N
     return min(same, key=lambda k: abs(candidates[k].look.gain - _nats(finding)))
 
 
-def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure]) -> Iterator[_Part]:
+def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure], *, folded: bool) -> Iterator[_Part]:
     words = f"<p>{escape(str(finding['words']))}</p>" if finding.get("words") else ""
     facts = "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in _facts(finding))
-    yield _Part(f"<div class=finding><h3 id={key}>{_cause(finding['cause'])}</h3>{words}<dl>{facts}</dl>")
+    heading = f"<h3 id={key}>{_cause(finding['cause'])}</h3>"
+    begin = f"<details class=finding><summary>{heading}</summary>" if folded else f"<div class=finding>{heading}"
+    yield _Part(f"{begin}{words}<dl>{facts}</dl>")
     for figure in shown:
         yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}", min(_nats(finding), 1e300))
-    yield _Part("</div>")
+    yield _Part("</details>" if folded else "</div>")
 
 
 def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -512,10 +662,13 @@ def _least(size: Mapping[str, Any]) -> str:
 
 def _reproduce(document: Mapping[str, Any], options: Options) -> Iterator[str]:
     def given(*left_out: str) -> str:
-        return "".join(f" {name} {shlex.quote(value)}" for name, value in options if name not in left_out)
+        wanted = [(name, value) for name, value in options if name not in left_out]
+        return "".join(f" {name} {shlex.quote(value)}" if value else f" {name}" for name, value in wanted)
 
-    log = shlex.quote(str(document["recording"]["path"]))
-    how_read = ("--rate", "--column", "--unit", "--scale")  # a simulated recording states all that
+    recording = document["recording"]
+    log = shlex.join(recording.get("paths", [recording["path"]]))
+    # A simulated recording states all that.
+    how_read = ("--rate", "--column", "--unit", "--scale", "--no-time", "--skip-bad")
     lines = [
         f"selfcal diagnose {log}{given()} --report report.html --json report.json --write-model extended.yaml",
         "selfcal simulate extended.yaml -o simulated.npz --seed 1",
@@ -540,6 +693,8 @@ def _reading() -> Iterator[str]:
         "the recording's own length, rate, gaps, lattice and limits. A model that fits leaves about one point in ten "
         "of a curve outside such a range.</p><p>Before: the model without the cause. After: the model with it. "
         "Residual innovations are the errors of predicting each sample from the earlier ones.</p>"
+        "<p>P is the probability of the law under the model with the findings in it. ~ before a number: the record "
+        "does not identify it. Fit: the most likely values without an interval, where no report was made.</p>"
         "<p>Evidence is in nats: 10 nats are odds of 22 000 to 1. Net of the search: less what the best of all the "
         "places looked at gains by chance.</p>"
     )

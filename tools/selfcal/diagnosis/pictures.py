@@ -14,10 +14,11 @@ from scipy.signal import detrend
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, envelope
 from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.loop import Diagnosed, Finding
-from selfcal.diagnosis.record import Record, bridged
+from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array
 from selfcal.diagnosis.statistics import simulated, whitened_of
+from selfcal.recording import bridged
 
 #: Simulated records a band is the range of.
 RECORDS = 20

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,13 +16,16 @@ from selfcal.errors import UserError
 from selfcal.model import Group, Model
 from selfcal.model import Regressor as Stated
 from selfcal.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
-from selfcal.recording import SIDE_CHANNELS, Recording
+from selfcal.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.regressors import columns_of, offered
+from selfcal.timebase import Clock
 
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000
 #: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
 BEYOND = 100.0
+#: Samples in a cell of the grid, on average, without which an axis is too slow for it.
+SLOWEST = 0.99
 
 
 @dataclass(frozen=True)
@@ -53,22 +56,25 @@ class Record:
         return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
 
 
-def of_recording(recording: Recording, model: Model, decimate: float | None = None) -> Record:
+def of_recording(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
     """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
     file states is in the model of each axis from the start. Stuck readings are left out. Where every axis holds its
     readings the record has the part's own rate; where some do, the repeats of those are left out.
 
     `decimate`, Hz: means of whole blocks at the rate nearest to it; a block of which half is missing is missing.
+    Without it the grid is that of the slowest of `axes`; an axis slower than the grid is left out.
     """
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
-    known = [name for name in model.axes if name in recording.columns and np.ptp(recording.columns[name].values) > 0.0]
+    known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
     recording, change = evened(recording)
-    recording, held_hz = thinned(recording, tuple(known))
-    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
-    at -= at[0]
-    block = 1 if decimate is None else max(1, round(recording.rate_hz / decimate))
-    n = (int(at[-1]) + 1) // block
+    recording, held_hz = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
+    clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
+    base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
+    block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
+    dt = block / base.rate_hz
+    begin = float(base.place[0])
+    n = int(base.place[-1] - begin + 1) // block
     if n < LEAST:
         raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
     if n > MOST:
@@ -76,34 +82,34 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST:,}: cut it at its gaps, or "
             "take a lower --decimate"
         )
-    index = at // block
-    kept = index < n
-    used = np.bincount(index[kept], minlength=n)
-    present = 2 * used >= block
 
-    def averaged(values: Array) -> tuple[Array, Array]:
-        """Means of the values that are there, NaN where fewer than half are, and samples a block over those used."""
-        there = kept & np.isfinite(values)
-        many = np.bincount(index[there], minlength=n)
-        mean = np.bincount(index[there], values[there], minlength=n) / np.maximum(many, 1)
-        enough = 2 * many >= block
-        return np.where(enough, mean, np.nan), np.where(enough, block / np.maximum(many, 1), 1.0)
-
-    def on_grid(values: Array) -> Array:
-        return averaged(values)[0]
+    def on_grid(clock: Clock, values: Array) -> tuple[Array, Array]:
+        """Means [n] of the values of a clock, NaN where half of a cell's samples are missing; samples of a cell over
+        those that are there [n]."""
+        expected = clock.rate_hz * dt
+        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
+        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
+        index = np.floor((clock.place + shift + 1e-6) / expected).astype(np.int64)
+        kept = (index >= 0) & (index < n) & np.isfinite(values)
+        used = np.bincount(index[kept], minlength=n)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(index[kept], values[kept], minlength=n) / used
+        present = 2 * used >= round(expected)
+        return np.where(present, mean, np.nan), np.where(present, round(expected) / np.maximum(used, 1), 1.0)
 
     def stated(name: str) -> tuple[Regressor, ...]:
         """The model file's regressors of an axis."""
         found: list[Regressor] = []
+        own = recording.along(name) if offered(model, name) else recording
         for one in offered(model, name):
-            values = columns_of((one,), recording)
+            values = columns_of((one,), own)
             entry = {
                 "column": one.column,
                 "frequency_hz": one.frequency_hz,
                 "time_s": one.time_s - recording.start_s,
             }
             for column, row in zip(one.columns, values.T, strict=True):
-                about = bridged(on_grid(np.ascontiguousarray(row))) - one.reference
+                about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.reference
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
         return tuple(found)
 
@@ -111,40 +117,48 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
     for name in known:
-        group = model.group_of(name)
-        if _beyond(recording.in_unit(name, group.unit), group):
+        clock, group = recording.clock_of(name), model.group_of(name)
+        values = recording.in_unit(name, group.unit)
+        if _beyond(values[np.isfinite(values)], group) or clock.rate_hz * dt < SLOWEST:
             continue
-        rows = None if held_hz is not None else own_rows(recording, name)
-        one = look(recording, name, group) if rows is not None else readings_of(recording, name, group)
-        if held_hz is not None:
+        whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
+        rows = own_rows(recording, name) if whole and held_hz is None else None
+        if rows is not None:
+            one = look(recording, name, group)
+        else:
+            one = readings_of(recording if whole else recording.along(name), name, group)
+            if not whole:
+                rows, clock = None, replace(one.recording.clock, start_s=clock.start_s)
+        if held_hz is not None and recording.columns[name].clock is None:
             one = replace(one, held_hz=held_hz)
+        each = round(clock.rate_hz * dt)
 
-        def spread(values: Array, rows: Rows | None = rows) -> Array:
+        def spread(values: Array, rows: Rows | None = rows, each: int = each) -> Array:
             if rows is None:
                 return values
             found = np.full(recording.samples, np.nan)
             found[rows] = values
-            return found if block == 1 else _held_on(found)
+            return found if each == 1 else _held_on(found)
 
-        y, r = averaged(spread(one.values if block == 1 else one.drawn))
+        y, r = on_grid(clock, spread(one.values if each == 1 else one.drawn))
         if np.isfinite(y).sum() < LEAST:
             continue
         read[name] = one
         found = one.lattice
         level = float(np.nanmedian(y))
-        if block == 1 and one.clipped is not None:
-            unclipped[name] = averaged(spread(one.drawn))[0] - level
+        if each == 1 and one.clipped is not None:
+            unclipped[name] = on_grid(clock, spread(one.drawn))[0] - level
         states[name] = State(
             axis=name,
             unit=group.unit,
             y=y - level,
-            dt=block / recording.rate_hz,
+            dt=dt,
             level=level,
             r=r,
             regressors=stated(name),
-            lsb=found.step if found is not None and block == 1 else 0.0,
+            lsb=found.step if found is not None and each == 1 else 0.0,
             stated_lsb=group.lsb,
-            redrawn=block > 1,
+            redrawn=each > 1,
             below_lattice=found is not None and found.too_coarse,
         )
     channels: dict[str, Array] = {}
@@ -153,16 +167,16 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if column in recording.columns:
             values = recording.in_unit(column, unit)
             if np.ptp(values) > 0.0:
-                channels[cause] = bridged(on_grid(values))
+                channels[cause] = bridged(on_grid(recording.clock, values)[0])
                 names[cause] = column
     return Record(
-        recording.rate_hz / block,
+        1.0 / dt,
         states,
         channels,
         names,
-        present,
-        recording.lost,
-        recording.rate_hz,
+        np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0]),
+        int(base.missing_before.sum()) - recording.moving,
+        base.rate_hz,
         read,
         change,
         unclipped,
@@ -179,11 +193,21 @@ def _held_on(values: Array) -> Array:
 def why_left_out(recording: Recording, model: Model, name: str) -> str:
     """Why an axis that was asked for is not in the record."""
     group = model.group_of(name)
-    if _beyond(recording.in_unit(name, group.unit), group):
+    values = recording.in_unit(name, group.unit)
+    if _beyond(values[np.isfinite(values)], group):
         return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
-    if np.ptp(recording.columns[name].values) > 0.0:
+    own = recording.clock_of(name).rate_hz
+    if own < SLOWEST * recording.rate_hz:
+        return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
+    if _varies(values):
         return "too few of its readings are none that stick or are clipped"
     return "every reading is the same"
+
+
+def _varies(values: Array) -> bool:
+    """Whether not all values that are there are one."""
+    there = values[np.isfinite(values)]
+    return bool(there.size and np.ptp(there) > 0.0)
 
 
 def _beyond(values: Array, group: Group) -> bool:
@@ -200,15 +224,6 @@ def _cause(one: Stated, model: Model) -> str:
 
 def _channel(column: str) -> str:
     return next((cause for cause, (name, _) in SIDE_CHANNELS.items() if name == column), "")
-
-
-def bridged(values: Array) -> Array:
-    """Missing values by straight lines."""
-    good = np.isfinite(values)
-    if good.all():
-        return values
-    where = np.arange(values.size)
-    return np.interp(where, where[good], values[good])
 
 
 def smoothed(values: Array, window: int) -> Array:

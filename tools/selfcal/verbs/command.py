@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import secrets
+import shlex
 import struct
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal.dbc_file import NODE_IDS, NODES
-from selfcal.errors import UserError
+from selfcal.errors import UserError, called
 from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of, open_bus, serial_ports
 
 if TYPE_CHECKING:
@@ -82,8 +83,9 @@ def read_key(path: Path | str) -> bytes:
     try:
         key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
     except FileNotFoundError as error:
+        make = f"{called()} command new-key --key {shlex.quote(str(path))}"
         raise UserError(
-            f"{path}: there is no such key; --key names the module's, `selfcal command new-key --key {path}` makes one"
+            f"{path}: there is no such key; --key names the module's, `{make}` makes one"
         ) from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the key: {error.strerror}") from error

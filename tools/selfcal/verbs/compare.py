@@ -14,7 +14,7 @@ from rich.table import Table
 
 from selfcal.document import check_writable, write_json
 from selfcal.ending import Held
-from selfcal.errors import UserError, printable
+from selfcal.errors import UserError, called, printable
 from selfcal.fail_on import CHANGED, check
 from selfcal.result import HALF_90
 from selfcal.verbs.diagnose import diagnose
@@ -47,7 +47,7 @@ def compare(
     Raises UserError for fewer than two recordings, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
-        raise UserError("compare takes two recordings or more of one part: selfcal compare A B")
+        raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
     check_writable(json, inputs=(*logs, model))
     seen = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.dbc_file import NODES
-from selfcal.errors import UserError
+from selfcal.errors import UserError, called
 from selfcal.model import Model
 from selfcal.recording import load
 from selfcal.verbs.identify import chosen_axes
@@ -52,6 +52,7 @@ def demo(
     model = Model.load()
     recording = load(path)
     names = chosen_axes(recording, model, ())
+    recording = recording.along(*names)
     with Console(stderr=True).status("building the firmware"):
         firmware = build(model, recording.rate_hz, names)
     more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]
@@ -70,7 +71,7 @@ def demo(
             if wire:
                 print(
                     f"{recording.path}: {recording.duration_s:g} s, {speed:g} times real time\n"
-                    f"watch it by:  selfcal monitor {watch.format(wire)}\nCtrl-C ends it",
+                    f"watch it by:  {called()} monitor {watch.format(wire)}\nCtrl-C ends it",
                     flush=True,
                 )
             try:

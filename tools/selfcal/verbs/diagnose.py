@@ -24,7 +24,7 @@ from selfcal.fail_on import check
 from selfcal.model import Model
 from selfcal.output import write_text
 from selfcal.progress import Doing
-from selfcal.recording import Recording, Scale, load
+from selfcal.recording import Recording, Scale, list_of, load
 from selfcal.table import since
 from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
 
@@ -37,7 +37,7 @@ PATIENCE_S = 0.3
 
 
 def diagnose(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -54,6 +54,8 @@ def diagnose(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
@@ -72,18 +74,17 @@ def diagnose(
     check(fail_on)
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
-    check_writable(json, report, write_model, inputs=(log, model))
+    check_writable(json, report, write_model, inputs=(*list_of(log), model))
     loaded = Model.load(model)
-    recording = stretch_of(
-        load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale), loaded, start_s, end_s, gate
-    )
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = stretch_of(recording, loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
-        record = of_recording(recording, loaded, decimate)
+        record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            first = _look(of_recording(recording, loaded, FIRST_HZ), names, ending, doing)
+            first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
             _show_first(recording, first)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
         found = _joined(names, first, seen)
@@ -110,7 +111,7 @@ def diagnose(
                 from selfcal.diagnosis.page import write_page
 
                 doing.now("pictures")
-                given = _given(axes, model, decimate, rate, columns, units, scale)
+                given = _given(axes, model, decimate, recording)
                 write_page(report, document, record, found, given)
     if json is not None:
         write_json(document, json)
@@ -202,25 +203,13 @@ def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] 
 
 
 def _given(
-    axes: Sequence[str],
-    model: Path | str | None,
-    decimate: float | None,
-    rate: float | None,
-    columns: Mapping[str, str] | None,
-    units: Mapping[str, str] | None,
-    scale: Mapping[str, Scale] | None,
+    axes: Sequence[str], model: Path | str | None, decimate: float | None, recording: Recording
 ) -> list[tuple[str, str]]:
     """The command line's options that decide what is found, as they were given."""
     given = [("--axis", name) for name in axes]
     given += [] if model is None else [("--model", str(model))]
-    for option, value in (("--decimate", decimate), ("--rate", rate)):
-        given += [] if value is None else [(option, f"{value:.15g}")]
-    for option, pairs in (("--column", columns), ("--unit", units)):
-        given += [(option, f"{name}={value}") for name, value in (pairs or {}).items()]
-    for name, (size, unit) in (scale or {}).items():
-        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
-        given.append(("--scale", f"{name}={text}" if name else text))
-    return given
+    given += [] if decimate is None else [("--decimate", f"{decimate:.15g}")]
+    return [*given, *recording.options]
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

@@ -26,7 +26,7 @@ from selfcal.gate import gated
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
 from selfcal.readings import look
-from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.recording import Recording, Scale, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
@@ -44,7 +44,7 @@ SLOW = ("flicker", "colored_noise", "ramp", "step")
 
 
 def identify(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -64,6 +64,8 @@ def identify(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
@@ -79,7 +81,7 @@ def identify(
     UserError for what the user can put right, and if no axis has a result.
     """
     check(fail_on)
-    check_writable(json, plot, None if export is None else export[1], inputs=(log, model))
+    check_writable(json, plot, None if export is None else export[1], inputs=(*list_of(log), model))
     if plot is not None:
         check_picture(plot)
     if export is not None and export[0] not in FORMS:
@@ -93,9 +95,8 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    recording = stretch_of(
-        load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale), loaded_model, start_s, end_s, gate
-    )
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = stretch_of(recording, loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
@@ -204,6 +205,7 @@ def identify_axis(
     """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
     is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
     `advance` is called after each. `draw`: with the Allan deviation of the samples."""
+    recording = recording.along(name)
     group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
     readings = look(recording, name, group)

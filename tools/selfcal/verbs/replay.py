@@ -24,15 +24,15 @@ from rich.console import Console
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_readings
 from selfcal.dbc_file import HYPOTHESES
-from selfcal.document import Identified, check_writable, to_document, write_json
+from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
 from selfcal.ending import held
-from selfcal.errors import OutsidePriors, UserError, note
+from selfcal.errors import OutsidePriors, UserError, called, note
 from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
 from selfcal.readings import look
-from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, load
+from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, list_of, load
 from selfcal.regressors import (
     Choice,
     Inclusion,
@@ -90,7 +90,7 @@ TARGETS = {
 
 
 def replay(
-    log: Path | str,
+    log: Path | str | Sequence[Path | str],
     *,
     axes: Sequence[str] = (),
     model: Path | str | None = None,
@@ -108,6 +108,8 @@ def replay(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
@@ -133,7 +135,7 @@ def replay(
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
     if plot is not None:
         check_picture(plot)
-    check_writable(json, plot, inputs=(log, model, start))
+    check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
     known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
@@ -141,11 +143,13 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale).between(start_s, end_s)
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = recording.between(start_s, end_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))
     recording = replace(recording, start_s=0.0)  # as the firmware has it
     names = chosen_axes(recording, loaded_model, axes)
+    recording = recording.along(*names)
     for name in names:
         if loaded_model.group_of(name).unit != axis_unit(name):
             raise UserError(
@@ -451,6 +455,7 @@ def _document(
             found[name] = error
     with_reasons(found, recording, model)
     document = to_document(recording, found)
+    again = f"{called()} diagnose {as_typed(document['recording'])}"
     for name, axis in document["axes"].items():
         axis["module_reason"] = why.get(name)
         if "error" not in axis:
@@ -460,7 +465,7 @@ def _document(
             if told is not None and told.change is not None and told.state != "inadequate":
                 note(f"{name}: the module says {told.change}; the checks here look at the record as one")
             if told is not None and told.state == "inadequate":
-                note(f"{name}: the module says {told}; why, and what mends it: selfcal diagnose {recording.path}")
+                note(f"{name}: the module says {told}; why, and what mends it: {again}")
     if gate:
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
@@ -469,6 +474,7 @@ def _document(
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
     """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
+    recording = recording.along(name)
     regressors = offered(model, name)
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))
     group, unit = model.group_of(name), recording.columns[name].unit

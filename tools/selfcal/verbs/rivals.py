@@ -64,6 +64,8 @@ def rivals(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | None = None,
+    no_time: bool = False,
+    skip_bad: bool = False,
 ) -> dict[str, Any]:
     """Run the library and every other method of `selfcal.methods` on the same block means of each axis.
 
@@ -76,7 +78,7 @@ def rivals(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded = Model.load(model)
-    recording = load(log, rate=rate, columns=columns or {}, units=units or {}, scale=scale)
+    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     names = chosen_axes(recording, loaded, axes)
     found: dict[str, Any] = {}
     console = Console(stderr=True)
@@ -183,6 +185,7 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
     laws = tuple(law for law in model.hypotheses if law in PLAIN)
     if not laws:
         raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
+    recording = recording.along(name)
     group = model.group_of(name)
     tables = make_tables(replace(model, regressors=()), recording.rate_hz, (name,), bank_rate_hz=decimate)
     samples = as_float(recording.in_unit(name, group.unit))

@@ -67,7 +67,7 @@ _EFFECTS: dict[str, dict[str, _Key]] = {
     "outliers": {"fraction": _Key("outlier_fraction", lambda s: 0.005)},
     "variance_change": {
         "time_s": _Key("variance_time_s", lambda s: s.duration_s / 2.0),
-        "ratio": _Key("variance_ratio", lambda s: 4.0),
+        "ratio": _Key("noise_ratio", lambda s: 2.0),
     },
     "saturation": {"limit": _Key("range", lambda s: abs(s.bias) + s.sd)},
     "motion": {

@@ -214,6 +214,7 @@ def _means(recording: Recording, model: Model, name: str) -> Floats:
     """Means of 1 s of a recorded axis, NaN where there is none."""
     from selfcal.blocks import usable_blocks
 
+    recording = recording.along(name)
     group = model.group_of(name)
     if not (same_kind(group.unit, "rad/s") or same_kind(group.unit, "m/s^2")):
         raise UserError(f"{recording.path}: {name}: worth takes gyros and accelerometers; choose with --axis")

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import binom
 
-from selfcal.diagnosis.record import bridged
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statemodel import Array, Mask
+from selfcal.recording import bridged
 
 #: Length of a block, s; with fewer samples than `BLOCK_LEAST` in it each sample is a block: no median leaves one out.
 BLOCK_S, BLOCK_LEAST = 0.25, 5

@@ -1,0 +1,204 @@
+"""The clock of a recording's columns: from time stamps, or from the places of their samples, to an even grid with gaps.
+
+Stamps may be coarse or fine (`sampling.py`), come in bursts, or be those of a 32-bit counter that wraps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.errors import UserError
+from selfcal.limits import LEAST_RATE_HZ, LONGEST, MOST_RATE_HZ
+from selfcal.sampling import Ambiguous, sampling
+
+#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
+_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
+#: Span of a 32-bit counter of microseconds, of milliseconds, s.
+_WRAPS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
+#: Median steps that a wrap may lie in a gap of.
+_WRAP_GAP = 1000.0
+#: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
+#: median of two rows or more.
+_OWN_SHARE, _OWN_NEAR = 0.6, 0.3
+#: Stamps come in bursts where so many steps are shorter than this share of the mean one, and bursts there must be.
+_SHORT_SHARE, _SHORT, _BURSTS = 0.3, 0.45, 20
+#: Mean steps, times the samples of a burst, by which stamps in bursts may stray from a steady count; bursts' distances
+#: beyond which there is a gap.
+_STRAY, _BURST_GAP = 5.0, 8.0
+
+#: Raises UserError for a row and what is wrong there.
+Fail = Callable[[int, str], NoReturn]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When n samples were taken: an even grid of `rate_hz` that begins `start_s` after the recording does.
+
+    `missing_before` int64[n]: samples missing just before each. `off_grid_s` float64[n]: stamp minus grid, s; None
+    without stamps.
+    """
+
+    rate_hz: float
+    missing_before: NDArray[np.int64]
+    off_grid_s: NDArray[np.float64] | None = None
+    start_s: float = 0.0
+
+    @property
+    def place(self) -> NDArray[np.int64]:
+        """int64[n]: place on the grid of each sample, the missing ones counted."""
+        return np.arange(self.missing_before.size) + np.cumsum(self.missing_before)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """float64[n]: time of each sample on the grid since the recording's first, s."""
+        return self.start_s + self.place / self.rate_hz
+
+    def of_rows(self, rows: NDArray[np.int64], begin_s: float) -> Clock:
+        """The clock of these samples of it, in a recording that begins `begin_s` later."""
+        place = self.place[rows]
+        missing = np.diff(place, prepend=place[0] - 1 if place.size else 0) - 1
+        off_grid = None if self.off_grid_s is None else self.off_grid_s[rows]
+        start = float(self.time_s[rows[0]]) - begin_s if rows.size else self.start_s
+        return Clock(self.rate_hz, missing, off_grid, start)
+
+    def alike(self, other: Clock) -> bool:
+        """Whether both are one clock."""
+        return (
+            abs(self.rate_hz / other.rate_hz - 1.0) < 1e-6
+            and abs(self.start_s - other.start_s) * self.rate_hz < 0.01
+            and np.array_equal(self.missing_before, other.missing_before)
+        )
+
+
+def unwrapped(time: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    """Stamps [n], s from the first, with the wraps of a 32-bit counter undone, and their number."""
+    back = np.flatnonzero(np.diff(time) < 0.0)
+    if not back.size or time.size < 3:
+        return time, 0
+    steps = np.diff(time)
+    most = _WRAP_GAP * float(np.median(np.abs(steps)))
+    for span in _WRAPS:
+        if ((steps[back] + span > 0.0) & (steps[back] + span <= min(most, 0.5 * span))).all():
+            turns = np.zeros(time.size)
+            turns[back + 1] = span
+            return time + np.cumsum(turns), int(back.size)
+    return time, 0
+
+
+def has_own_clock(rows: NDArray[np.int64]) -> bool:
+    """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
+    if rows.size < 3:
+        return False
+    steps = np.diff(rows)
+    middle = float(np.median(steps))
+    near = np.abs(steps - middle) <= _OWN_NEAR * middle
+    return middle >= 2.0 and float(near.mean()) >= _OWN_SHARE
+
+
+def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
+    """The clock of samples in these rows of a table without stamps, whose rows come at `rate`, Hz."""
+    every = max(1, round(float(np.median(np.diff(rows))))) if has_own_clock(rows) else 1
+    place = np.rint((rows - rows[0]) / every).astype(np.int64)
+    return Clock(rate / every, np.maximum(np.diff(place, prepend=-1) - 1, 0), None, float(rows[0]) / rate)
+
+
+def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
+    """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
+    states it. Raises UserError, by `fail` for a row."""
+    start, time = float(time[0]), time - time[0]
+    if not np.isfinite(time[-1]):
+        raise UserError(f"{path}: column 't' spans more than a number can hold")
+    found, missing = _sampling(path, time, noise_s, rate, fail)
+    if rate is not None and (not 0.9 < found / rate < 1.1 or 2 * np.count_nonzero(missing) > missing.size):
+        raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
+    rate = found if rate is None else rate
+    if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
+        what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
+        raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
+    off_grid = time - (np.arange(time.size) + np.cumsum(missing) - missing[0]) / rate
+    return Clock(rate, missing, off_grid, start)
+
+
+def _sampling(
+    path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
+) -> tuple[float, NDArray[np.int64]]:
+    """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
+    steps = np.diff(time)
+    if (steps < 0.0).any():
+        fail(int(np.argmax(steps < 0.0)) + 1, "time runs backwards")
+    repeats = steps == 0.0
+    few = time.size < _REPEATS_FROM or np.count_nonzero(repeats) < _REPEATS_LEAST * time.size
+    if repeats.any() and (few or repeats.all()):
+        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+    bursts = _bursts(time, steps, rate)
+    if bursts is not None and not repeats.any():
+        return bursts
+    try:
+        dt, missing = sampling(time, noise_s, rate)
+    except Ambiguous as error:
+        if bursts is not None:
+            return bursts
+        raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
+    if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
+        if bursts is not None:
+            return bursts
+        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+    if not 0.0 < dt < math.inf or not time[-1] / dt < LONGEST:
+        raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
+    return float(f"{1.0 / dt:.10g}"), missing
+
+
+def _bursts(
+    time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None
+) -> tuple[float, NDArray[np.int64]] | None:
+    """Rate and missing_before of samples that arrive in bursts and are stamped on arrival; None for other stamps.
+
+    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
+    """
+    if time.size < 3 * _BURSTS:
+        return None
+    mean = float(np.median(_window_means(time)))
+    short = steps < _SHORT * mean
+    starts = np.flatnonzero(steps > mean) + 1
+    if short.mean() < _SHORT_SHARE or starts.size < _BURSTS:
+        return None
+    size = time.size / (starts.size + 1)
+    apart = float(np.median(np.diff(time[starts])))
+    cuts = np.flatnonzero(steps > _BURST_GAP * apart) + 1
+    edges = np.concatenate(([0], cuts, [time.size]))
+    index = np.arange(time.size, dtype=np.float64)
+    dt = _common_slope(index, time, edges) if rate is None else 1.0 / rate
+    left = time - index * dt
+    levels = []
+    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = left[begin:end]
+        if float(np.ptp(part)) > _STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt):
+            return None
+        # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
+        reach = max(1, round(10.0 * size))
+        levels.append((float(part[:reach].min()), float(part[-reach:].min())))
+    missing = np.zeros(time.size, np.int64)
+    for cut, before, after in zip(cuts.tolist(), levels[:-1], levels[1:], strict=True):
+        missing[cut] = max(0, round((after[0] - before[1]) / dt))
+    return float(f"{1.0 / dt:.10g}"), missing
+
+
+def _window_means(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean steps over windows of a twentieth of the record: gaps are in few of them."""
+    at = np.linspace(0, time.size - 1, 21).astype(int)
+    return np.asarray(np.diff(time[at]) / np.diff(at))
+
+
+def _common_slope(index: NDArray[np.float64], time: NDArray[np.float64], edges: NDArray[np.int64]) -> float:
+    """The slope of `time` against `index` by least squares, with a level of its own between any two `edges`."""
+    part = np.repeat(np.arange(edges.size - 1), np.diff(edges))
+    count = np.bincount(part)
+    x = index - (np.bincount(part, index) / count)[part]
+    y = time - (np.bincount(part, time) / count)[part]
+    return float(x @ y / (x @ x))
