@@ -128,9 +128,10 @@ def rate_change(time: NDArray[np.float64]) -> tuple[int, float, float, float] | 
     if apart < _CHANGE or apart < 6.0 * scatter or abs(means - (after - before)) > 0.3 * apart:
         return None
     first, last = max(0, (at - 2) * size), min(n - 1, (at + 2) * size + _STEPS)
-    # The bend: farthest from the line of the mean interval.
-    line = time[first : last + 1] - 0.5 * (math.exp(before) + math.exp(after)) * np.arange(last + 1 - first)
-    row = first + int(np.argmax(line) if before > after else np.argmin(line))
+    # The bend: farthest from the line of the mean interval, gaps left out.
+    mean_step, each = 0.5 * (math.exp(before) + math.exp(after)), np.diff(time[first : last + 1])
+    line = np.cumsum(np.where(each < 1.5 * math.exp(max(before, after)), each - mean_step, 0.0))
+    row = first + 1 + int(np.argmax(line) if before > after else np.argmin(line))
     exact = [_mean_step(part, math.exp(level)) for part, level in ((time[: row + 1], before), (time[row:], after))]
     return row, exact[0], exact[1], min(1e6, 0.5 * n * apart**2 / max(scatter, 1e-3) ** 2)
 

@@ -144,8 +144,10 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None
         read = codes[np.isfinite(codes)].astype(np.int64)
         odd = int((read & 1).sum())
         if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
-            # A code that never comes leaves its readings to others.
-            found["equal_readings"] = sum(equal) / math.sqrt(n)
+            # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
+            apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
+            same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
+            found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
             found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
     return found
 
