@@ -6,18 +6,21 @@ A unit that is picked up leaves a gap with the step in it. Truth: the numbers th
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.diagnosis.causes import step
+from selfcal.diagnosis.causes import noise, periodic, step
+from selfcal.diagnosis.fit import Series, finish, run
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array
+from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.verbs.diagnose import diagnose
 
-from conftest import case_records
+from conftest import case_records, shared_case
 
 #: Rates, Hz, and gaps, s, of the records of each kind, and their samples beside the gap.
 GRID = [(rate, gap) for rate in (1.0, 10.0, 100.0) for gap in (1.0, 10.0, 100.0)]
@@ -84,3 +87,85 @@ def test_a_step_beside_a_gap(place: str) -> None:
     print(f"time of a step {place}: {sum(times)} of {len(times)}")
     # A step far above the noise lies between two readings: its interval is a normal's and holds 95 % of these.
     assert binom.cdf(sum(times), len(times), 0.9) > 1e-3
+
+
+@pytest.mark.parametrize("place", ["in the gap", "before", "after"])
+def test_a_change_of_the_noise_beside_a_gap(place: str) -> None:
+    random = np.random.default_rng(396 + len(place))
+    times: list[bool] = []
+    ratios: list[bool] = []
+    for k in range(case_records(9, 180)):
+        rate, gap = GRID[k % len(GRID)]
+        t, y, begin, end, _ = drawn(random, rate, gap)
+        time = {
+            "in the gap": random.uniform(t[begin - 1], t[end]),
+            "before": t[begin] - 50.0 / rate,
+            "after": t[end] + 50.0 / rate,
+        }[place]
+        ratio = float(random.choice([0.6, 0.75, 1.3, 1.7]))
+        white = random.standard_normal(t.size) * np.where(t >= time, ratio, 1.0)
+        y = white + math.exp(random.uniform(-4.5, -2.5)) * random.standard_normal(t.size).cumsum()
+        y[begin:end] = np.nan
+        look = looked(y, rate, noise.variance_change)
+        assert look is not None
+        times.append(holds(look.estimate["time_s"], time))
+        ratios.append(holds(look.estimate["ratio"], ratio))
+    judge(f"ratio of a change {place}", ratios)
+    print(f"time of a change {place}: {sum(times)} of {len(times)}")
+    assert binom.cdf(sum(times), len(times), 0.9) > 1e-3
+
+
+def test_a_line_across_a_gap() -> None:
+    """25 to 150 nats; the gap turns the phase by many turns."""
+    random = np.random.default_rng(397)
+    sizes: list[bool] = []
+    frequencies: list[bool] = []
+    for k in range(case_records(9, 180)):
+        rate, gap = GRID[k % len(GRID)]
+        t, y, begin, end, _ = drawn(random, rate, gap)
+        frequency = float(random.uniform(0.02, 0.45)) * rate
+        size = math.sqrt(4.0 * random.uniform(25.0, 150.0) / SAMPLES[rate])
+        y += size * np.sin(2.0 * math.pi * frequency * t + random.uniform(0.0, 6.28))
+        y[begin:end] = np.nan
+        look = looked(y, rate, periodic.looks)
+        assert look is not None
+        sizes.append(holds(look.estimate["amplitude"], size))
+        frequencies.append(holds(look.estimate["frequency_hz"], frequency))
+    judge("amplitude of a line across a gap", sizes)
+    judge("frequency of a line across a gap", frequencies)
+
+
+def test_the_scan_is_the_fit_at_every_place() -> None:
+    """Score and information of a step by the backward pass against a fit with its column: at the ends of a gap and in
+    it, where the noise changes, at the start. Both are sums of the same products: 1e-9."""
+    random = np.random.default_rng(3)
+    n = 500
+    r = np.where(np.arange(n) < 280, 1.0, 2.5)
+    for terms, theta in (
+        (Terms(walk=True), [-3.0]),
+        (Terms(markov=True, color="ma"), [-1.0, -3.0, 0.3]),
+        (Terms(walk=True, flicker=True, color="ar", bands=((0.1, 0.01, -0.5),)), [-3.0, -2.0, 0.4]),
+    ):
+        y = random.standard_normal(n) + 0.05 * random.standard_normal(n).cumsum()
+        y[100:130] = y[400] = np.nan
+        series = Series(y, 1.0, r, np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)]))
+        fit = finish(series, terms, np.array(theta))
+        scan = step.scan(series, fit)
+        for place in (20, 99, 100, 115, 130, 279, 280, 399, 400, 401, 450):
+            column = (np.arange(n) >= place).astype(np.float64)
+            c, inverse, _ = run(series.beside(column), terms, fit.theta)[0][0].coefficients()
+            assert scan.B[place] / scan.A[place] == pytest.approx(c[-1], rel=1e-9)
+            assert scan.A[place] * fit.sigma**2 * inverse[-1, -1] == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("gap", ["9", "70"])
+def test_the_case_of_a_unit_that_was_picked_up(gap: str, tmp_path: Path) -> None:
+    """Truth: 0.513, put in at the gap's beginning."""
+    found = diagnose(shared_case("S01_step_across_gap.py", tmp_path, gap), axes=["ax"], decimate=1.0)["axes"]["ax"][
+        "findings"
+    ]
+    (finding,) = (each for each in found if each["cause"] == "step")
+    size, time = finding["estimate"]["amplitude"], finding["estimate"]["time_s"]
+    assert abs(size["median"] - 0.513) < 3.0 * size["sd"]
+    assert 1199.0 < time["q05"] < time["q95"] < 1201.0 + float(gap)
+    assert {each["cause"] for each in found} == {"step", "missing_samples"}

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.stats import binom
 
 from selfcal.diagnosis.state import NET_LEAST, Look, State
@@ -83,8 +83,10 @@ def loud(state: State, rate_hz: float) -> Moved | None:
         sizes.append(bridged(spread))
         rough = np.maximum(rough, _over(sizes[1], around, state.lsb))
     away = np.max([_over(size, around, state.lsb) for size in sizes], axis=0)
-    far = known & (away > LOUD)
-    runs = _runs(far, max(2, round(APART_S * rate_hz / block)))
+    apart = max(2, round(APART_S * rate_hz / block))
+    # Still blocks on another level, before a jump or behind it, are no part of a stretch.
+    far = known & (away > LOUD) & maximum_filter1d(rough > LOUD, 2 * apart + 1)
+    runs = _runs(far, apart)
     chance = max(1, len(runs)) / level.size
     margin = max(1, round(MARGIN_S * rate_hz))
     found: list[Interval] = []
@@ -110,7 +112,7 @@ def _louder(sizes: list[Array], far: Mask, a: int, b: int, around: int) -> bool:
         all(
             float(np.median(size[a:b][far[a:b]])) > LOUD * float(np.median(size[side])) / 0.6745
             for side in sides
-            if size[side].size > around // 4
+            if size[side].size > around // 24
         )
         for size in sizes
     )

@@ -158,7 +158,9 @@ def variance_change(state: State, record: Record) -> list[Look]:
     # Over every place: the change lies between the last reading before it and the first one with it.
     weight = np.exp((gain - gain.max()) / wide) * (gain > 0.0)
     held = weight > 1e-7
-    times = record.time_s[np.flatnonzero(present)[1:][held]] - 0.5 * state.dt
+    read = record.time_s[present]
+    apart = np.diff(read)[held]
+    times = read[1:][held] - 0.5 * apart
     ratios = np.sqrt(second[held] / first[held]) * more
     sds = ratios * np.sqrt(0.5 * wide / k[held] + 0.5 * wide / (n - k[held]))
     return [
@@ -167,7 +169,7 @@ def variance_change(state: State, record: Record) -> list[Look]:
             exact,
             worth,
             {
-                "time_s": mixture(weight[held], times, state.dt / math.sqrt(12.0), "s"),
+                "time_s": mixture(weight[held] * apart, times, apart / math.sqrt(12.0), "s"),
                 "ratio": mixture(weight[held], ratios, sds, "1"),
             },
             {"r": r},
