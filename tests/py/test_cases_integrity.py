@@ -307,7 +307,7 @@ def test_a_change_of_rate_is_found_and_spoils_nothing(before: float, after: floa
     held = Held()
     for seed in range(case_records(3, 120)):
         random = np.random.default_rng([9, seed, round(before)])
-        counts = [round(random.uniform(0.3, 0.7) * 6000 * rate / before) for rate in (before, after)]
+        counts = [round(random.uniform(200.0, 500.0) * rate) for rate in (before, after)]
         dt = np.repeat([1.0 / before, 1.0 / after], counts)
         bias = random.uniform(-5.0, 5.0) + np.cumsum(random.normal(size=dt.size) * 4e-3 * np.sqrt(dt))
         y = bias + 0.04 / np.sqrt(dt) * random.normal(size=dt.size)
