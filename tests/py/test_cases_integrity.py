@@ -105,7 +105,7 @@ FORMS: dict[str, Callable[[Array], Array]] = {
 @pytest.mark.parametrize("form", FORMS)
 def test_the_digits_of_a_number_are_no_lattice(form: str) -> None:
     """Spacing that changes with the size of the reading: clean records about 0 to 10 at 1 to 100 Hz show nothing."""
-    records, wrong = case_records(2, 200), 0
+    records, wrong = case_records(1, 200), 0
     for seed in range(records):
         random = np.random.default_rng([1, seed, len(form)])
         rate = float(random.choice([1.0, 10.0, 100.0]))
@@ -119,7 +119,7 @@ def test_the_digits_of_a_number_are_no_lattice(form: str) -> None:
 def test_means_of_readings_on_a_lattice_are_judged_by_it(block: int) -> None:
     """Means of `block` readings, as sums in floating point: their lattice is a part of the first one's. Truth: the
     noise is white, and no statistic of the lattice stands out. A coarse lattice is one to be told of."""
-    records, wrong = case_records(2, 200), 0
+    records, wrong = case_records(1, 200), 0
     for seed in range(records):
         random = np.random.default_rng([2, seed, block])
         rate = float(random.choice([1.0, 10.0, 100.0]))
@@ -153,8 +153,8 @@ def test_the_means_of_the_real_runs_show_no_lattice_statistic() -> None:
 
 def test_a_dead_band_is_told_of_without_a_warning() -> None:
     """Readings near one value read as that value, on no lattice. Nothing claims most of the samples as exceptions."""
-    for width in (0.3, 1.0, 2.5):
-        y, bias = noise(np.random.default_rng(3), 4000, 10.0)
+    for width in (0.3, 2.5):
+        y, bias = noise(np.random.default_rng(3), 2500, 10.0)
         y = np.where(np.abs(y - bias[0]) < width * 0.04 * math.sqrt(10.0), bias[0], y)
         found = judged(a_recording(y, 10.0)).findings
         assert found, width
@@ -204,7 +204,7 @@ def test_clipping_at_the_models_range_is_clipping_too() -> None:
     assert not found.judged.checks["saturation"]["passed"]
 
 
-@pytest.mark.parametrize("decimate", [1.0, 10.0])
+@pytest.mark.parametrize("decimate", [1.0, 10.0] if case_records(0, 1) else [1.0])
 def test_the_diagnosis_names_clipping_at_every_rate(decimate: float, tmp_path: Path) -> None:
     """38 % of the readings at the part's rail, far below the model's range: that alone, with the truth beside it."""
     axis = diagnose(shared_case("P26_clip_own.py", tmp_path), decimate=decimate)["axes"]["az"]
@@ -307,7 +307,7 @@ def test_a_change_of_rate_is_found_and_spoils_nothing(before: float, after: floa
     held = Held()
     for seed in range(case_records(3, 120)):
         random = np.random.default_rng([9, seed, round(before)])
-        counts = [round(random.uniform(0.3, 0.7) * 6000 * rate / before) for rate in (before, after)]
+        counts = [round(random.uniform(200.0, 500.0) * rate) for rate in (before, after)]
         dt = np.repeat([1.0 / before, 1.0 / after], counts)
         bias = random.uniform(-5.0, 5.0) + np.cumsum(random.normal(size=dt.size) * 4e-3 * np.sqrt(dt))
         y = bias + 0.04 / np.sqrt(dt) * random.normal(size=dt.size)
@@ -372,7 +372,7 @@ def test_an_offset_of_a_million_times_the_noise_costs_nothing(engine: str) -> No
 def test_clean_records_show_none_of_it() -> None:
     """White noise and a walk on lattices up to three times the noise, at even, jittering and lossy stamps. Without the
     effect each look fires in 1 of 200 at most; together in 1 of 100."""
-    records, found = case_records(10, 600), 0
+    records, found = case_records(5, 600), 0
     for seed in range(records):
         random = np.random.default_rng([12, seed])
         rate = float(random.choice([1.0, 10.0, 100.0]))
@@ -393,7 +393,7 @@ def test_clean_records_show_none_of_it() -> None:
 
 def test_no_warning_of_a_library_reaches_the_user(tmp_path: Path) -> None:
     """A dead band that holds nearly every reading: whatever is found, numpy keeps silent."""
-    y, bias = noise(np.random.default_rng(13), 2000, 10.0)
+    y, bias = noise(np.random.default_rng(13), 1000, 10.0)
     save(tmp_path / "log.csv", {"gx": ("deg/s", np.where(np.abs(y - bias) < 0.32, bias[0], y))}, 10.0)
     for verb in ("identify", "diagnose"):
         assert "Warning" not in run(verb, tmp_path / "log.csv").stderr
