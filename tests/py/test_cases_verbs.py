@@ -302,8 +302,11 @@ def test_fail_on_names_what_could_not_be_judged(tmp_path: Path) -> None:
         (tmp_path / "found.json").unlink()
         files = files[:2]
     assert (tmp_path / "page.html").exists()
-    done = run("diagnose", "log.npz", "--axis", "gz", "--fail-on", "step", "--json", "found.json", cwd=tmp_path)
-    assert done.returncode == 2
+    (tmp_path / "page.html").unlink()
+    with pytest.raises(UserError, match="no axis can be judged"):
+        both = {"json": tmp_path / "found.json", "report": tmp_path / "page.html"}
+        diagnose(tmp_path / "log.npz", axes=["gz"], fail_on="step", **both)
+    assert "Not diagnosed: gz" in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]["gz"]["error"]
 
 

@@ -96,8 +96,14 @@ def diagnose(
         with work.within(work.Work(lambda: ending.overdue)):
             if not found:
                 reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
-                if fail_on is not None and json is not None:
-                    write_json(of_errors(SCHEMA, recording, errors), json)
+                if fail_on is not None:  # a production line gets its files in each case
+                    document = of_errors(SCHEMA, recording, errors) | {"model": {}}
+                    if report is not None:
+                        from selfcal.diagnosis.page import write_page
+
+                        write_page(report, document, record, {})
+                    if json is not None:
+                        write_json(document, json)
                 ending.check()
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
