@@ -268,6 +268,31 @@ def verdict_of(path: Path) -> UserError:
     return caught.value
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "a " * 2_000_000,
+        " " * 4_000_000,
+        "(" * 4_000_000,
+        "gx(" * 1_000_000,
+        "[ " * 2_000_000,
+        "#" * 4_000_000,
+        ("(" * 255 + ",") * 16_000,
+        "\n".join(["(" * 200 + ")," * 100] * 1000),
+        ", ,," * 1_000_000,
+        ",".join(["gx"] * 900),
+    ],
+    ids=range(10),
+)
+def test_headers_that_take_long(tmp_path: Path, line: str) -> None:
+    """The time to find a header, and to fill empty cells, grows with the file and not with its square."""
+    path = tmp_path / "log.csv"
+    for text in (line, f"{line}\nt[s] gx[deg/s]\n", f"t[s],gx[deg/s]\n{line}\n0,1\n"):
+        path.write_text(text)
+        assert "log.csv: " in str(verdict_of(path))
+        verdict(lambda: load(path, rate=1.0), path)
+
+
 @pytest.mark.parametrize("name", ["log.rda", "log.mat"])
 def test_a_bomb_of_arrays(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """More unpacked than is allowed is not unpacked."""

@@ -51,6 +51,8 @@ _FOREIGN: Mapping[str, tuple[str, str | None]] = {
     **{f"gyro_rad[{place}]": (f"g{axis}", "rad/s") for place, axis in enumerate("xyz")},
     **{f"accelerometer_m_s2[{place}]": (f"a{axis}", "m/s^2") for place, axis in enumerate("xyz")},
 }
+#: Characters of a known heading with its unit, at most.
+_LONGEST_KNOWN = 64
 #: Headings of a time column that states its unit, or holds dates.
 _TIMES = ("time", "timestamp")
 #: Where a sensor's axes stand at rest, 1 g is so long in these units; the share that it may be off, the share of the
@@ -526,12 +528,8 @@ class _Header:
 
     def knows(self, keys: Sequence[str]) -> bool:
         """Whether one of these headings is a sensor's."""
-        wanted = self.columns.values()
-        return any(
-            key in wanted or name in wanted or name in self.sensors or key in _FOREIGN or name in _FOREIGN
-            for key in keys
-            for name in [_split(key)[0]]
-        )
+        known = {*self.columns.values(), *self.sensors, *_FOREIGN}
+        return any(key in known or (len(key) <= _LONGEST_KNOWN and _split(key)[0] in known) for key in keys)
 
     def fields(self, keys: Sequence[str], where: str, described: Any, first: Sequence[str] = ()) -> list[_Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is

@@ -38,8 +38,6 @@ from selfcal.limits import (
 _SLOW_BYTES = 1 << 26
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
-#: Blanks that separate; those within the brackets of a unit and before them do not.
-_BLANKS = re.compile(r"\s+(?!\s|[\[(]|[^\[(]*[\])])")
 #: What begins a comment.
 _COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
 #: Nothing but numbers and what separates them.
@@ -80,7 +78,7 @@ class TextTable:
         self._skip_bad, self._skipped = skip_bad, list[int]()
         self._origin: datetime | None = None
         self.where = f"line {number}: "
-        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(self._cells(header))]
+        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(self._headings(header))]
         self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
 
     @property
@@ -159,7 +157,7 @@ class TextTable:
                 break
             if not line.strip():
                 continue
-            bare = _COMMENT.sub("", line, count=1).strip()
+            bare = _bare(line)
             if plain < 0:
                 if bare != line.strip():
                     comment = place
@@ -168,7 +166,7 @@ class TextTable:
             if _is_header(bare, batch[place + 1 : place + 2], knows):
                 return self._begins(batch, place, place + 1, bare)
         if comment >= 0 and plain >= 0 and _ROW.fullmatch(batch[plain]):
-            return self._begins(batch, comment, plain, _COMMENT.sub("", batch[comment], count=1).strip())
+            return self._begins(batch, comment, plain, _bare(batch[comment]))
         if 0 <= plain < MOST_LEADING_LINES:
             return self._begins(batch, plain, plain + 1, batch[plain])
         if len(batch) > MOST_LEADING_LINES:
@@ -189,12 +187,15 @@ class TextTable:
                 signs = " or ".join(_SEPARATORS[sign] for sign in found)
                 raise UserError(f"{self.path}: line {number}: {signs} could separate the columns: keep one of them")
             found = fitting
-        if not found and 1 < len(_BLANKS.split(header.strip())) == len(row.split()):
+        if not found and 1 < len(_words(header)) == len(row.split()):
             return " "
         return found[0] if found else ","
 
     def _cells(self, line: str) -> list[str]:
-        return _BLANKS.split(line.strip()) if self._separator == " " else line.split(self._separator)
+        return line.split() if self._separator == " " else line.split(self._separator)
+
+    def _headings(self, line: str) -> list[str]:
+        return _words(line) if self._separator == " " else line.split(self._separator)
 
     def _heading(self, cell: str, number: int, place: int) -> str:
         where = f"{self.path}: line {number}: column {place + 1}: "
@@ -326,16 +327,37 @@ def _place(wanted: Sequence[int], place: int | None) -> int | None:
     return None if place is None else wanted.index(place)
 
 
+def _bare(line: str) -> str:
+    """A line without the sign of a comment before it."""
+    sign = _COMMENT.match(line)
+    return line[sign.end() if sign else 0 :].strip()
+
+
+def _words(line: str) -> list[str]:
+    """The headings between blanks: a unit in brackets may stand apart, and have blanks in it."""
+    found: list[list[str]] = []
+    within = False
+    for word in line.split(None, 8 * MOST_COLUMNS):  # the rest of a longer line is one word
+        if found and (within or word[0] in "[("):
+            found[-1].append(word)
+        else:
+            found.append([word])
+        opened, closed = max(word.rfind("["), word.rfind("(")), max(word.rfind("]"), word.rfind(")"))
+        within = opened > closed or (within and closed < 0)
+    return [" ".join(words) for words in found]
+
+
 def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]], bool]) -> bool:
     """Whether a line has a known heading and no number, and the line `after` it, if any, numbers in as many cells."""
     for sign in (*_SEPARATORS, " "):
-        if sign != " " and sign not in line:
+        if sign != " " and line.count(sign) > MOST_COLUMNS:
             continue
-        split = _BLANKS.split if sign == " " else lambda text, sign=sign: text.split(sign)
-        cells = [cell.strip(' "') for cell in split(line)]
+        cells = [cell.strip(' "') for cell in (_words(line) if sign == " " else line.split(sign))]
+        if len(cells) > MOST_COLUMNS or max(map(len, cells), default=0) > LONGEST_HEADING:
+            continue
         if any(_NUMBER.fullmatch(cell) for cell in cells) or not knows(cells):
             continue
-        row = split(after[0].strip()) if after else []
+        row = [cell for line in after for cell in (line.split() if sign == " " else line.split(sign))]
         if not after or (len(row) == len(cells) and any(_ROW.fullmatch(cell.strip(' "')) for cell in row)):
             return True
     return False

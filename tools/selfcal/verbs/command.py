@@ -84,9 +84,7 @@ def read_key(path: Path | str) -> bytes:
         key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
     except FileNotFoundError as error:
         make = f"{called()} command new-key --key {shlex.quote(str(path))}"
-        raise UserError(
-            f"{path}: there is no such key; --key names the module's, `{make}` makes one"
-        ) from error
+        raise UserError(f"{path}: there is no such key; --key names the module's, `{make}` makes one") from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
     except ValueError as error:
