@@ -415,7 +415,8 @@ check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py
-	@cd tools && ../$(BIN)/mypy --no-error-summary $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py)
+	@cd tools && ../$(BIN)/mypy --no-error-summary \
+	    $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

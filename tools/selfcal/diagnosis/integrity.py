@@ -116,8 +116,8 @@ def rate_change(record: Record) -> Look | None:
 
 def held_samples(record: Record, axis: str) -> Look | None:
     """The logger asks oftener than the part measures."""
-    readings = record.readings[axis]
-    if readings.held_hz is None:
+    readings = record.readings.get(axis)
+    if readings is None or readings.held_hz is None:
         return None
     # Each reading that is asked for again repeats; by chance one in 100 would at most.
     nats = min(1e6, readings.values.size * math.log(100.0))
@@ -126,10 +126,10 @@ def held_samples(record: Record, axis: str) -> Look | None:
 
 def stuck(record: Record, axis: str) -> Look | None:
     """Stretches of equal readings that are no chance."""
-    readings = record.readings[axis]
-    intervals = readings.intervals
-    if not intervals:
+    readings = record.readings.get(axis)
+    if readings is None or not readings.intervals:
         return None
+    intervals = readings.intervals
     nats = readings.stuck_nats
     return Look("stuck", nats, nats, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
 
@@ -164,10 +164,10 @@ def quantization(state: State) -> Look | None:
 def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
     """Readings are clipped at a limit. In a record at the recording's own rate they are drawn anew beyond the limit, so
     that the rest is judged as if it had not been clipped. Means are of those from the start."""
-    state, readings = record.axes[axis], record.readings[axis]
-    clipped = readings.clipped
-    if clipped is None:
+    state, readings = record.axes[axis], record.readings.get(axis)
+    if readings is None or readings.clipped is None:
         return None
+    clipped = readings.clipped
     sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
     estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
     look = Look("saturation", clipped.nats, clipped.nats, estimate, {})
