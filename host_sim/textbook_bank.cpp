@@ -22,8 +22,29 @@ struct Drift {
     double innovation = 0.0; // variance of e_i over r_i, the last state but one, in place of that
 };
 
-Drift drift_of(const Law &law, const Node &node, double dt_s) {
-    const auto n = static_cast<Eigen::Index>(order(law));
+// A term at the last of `block` samples, and its mean over them, from the term before: sample by sample.
+struct Block {
+    double phi, mean;              // of the term, of its mean
+    double var, covariance, of_mean; // of the noise in either
+};
+
+Block block_of(double phi, double step, std::size_t block) {
+    Block sum{1.0, 0.0, 0.0, 0.0, 0.0};
+    for (std::size_t k = 0; k < block; ++k) {
+        sum.phi *= phi;
+        sum.var = phi * phi * sum.var + step;
+        sum.of_mean += 2.0 * phi * sum.covariance + sum.var;
+        sum.covariance = phi * sum.covariance + sum.var;
+        sum.mean += sum.phi;
+    }
+    const auto m = static_cast<double>(block);
+    return {sum.phi, sum.mean / m, sum.var, sum.covariance / m, sum.of_mean / (m * m)};
+}
+
+Drift drift_of(const Law &law, const Node &node, double dt_s, std::size_t block) {
+    const auto n = static_cast<Eigen::Index>(order(law, block));
+    const auto m = static_cast<double>(block);
+    const double sample_s = dt_s / m;
     Drift drift;
     drift.transition = Eigen::MatrixXd::Identity(n, n);
     drift.step = drift.start = Eigen::MatrixXd::Zero(n, n);
@@ -31,17 +52,31 @@ Drift drift_of(const Law &law, const Node &node, double dt_s) {
     drift.white = node.sigma_v * node.sigma_v;
     Eigen::Index i = 0;
     for (const Term &term : law.terms) {
+        double phi = 1.0, step = 0.0;
         if (term.walk) { // (23), x_0 = 0
             const double density = term.deviation * node.drift;
-            drift.step(i, i) = density * density * dt_s;
+            step = density * density * sample_s;
+            drift.start(i, i) = step * (m - 1.0) / 2.0;
         } else { // stationary from the start
             const double alpha = bandwidth(term, node.second), sigma = deviation(law, term, node.drift, node.second);
-            drift.transition(i, i) = std::exp(-alpha * dt_s);
+            phi = std::exp(-alpha * sample_s);
             drift.start(i, i) = sigma * sigma;
-            drift.step(i, i) = -sigma * sigma * std::expm1(-2.0 * alpha * dt_s);
+            step = -sigma * sigma * std::expm1(-2.0 * alpha * sample_s);
+        }
+        const Block over = block_of(phi, step, block);
+        drift.transition(i, i) = over.phi;
+        drift.step(i, i) = over.var;
+        if (block > 1) {
+            const Eigen::Index mean = i + static_cast<Eigen::Index>(law.terms.size());
+            drift.transition(mean, mean) = 0.0;
+            drift.transition(mean, i) = over.mean;
+            drift.step(mean, i) = drift.step(i, mean) = over.covariance;
+            drift.step(mean, mean) = over.of_mean;
+            drift.output(i) = drift.level(mean) = 0.0;
         }
         ++i;
     }
+    i = n - 2; // of e_i
     if (law.coloured_noise) {
         const double theta = (node.second - 1.0) / (node.second + 1.0);
         drift.transition.bottomRightCorner(2, 2) << 0.0, 0.0, 1.0, 0.0; // e_i is new, e_(i-1) was e_i
@@ -62,7 +97,7 @@ template <int size> class Filter {
 
   public:
     Filter(const Record &record, const Law &law, const Node &node) : record_(record) {
-        const Drift drift = drift_of(law, node, record.dt_s);
+        const Drift drift = drift_of(law, node, record.dt_s, record.block);
         const Eigen::Index bias = drift.output.size();
         const Eigen::Index n = bias + 1 + static_cast<Eigen::Index>(record.regressors);
         r_ = drift.white;
@@ -140,7 +175,7 @@ template <int size> class Filter {
 // Calls use(filter). The compiler knows the size of a small state and writes its products out; larger states are few.
 template <int size = 2, typename Use>
 void with_filter(const Record &record, const Law &law, const Node &node, const Use &use) {
-    if (order(law) + 1 + record.regressors == size) {
+    if (order(law, record.block) + 1 + record.regressors == size) {
         Filter<size> filter(record, law, node);
         use(filter);
     } else if constexpr (size < 5) {
@@ -212,8 +247,9 @@ double deviation(const Law &law, const Term &term, double drift, double second) 
     return beside_walk ? own / std::sqrt(bandwidth(term, second)) : own;
 }
 
-std::size_t order(const Law &law) {
-    return std::max<std::size_t>(1, law.terms.size() + (law.coloured_noise ? 2 : 0));
+std::size_t order(const Law &law, std::size_t block) {
+    const std::size_t of_terms = (block > 1 ? 2 : 1) * law.terms.size();
+    return std::max<std::size_t>(1, of_terms + (law.coloured_noise ? 2 : 0));
 }
 
 Filtered run_filter(const Record &record, const Law &law, const Node &node, double *standardized) {

@@ -5,6 +5,8 @@
 // One axis, sampled every dt:  y_i = x0 + x_i + v_i  (22),  x0 ~ N(bias mean, P0),  v_i ~ N(0, r_i sigma_v^2).
 // Known disturbances z (temperature, time, ...) enter as the paper's bias does: constant states with a row of H each.
 // y_i = x0 + x_i + c' z_i + v_i,  c ~ N(0, diag(sd^2)).
+// A reading may be the mean of `block` samples of the drift and of white noise (Record::block). The drift is then the
+// state at the last of them, and its mean over them a second state, which is read.
 // Two deviations from the print:
 //   - the Gauss-Markov noise gain is the exact sigma_m sqrt(1 - phi^2); the printed one,
 //     sigma_m sqrt(2 / (alpha dt)) (1 - phi), is (alpha dt)^2 / 24 off it, relatively;
@@ -41,7 +43,7 @@ struct Law {
     bool coloured_noise = false;
 };
 constexpr std::size_t terms_max = 3;
-constexpr std::size_t order_max = 5; // states of x_i: its terms, and e_i, e_(i-1) of coloured noise
+constexpr std::size_t order_max = 8; // states of x_i: its terms, their means, and e_i, e_(i-1) of coloured noise
 constexpr std::size_t regressors_max = 6;
 
 // Of a term at one value of the law's parameters: bandwidth, 1/s, and standard deviation of a Gauss-Markov process.
@@ -56,8 +58,8 @@ struct Node {
     double sigma_v;         // unit, per sample
 };
 
-// States of x_i: at least one.
-std::size_t order(const Law &law);
+// States of x_i: at least one. Beside means of a block each term has two, first all terms, then all means.
+std::size_t order(const Law &law, std::size_t block);
 
 // One axis of a recording. A sample that is NaN is missing: the filter predicts over it.
 struct Record {
@@ -69,10 +71,11 @@ struct Record {
     std::size_t regressors = 0;              // at most regressors_max
     const double *z = nullptr;               // [n][regressors], finite where y is
     const double *coefficient_sd = nullptr;  // [regressors] prior of each coefficient, unit per unit of its regressor
+    std::size_t block = 1; // samples that y is the mean of; x_0 = 0 is one dt before the middle of the first block
 };
 
 // What a filter knows after its last sample: ln p(Y | h_k, theta_kj), and the state [drift; x0; c] given them.
-// `drift` has order(law) elements.
+// `drift` has order(law, block) elements.
 struct Filtered {
     double ln_p;
     Eigen::VectorXd mean;

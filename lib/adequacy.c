@@ -59,6 +59,25 @@ static uint8_t widest(const selfcal_model_t *model, const selfcal_report_t *repo
     return found;
 }
 
+/* Of a law at its true parameters, the points that its filters take a block mean of its drift for: sigma_v^2, and the
+ * drift parameter's square over it, which is rho^2 but for a plain Gauss-Markov drift. */
+typedef struct {
+    selfcal_wide_t variance, square;
+} points_t;
+
+/* Least part of N^2/dt that remains, where the nodes end as well. */
+#define WHITE_LEAST 0.1
+
+static points_t points_of(const selfcal_model_t *model, const selfcal_law_t *law, selfcal_wide_t N,
+                          selfcal_wide_t drift, selfcal_wide_t second) {
+    const selfcal_wide_t dt = (selfcal_wide_t)model->dt_s, white = N * N / dt;
+    const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0);
+    const selfcal_wide_t variance = fmax(white - white_left_out(law, second, dt, model->block) * square,
+                                         WHITE_LEAST * white);
+    const points_t points = {variance, square / variance};
+    return points;
+}
+
 /* Where the likeliest law lies among the nodes. */
 static selfcal_reopening_t likely_place(const selfcal_model_t *model, const selfcal_report_t *report) {
     uint8_t best = 0;
@@ -67,14 +86,19 @@ static selfcal_reopening_t likely_place(const selfcal_model_t *model, const self
     }
     const selfcal_law_t *law = model->hypothesis[best].law;
     const selfcal_estimate_t *parameter = report->hypothesis[best].parameter;
-    const selfcal_real_t root_dt = r_sqrt((selfcal_real_t)model->dt_s);
-    selfcal_reopening_t at = {.hypothesis = best, .sigma_v = parameter[SELFCAL_N].median / (float)root_dt};
+    const bool has_second = has_alpha(law) || has_ratio(law);
+    const selfcal_wide_t second = has_second ? (selfcal_wide_t)parameter[SELFCAL_ALPHA].median : 1.0;
+    const selfcal_wide_t drift = has_drift(law) ? (selfcal_wide_t)parameter[drift_parameter(law)].median : 0.0;
+    const points_t points = points_of(model, law, (selfcal_wide_t)parameter[SELFCAL_N].median, drift, second);
+    selfcal_reopening_t at = {.hypothesis = best, .sigma_v = (float)sqrt(points.variance)};
     if (has_drift(law)) {
-        const selfcal_real_t drift = (selfcal_real_t)parameter[drift_parameter(law)].median;
-        at.ln_rho = (float)r_log(drift * (has_walk(law) ? root_dt : R(1.0)) / (selfcal_real_t)at.sigma_v);
+        const bool pole = has_alpha(law) && !is_sum(law);
+        const selfcal_real_t x = (selfcal_real_t)(second * (selfcal_wide_t)model->dt_s);
+        const selfcal_wide_t gain = pole ? (selfcal_wide_t)averaged(x, model->block).gain : 1.0;
+        at.ln_rho = (float)(0.5 * log(points.square * gain));
     }
-    if (has_alpha(law) || has_ratio(law)) {
-        at.ln_second = (float)r_log((selfcal_real_t)parameter[SELFCAL_ALPHA].median);
+    if (has_second) {
+        at.ln_second = (float)log(second);
     }
     return at;
 }
@@ -86,11 +110,11 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
     const selfcal_law_t *law = model->hypothesis[best].law;
     const selfcal_estimate_t *parameter = report->hypothesis[best].parameter;
     const selfcal_wide_t dt = (selfcal_wide_t)model->dt_s;
-    const selfcal_wide_t N = (selfcal_wide_t)parameter[SELFCAL_N].median, variance = N * N / dt;
     const selfcal_wide_t drift = has_drift(law) ? (selfcal_wide_t)parameter[drift_parameter(law)].q95 : 0.0;
     const bool decays = has_decay(law) && (has_alpha(law) || has_ratio(law));
     const selfcal_wide_t second = decays ? (selfcal_wide_t)parameter[SELFCAL_ALPHA].median : 1.0;
-    const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0) / variance; /* rho^2 */
+    const points_t points = points_of(model, law, (selfcal_wide_t)parameter[SELFCAL_N].median, drift, second);
+    const selfcal_wide_t variance = points.variance, square = points.square;
     watch->known = !law->coloured_noise && isfinite(square) && isfinite(second) && variance > 0.0 && second > 0.0;
     if (self->changes != NULL) {
         watch->likely = likely_place(model, report);
@@ -115,8 +139,9 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
             continue;
         }
         const size_t at = watch->next.states++;
-        const selfcal_wide_t pole = exp(-bandwidth_of(term, second) * dt);
-        const selfcal_wide_t stationary = markov_variance(law, term, square, second, dt);
+        const selfcal_wide_t rate = bandwidth_of(term, second) * dt, pole = exp(-fmin(rate, ALPHA_DT_MAX));
+        const selfcal_wide_t stationary = (selfcal_wide_t)averaged((selfcal_real_t)rate, model->block).gain *
+                                          markov_variance(law, term, square, second, dt);
         watch->next.pole[at] = (selfcal_real_t)pole;
         watch->next.variance[at] = (selfcal_real_t)stationary;
         watch->next.noise[at] = (selfcal_real_t)(stationary * (1.0 - pole * pole));

@@ -36,9 +36,6 @@
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
-/* ln of 1e3: beyond, 1 + theta or 1 - theta is no longer a float. */
-#define LN_RATIO_MAX 6.91F
-
 static bool valid_prior(const selfcal_prior_t *prior) {
     return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
 }
@@ -665,6 +662,16 @@ void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_
     }
 }
 
+static selfcal_averaged_t averaged_at(const selfcal_t *self, selfcal_place_t place) {
+    return averaged(r_exp(place.ln_alpha) * (selfcal_real_t)self->model->dt_s, self->model->block);
+}
+
+selfcal_wide_t selfcal_bank_per_prediction(const selfcal_t *self, uint16_t index) {
+    const selfcal_place_t place = selfcal_bank_place(self, index);
+    return has_decay(self->model->hypothesis[place.hypothesis].law)
+               ? (selfcal_wide_t)averaged_at(self, place).now / (1.0 - (selfcal_wide_t)self->node[index].beta) : 1.0;
+}
+
 void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     const selfcal_node_t *node = &self->node[index];
@@ -687,6 +694,20 @@ void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t
         /* P' = phi^2 P(now) + q has lost P(now): it is that after a sample, unless a gap has just let it grow. */
         const bool gap = (selfcal_wide_t)now.d > 1e-3 * (selfcal_wide_t)node->p_inf;
         view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
+    }
+    if (self->model->block == 1U) {
+        return;
+    }
+    /* from the point to the end of the interval */
+    if (beta > 0.0) {
+        const selfcal_averaged_t of = averaged_at(self, place);
+        const selfcal_wide_t over = (selfcal_wide_t)of.now;
+        view->drift *= over;
+        view->bias_left = 1.0 - over * (1.0 - view->bias_left);
+        view->drift_var = over * over * view->drift_var +
+                          (selfcal_wide_t)(r_exp(R(2.0) * place.ln_rho) * of.after / of.gain);
+    } else {
+        view->drift_var += (selfcal_wide_t)(node->q * averaged_walk_after(self->model->block));
     }
 }
 

@@ -3,7 +3,7 @@
 #ifndef SELFCAL_BANK_H
 #define SELFCAL_BANK_H
 
-#include "laws.h"
+#include "averages.h"
 #include "twofold.h"
 
 /* ln of the largest drift over white noise, 1e6: after the longest gap, 2^32 intervals, the recursion of d multiplies
@@ -15,9 +15,6 @@
 #define P_MAX R(1e22)
 /* One bank sample per axis, about the offset, with `r` times the white-noise variance of a whole block. */
 void selfcal_bank_sample(selfcal_t *self, const selfcal_real_t y[], selfcal_real_t r);
-/* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and
- * neighbours correlated by 1e-3 are beyond telling from white ones. */
-#define ALPHA_DT_MAX 6.9
 /* `count` bank intervals without a sample. */
 void selfcal_bank_gap(selfcal_t *self, uint64_t count);
 /* From now on `block` samples make a bank interval: how many nodes a push has to run follows. */
@@ -50,6 +47,8 @@ void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, self
 void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
 /* ln x of a positive, finite x; else log(). */
 selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x);
+/* Over a filter's prediction for the next interval: the drift at the end of the last one. Of a plain law's node. */
+selfcal_wide_t selfcal_bank_per_prediction(const selfcal_t *self, uint16_t index);
 void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
 void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view);
 

@@ -279,7 +279,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
     normal->drift[0] = normal->node.drift;
     normal->sd[0] = (selfcal_wide_t)self->prior_sd[axis];
     normal->first[0] = selfcal_bank_from_prior(self, axis);
-    const selfcal_wide_t phi = 1.0 - (selfcal_wide_t)self->node[index].beta;
+    const selfcal_wide_t per_prediction = selfcal_bank_per_prediction(self, index);
     const size_t p = mask != 0U ? columns_of(self) : 0U;
     const selfcal_states_code_t *states = is_state_node(self, &self->node[index]) ? self->model->states : NULL;
     if (states != NULL) {
@@ -304,7 +304,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
         const size_t at = (size_t)index * self->model->axes + axis;
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
-        normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) / phi;
+        normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) * per_prediction;
         if (states != NULL) {
             states->drift(self, index, k + 1U, normal->lost[row]);
         }

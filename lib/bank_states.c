@@ -87,8 +87,10 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
             node->q[a] = (selfcal_real_t)(deviation * deviation * square);
             node->p[term_pair(a, a)] = deviation * deviation * square; /* x_0 = 0 */
         } else {
-            const selfcal_wide_t variance = markov_variance(law, term, square, second, dt_s); /* stationary */
-            node->beta[a] = (selfcal_real_t)-expm1(-fmin(bandwidth_of(term, second) * dt_s, ALPHA_DT_MAX));
+            const selfcal_wide_t rate = bandwidth_of(term, second) * dt_s; /* of an interval */
+            const selfcal_wide_t variance = (selfcal_wide_t)averaged((selfcal_real_t)rate, self->model->block).gain *
+                                            markov_variance(law, term, square, second, dt_s); /* stationary */
+            node->beta[a] = (selfcal_real_t)-expm1(-fmin(rate, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
             node->p[term_pair(a, a)] = variance;
@@ -96,7 +98,11 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
     }
     if (law->coloured_noise) {
         const size_t last = law->terms;
-        node->theta = (selfcal_real_t)tanh(0.5 * (selfcal_wide_t)place.ln_alpha); /* (ratio - 1)/(ratio + 1) */
+        /* White noise that the drift leaves out is missing at all frequencies. */
+        const selfcal_wide_t out = white_left_out(law, second, dt_s, self->model->block) * square;
+        const selfcal_wide_t per_ratio_sq = fmax((1.0 + out) / (second * second) - out,
+                                                 exp(-2.0 * (selfcal_wide_t)LN_RATIO_MAX));
+        node->theta = (selfcal_real_t)tanh(-0.25 * log(per_ratio_sq)); /* (ratio - 1)/(ratio + 1) */
         node->beta[last] = R(1.0);
         node->p[term_pair(last, last)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
     }
@@ -329,25 +335,52 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
 /* --------------------------------------------------------------------------------------------------------------
  * views */
 
+/* A term now, from the filter's prediction for the next interval: over that, and variance beside it. */
+typedef struct {
+    selfcal_wide_t per_prediction, after;
+} term_now_t;
+
 /* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
+static void terms_now(const selfcal_t *self, size_t j, term_now_t now[SELFCAL_TERMS_MAX]) {
+    const selfcal_place_t place = selfcal_bank_place(self, (uint16_t)j);
+    const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
+    const selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
+    const selfcal_wide_t dt_s = (selfcal_wide_t)self->model->dt_s, second = exp((selfcal_wide_t)place.ln_alpha);
+    const uint32_t block = self->model->block;
+    memset(now, 0, SELFCAL_TERMS_MAX * sizeof now[0]);
+    for (size_t a = 0; a < terms_of(law); a++) {
+        const selfcal_term_t *term = &law->term[a];
+        if (term->kind == SELFCAL_WALK) {
+            now[a].per_prediction = 1.0;
+            now[a].after = (selfcal_wide_t)(node->q[a] * averaged_walk_after(block));
+        } else {
+            const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
+            const selfcal_averaged_t of = averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
+            now[a].per_prediction = (selfcal_wide_t)of.now / phi_of(node, a);
+            now[a].after = markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
+        }
+    }
+}
+
 static void drift_of(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
-    const term_t at_node = term_of(self, j);
-    const selfcal_term_node_t *term = &self->terms->node[at_node.index];
+    const size_t index = term_of(self, j).index;
+    term_now_t now[SELFCAL_TERMS_MAX];
+    terms_now(self, j, now);
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
-        const bool is_drift = a < at_node.order && term->beta[a] < R(1.0);
-        drift[a] = is_drift ? sum_value(states(self, at_node.index, series)[a]) / phi_of(term, a) : 0.0;
+        drift[a] = sum_value(states(self, index, series)[a]) * now[a].per_prediction;
     }
 }
 
 static void spread_of(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
     const term_t at_node = term_of(self, j);
     const selfcal_term_node_t *term = &self->terms->node[at_node.index];
-    memset(spread, 0, SELFCAL_TERM_PAIRS * sizeof spread[0]);
-    for (size_t a = 0; a < at_node.order; a++) {
-        for (size_t b = 0; b <= a && term->beta[a] < R(1.0); b++) {
+    term_now_t now[SELFCAL_TERMS_MAX];
+    terms_now(self, j, now);
+    for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
+        for (size_t b = 0; b <= a; b++) {
             /* P' = phi P(now) phi + Q */
             const selfcal_wide_t p = term->p[term_pair(a, b)] - (a == b ? (selfcal_wide_t)term->q[a] : 0.0);
-            spread[term_pair(a, b)] = p / (phi_of(term, a) * phi_of(term, b));
+            spread[term_pair(a, b)] = p * now[a].per_prediction * now[b].per_prediction + (a == b ? now[a].after : 0.0);
         }
     }
 }

@@ -154,6 +154,7 @@ bool selfcal_spline_step(selfcal_work_t *work, bool transposed, int which);
 
 typedef struct {
     selfcal_real_t ln_rho, profile, ln_sigma;
+    selfcal_real_t ln_white; /* ln(N) - ln(sigma_v) - ln(dt)/2: white noise that the drift leaves out */
     selfcal_real_t basis[6]; /* of rho */
     uint8_t basis_first;
     bool off_grid;
@@ -177,6 +178,9 @@ uint8_t selfcal_cells_for_peak(const selfcal_real_t height[], selfcal_real_t lea
 
 /* Cells of a row (dimension 0), and rows. */
 uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension);
+
+/* Variance of a plain Gauss-Markov law's points over the drift's own, at an alpha: its rho is that of the points. */
+selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln_alpha);
 
 /* The widest ranges of ln rho and ln alpha that the priors permit. */
 void selfcal_cells_limits(selfcal_work_t *work);

@@ -32,11 +32,12 @@ static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_vi
     selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
     const bool sum = is_sum(law);
     const selfcal_wide_t second = sum ? exp(v->ln_alpha) : 0.0, dt_s = (selfcal_wide_t)work->bank->model->dt_s;
+    const selfcal_real_t gain = sum ? R(1.0) : selfcal_points_gain(work, (selfcal_real_t)v->ln_alpha);
     if (sum) {
         work->bank->model->states->spread(work->bank, (size_t)work->first_node + k, spread);
     }
     for (size_t a = 0; a < terms; a++) {
-        selfcal_wide_t stationary = square;
+        selfcal_wide_t stationary = square / (selfcal_wide_t)gain;
         if (sum) { /* a walk does not decay: its psi is 0 */
             const selfcal_term_t *term = &law->term[a];
             stationary = term->kind == SELFCAL_WALK ? 0.0 : markov_variance(law, term, square, second, dt_s);

@@ -37,9 +37,30 @@ uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension) {
     return (uint16_t)(dimension == 1U && cells > ROWS_MOST ? ROWS_MOST : cells);
 }
 
-/* ln(parameter) - ln(rho) - ln(sigma_v): K sqrt(dt) = sigma_w = rho sigma_v, sigma_m = rho sigma_v. */
-static selfcal_real_t drift_shift(const selfcal_work_t *work) {
-    return has_walk(hypothesis_of(work)->law) ? -half_ln_dt(work) : R(0.0);
+/* A drift so fast that averaging hides more of the white noise than this, at the frequency where it hides most, is at
+ * the edge: the nodes have no place for one that hides more than all. */
+#define LEFT_OUT_MOST R(0.9)
+/* rho has no end as that part goes to 1, but what is left of the prior goes to 0 with the rest of it. */
+#define LEFT_OUT_LIMIT R(0.99999)
+
+selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    const selfcal_model_t *model = work->bank->model;
+    return has_pole(work) ? averaged(r_exp(ln_alpha) * (selfcal_real_t)model->dt_s, model->block).gain : R(1.0);
+}
+
+/* White noise that the drift leaves out at rho = 1, over sigma_v^2. `ln_second`: of alpha or of the ratio. */
+static selfcal_real_t left_out_of(const selfcal_work_t *work, selfcal_real_t ln_second) {
+    const selfcal_model_t *model = work->bank->model;
+    return (selfcal_real_t)white_left_out(hypothesis_of(work)->law, (selfcal_wide_t)r_exp(ln_second),
+                                          (selfcal_wide_t)model->dt_s, model->block) /
+           selfcal_points_gain(work, ln_second);
+}
+
+/* ln(parameter) - ln(rho) - ln(sigma_v): K sqrt(dt) = sigma_w = rho sigma_v; sigma_m = rho sigma_v but for the
+ * points' gain. */
+static selfcal_real_t drift_shift(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    return has_walk(hypothesis_of(work)->law) ? -half_ln_dt(work)
+                                              : R(-0.5) * r_log(selfcal_points_gain(work, ln_alpha));
 }
 
 void selfcal_cells_limits(selfcal_work_t *work) {
@@ -55,9 +76,14 @@ void selfcal_cells_limits(selfcal_work_t *work) {
     }
     if (hypothesis->rho != NULL) {
         const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
-        const selfcal_real_t shift = half_ln_dt(work) - drift_shift(work);
-        work->search.limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + shift;
-        work->search.limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + shift;
+        const selfcal_real_t lo = half_ln_dt(work) - drift_shift(work, work->search.limit_lo[1]),
+            hi = half_ln_dt(work) - drift_shift(work, work->search.limit_hi[1]);
+        work->search.limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + lo;
+        work->search.limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + hi;
+        /* this far over N/sqrt(dt), farther over sigma_v */
+        const selfcal_real_t of_noise = r_exp(R(2.0) * work->search.limit_hi[0]) *
+                                        left_out_of(work, work->search.limit_hi[1]);
+        work->search.limit_hi[0] -= R(0.5) * r_log1p(-r_fmin(of_noise, LEFT_OUT_LIMIT));
     }
 }
 
@@ -68,7 +94,9 @@ void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     row->ln_alpha = ln_alpha;
     row->beta = selfcal_expected_beta(work, ln_alpha);
     row->half_ln_dt = half_ln_dt(work);
-    row->shift = drift_shift(work);
+    row->shift = drift_shift(work, ln_alpha);
+    row->left_out = left_out_of(work, ln_alpha);
+    row->noise_sq = hypothesis->law->coloured_noise ? r_exp(R(2.0) * ln_alpha) : R(1.0);
     row->prior = prior_of(work);
     row->drift = drift_parameter(hypothesis->law);
     uint16_t taps = 1;
@@ -96,7 +124,7 @@ void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     cell->off_grid = false;
-    cell->ln_rho = R(0.0);
+    cell->ln_rho = cell->ln_white = R(0.0);
     if (hypothesis->rho == NULL) {
         cell->profile = row->profile[0];
         cell->ln_sigma = row->ln_sigma[0];
@@ -125,12 +153,17 @@ void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_
     selfcal_expected(work, cell->ln_rho, row->ln_alpha, row->beta, &e);
     cell->profile += (selfcal_real_t)e.profile;
     cell->ln_sigma += (selfcal_real_t)e.ln_sigma;
+    /* N^2/dt = (1 + left) sigma_v^2, so d(ln N) d(ln K) = d(ln sigma_v) d(ln rho)/(1 + left) */
+    const selfcal_real_t left = row->left_out * r_exp(R(2.0) * ln_rho);
+    cell->ln_white = R(0.5) * r_log1p(left);
+    cell->profile -= R(2.0) * cell->ln_white;
+    cell->off_grid = cell->off_grid || left * row->noise_sq > LEFT_OUT_MOST * (R(1.0) + left);
 }
 
 void selfcal_cells_parameters(const selfcal_work_t *work, const cell_t *cell,
                               selfcal_real_t ln_value[SELFCAL_PARAMETERS]) {
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
-    ln_value[SELFCAL_N] = cell->ln_sigma + row->half_ln_dt;
+    ln_value[SELFCAL_N] = cell->ln_sigma + cell->ln_white + row->half_ln_dt;
     ln_value[SELFCAL_ALPHA] = row->ln_alpha;
     ln_value[SELFCAL_K] = cell->ln_rho + cell->ln_sigma + row->shift;
     ln_value[SELFCAL_SIGMA_M] = ln_value[SELFCAL_K];

@@ -143,16 +143,15 @@ static sums_t sum_cut(const selfcal_work_t *work, const side_t side[2], unsigned
     return sum;
 }
 
-/* `fall`: change of ln sigma_v's mode from one side of the cell to the other, of width `wide` in ln rho; `profile`: ln
- * height at that mode. `cost`: in cells that nothing cuts. */
+/* `change`: of ln N and of the drift parameter from one side of the cell to the other, at sigma_v's mode; `profile`: ln
+ * height there. `cost`: in cells that nothing cuts. */
 static sums_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t profile,
-                       selfcal_real_t density,
-                          selfcal_real_t wide, selfcal_real_t fall, unsigned *cost) {
+                       selfcal_real_t density, const selfcal_real_t change[2], unsigned *cost) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const unsigned sides = hypothesis->rho != NULL ? 2U : 1U;
     /* What N and the drift parameter run through from one side of the cell to the other: where the drift hides the
      * white noise, sigma_v falls as rho rises and their product stands still. */
-    selfcal_real_t half[2] = {R(0.5) * r_fabs(fall), R(0.5) * r_fabs(wide + fall)};
+    selfcal_real_t half[2] = {R(0.5) * r_fabs(change[0]), R(0.5) * r_fabs(change[1])};
     const reach_t reach = selfcal_cells_reach(work, ln_value, half);
     sums_t sum = {R(0.0), R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     /* nor NaN */
@@ -261,9 +260,12 @@ static void sum_part(selfcal_work_t *work, uint16_t count, part_t *part) {
         }
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         selfcal_cells_parameters(work, &cell, ln_value);
-        const selfcal_real_t fall = (after.ln_sigma - before.ln_sigma) / (i == 0U || last ? R(1.0) : R(2.0));
+        const selfcal_real_t steps = i == 0U || last ? R(1.0) : R(2.0);
+        const selfcal_real_t change[2] = {
+            (after.ln_sigma - before.ln_sigma + (after.ln_white - before.ln_white)) / steps,
+            wide + (after.ln_sigma - before.ln_sigma) / steps};
         unsigned cost = 1;
-        const sums_t sum = sum_cell(work, ln_value, cell.profile, density, wide, fall, &cost);
+        const sums_t sum = sum_cell(work, ln_value, cell.profile, density, change, &cost);
         spent += cost;
         part->sum.mass += sum.mass;
         part->sum.mass_sq += sum.mass_sq;

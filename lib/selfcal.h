@@ -102,6 +102,8 @@ typedef double selfcal_wide_t;
 /* A law is data: the terms of its drift, and the kind of its white noise.
  *   SELFCAL_WALK:   x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                                             (23)
  *   SELFCAL_MARKOV: x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-bandwidth dt), stationary
+ * That holds at each sample; a bank sample is the mean of a block of samples. A model of one sample a block takes the
+ * drift for a point, whatever the sensor averaged before.
  * A law has at most three parameters: N, the drift parameter, and a second one.
  * The drift parameter is K if a term is a walk, else sigma_m (B for flicker).
  * The second one is alpha, which scales the bandwidths that are not stated, or a ratio. No law has both. */
@@ -161,7 +163,8 @@ typedef struct {
 } selfcal_grid_t;
 
 /* Nodes of a hypothesis: all pairs of rho (outer) and alpha (inner). rho is the drift over the white noise per bank
- * interval: sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v.
+ * interval: sigma_w / sigma_v, sigma_m / sigma_v or B / sigma_v. Block means have these less white noise than the
+ * samples (averages.h): N^2 / dt is above sigma_v^2, and a Gauss-Markov law's rho is of its block means.
  * The alpha nodes span the priors. The rho nodes span the priors of K or sigma_m over the white noise seen in the first
  * SELFCAL_BATCH bank samples. Their margin is e^0.5 either way, and e^1.25 above sigma_m.
  * A call that looks at the sums sooner (a report, a node's) places the nodes for good by the samples there are. With
@@ -407,8 +410,8 @@ typedef struct {
     uint8_t hypothesis;
     selfcal_wide_t ln_rho, ln_alpha; /* the node; NaN where the law has none */
     selfcal_wide_t a, b, c, ln_s;    /* sums A, B, C about the offset, and D, see bank.c */
-    selfcal_wide_t drift;            /* at the last interval, if x0 were the offset */
-    selfcal_wide_t bias_left;        /* change of x0 + drift at the last interval per unit of x0 */
+    selfcal_wide_t drift;            /* at the end of the last interval, if x0 were the offset */
+    selfcal_wide_t bias_left;        /* change of x0 + drift at the end of the last interval per unit of x0 */
     selfcal_wide_t drift_var;        /* variance of the drift there, given x0, over sigma_v^2 */
 } selfcal_node_view_t;
 selfcal_status_t selfcal_node(selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view);
@@ -495,9 +498,13 @@ enum {
      * wrong by more than 0.05 nat (evidence), 0.05 sd (mean) or 3 % (sd).
      * The second condition is a conservative bound. It grows with the length of the record, with scattered gaps, and
      * with changes of rate. Without a Gauss-Markov law in the model it does not see a record that no random walk makes.
-     * Set for all laws if the report lost one between the nodes: its ln_evidence is -INFINITY, its estimates are NaN,
-     * and no probability is right. Without the flag an ln_evidence of -INFINITY means that the priors exclude the law.
-     * Remedy: more nodes in the model file. */
+     * Also set for all laws if the report lost one between the nodes: its ln_evidence is -INFINITY, its estimates are
+     * NaN, and no probability is right. Without the flag an ln_evidence of -INFINITY means that the priors exclude the
+     * law.
+     * Remedy: more nodes in the model file.
+     * Also set if more than 1 % of the posterior lies where the drift moves so far in a bank interval that its averages
+     * hide over 90 % of the white noise: of a random walk, K dt / N above 2.3. Above sqrt(6) there is no node.
+     * Remedy: a higher bank rate. */
     SELFCAL_OFF_GRID = 8
 };
 

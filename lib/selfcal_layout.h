@@ -320,6 +320,7 @@ typedef struct {
     selfcal_real_t basis[6]; /* of alpha */
     uint8_t basis_first;
     selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
+    selfcal_real_t left_out, noise_sq; /* white_left_out(); the square of the ratio of coloured noise, else 1 */
     const selfcal_prior_t *prior; /* of the hypothesis on the axis */
     selfcal_parameter_t drift;    /* which parameter goes with rho */
 } selfcal_cell_row_t;

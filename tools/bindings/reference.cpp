@@ -50,12 +50,15 @@ private:
 using Output = nb::ndarray<nb::numpy, double>;
 
 sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, double bias_mean, double bias_sd,
-                  const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd) {
+                  const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd, std::size_t block) {
+    if (block < 1)
+        throw std::invalid_argument("block must be at least 1");
     if (r && r->shape(0) != y.shape(0))
         throw std::invalid_argument("r must have the length of y");
     if (!(dt_s > 0.0) || !(bias_sd >= 0.0) || !std::isfinite(bias_mean))
         throw std::invalid_argument("dt_s must be positive, bias_sd at least 0 and bias_mean finite");
     sr::Record out{y.data(), r ? r->data() : nullptr, y.shape(0), dt_s, bias_mean, bias_sd};
+    out.block = block;
     if (z.has_value() != coefficient_sd.has_value())
         throw std::invalid_argument("z and coefficient_sd come together");
     if (!z)
@@ -136,19 +139,19 @@ std::tuple<Output, Output, Output> run_filters(const Vector &y, double dt_s, dou
                                                const std::vector<LawTuple> &law_tuples, const Laws &hypothesis,
                                                const Vector &drift, const Vector &second, const Vector &sigma_v,
                                                const std::optional<Vector> &r, const std::optional<Columns> &z,
-                                               const std::optional<Vector> &coefficient_sd) {
+                                               const std::optional<Vector> &coefficient_sd, std::size_t block) {
     const std::vector<sr::Law> laws = laws_of(law_tuples);
     const std::vector<sr::Node> nodes = node_list(laws, hypothesis, drift, second, sigma_v);
     for (const sr::Node &one : nodes)
-        if (sr::order(laws[one.hypothesis]) != sr::order(laws[nodes[0].hypothesis]))
+        if (sr::order(laws[one.hypothesis], block) != sr::order(laws[nodes[0].hypothesis], block))
             throw std::invalid_argument("the laws of one call must have as many states each");
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd, block);
     std::vector<sr::Filtered> filtered;
     {
         nb::gil_scoped_release release;
         filtered = sr::run_filters(rec, laws, nodes);
     }
-    const std::size_t size = (nodes.empty() ? 1 : sr::order(laws[nodes[0].hypothesis])) + 1 + rec.regressors;
+    const std::size_t size = (nodes.empty() ? 1 : sr::order(laws[nodes[0].hypothesis], block)) + 1 + rec.regressors;
     const Array<double> ln_p({nodes.size()}), mean({nodes.size(), size}), covariance({nodes.size(), size, size});
     for (std::size_t j = 0; j < nodes.size(); j++) {
         ln_p.data()[j] = filtered[j].ln_p;
@@ -162,7 +165,7 @@ std::tuple<Output, Output, Output, Output, Output, Output>
 run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const std::vector<LawTuple> &law_tuples,
          const Laws &hypothesis, const Vector &drift, const Vector &second, const Vector &sigma_v,
          const std::vector<double> &ln_prior, const std::vector<std::size_t> &after, const std::optional<Vector> &r,
-         const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd) {
+         const std::optional<Columns> &z, const std::optional<Vector> &coefficient_sd, std::size_t block) {
     const std::vector<sr::Law> laws = laws_of(law_tuples);
     const std::vector<sr::Node> nodes = node_list(laws, hypothesis, drift, second, sigma_v);
     if (ln_prior.size() != nodes.size())
@@ -170,7 +173,7 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const s
     for (std::size_t m = 0; m < after.size(); m++)
         if (after[m] > y.shape(0) || (m > 0 && after[m] < after[m - 1]))
             throw std::invalid_argument("after must ascend and stay within the record");
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd, block);
     std::vector<sr::Posterior> posterior;
     {
         nb::gil_scoped_release release;
@@ -196,10 +199,10 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const s
 
 Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, const LawTuple &law, double drift,
                    double second, double sigma_v, const std::optional<Vector> &r, const std::optional<Columns> &z,
-                   const std::optional<Vector> &coefficient_sd) {
+                   const std::optional<Vector> &coefficient_sd, std::size_t block) {
     const std::vector<sr::Law> laws = laws_of({law});
     const sr::Node one = node(laws, 0, drift, second, sigma_v);
-    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd);
+    const sr::Record rec = record(y, r, dt_s, bias_mean, bias_sd, z, coefficient_sd, block);
     const Array<double> out({rec.n});
     {
         nb::gil_scoped_release release;
@@ -238,12 +241,13 @@ NB_MODULE(_reference, m) {
     using namespace nb::literals;
     m.doc() = "The textbook bank of Stepanov & Motorin (2017) and the simulator (host_sim).";
     m.def("run_filters", &run_filters, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a,
-          "second"_a, "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+          "second"_a, "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(),
+          "block"_a = 1);
     m.def("run_bank", &run_bank, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "laws"_a, "hypothesis"_a, "drift"_a,
           "second"_a, "sigma_v"_a, "ln_prior"_a, "after"_a, "r"_a = nb::none(), "z"_a = nb::none(),
-          "coefficient_sd"_a = nb::none());
+          "coefficient_sd"_a = nb::none(), "block"_a = 1);
     m.def("innovations", &innovations, "y"_a, "dt_s"_a, "bias_mean"_a, "bias_sd"_a, "law"_a, "drift"_a, "second"_a,
-          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none());
+          "sigma_v"_a, "r"_a = nb::none(), "z"_a = nb::none(), "coefficient_sd"_a = nb::none(), "block"_a = 1);
 
     nb::class_<sr::Scene>(m, "Scene")
         .def(nb::init<>())

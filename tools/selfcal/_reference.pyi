@@ -4,9 +4,11 @@
 A law is a tuple (`laws.Law.as_tuple`). Nodes are arrays of one length m: `hypothesis` int32 (index into the laws),
 `drift` (K in unit/s/sqrt(Hz) if the law has a walk, else sigma_m or B in unit; not used without terms), `second` (alpha
 in 1/s, or the law's ratio), and `sigma_v` (unit, per sample: N / sqrt(dt_s)). The states of a drift are its terms in
-order (one that stays 0 without any), and e_i, e_(i-1) of coloured noise. A
+order (one that stays 0 without any), with a `block` of several samples the mean of each over the block, and e_i,
+e_(i-1) of coloured noise. A
 record is `y` float64[n] in its unit, NaN where a sample is missing, every `dt_s`; `r` float64[n] multiplies sigma_v^2,
-None is 1. The bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where
+None is 1. `y` is the mean of `block` samples of drift and white noise, at whose instants the drift is a point. The
+bias x0 is normal with `bias_mean` and `bias_sd`. Regressors are `z` float64[n, p], p <= 6, finite where
 y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in the unit of y per unit of each column.
 Arguments that do not fit raise ValueError. All cores are used, the interpreter's lock is released.
 """
@@ -36,6 +38,7 @@ def run_filters(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    block: int = 1,
 ) -> tuple[_Floats, _Floats, _Floats]:
     """One Kalman filter per node: ln p(Y | node) [m]; then, after the last sample, the mean [m, d + 1 + p] and
     covariance [m, d + 1 + p, d + 1 + p] of the state (drift, x0, c), where a drift has d states. The laws of
@@ -56,6 +59,7 @@ def run_bank(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    block: int = 1,
 ) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
     """The bank at t instants, `after` so many samples (ascending). `ln_prior`: ln of each node's prior probability, up
     to a constant.
@@ -77,6 +81,7 @@ def innovations(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: _Floats | None = None,
+    block: int = 1,
 ) -> _Floats:
     """Standardised innovations nu / sqrt(s) [n] of one node's filter, NaN where a sample is missing."""
 

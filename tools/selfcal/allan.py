@@ -6,8 +6,9 @@ of X is the sum of the weights times G at the distance between them. At m readin
 
     u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
 
-Readings are the bank's: block means, with a drift that steps from one to the next, as the filters have it. A random
-walk's Allan variance is then K^2 tau / 3 (1 + 1 / (2 m^2)).
+Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. Of readings that are no
+means a random walk's Allan variance is K^2 tau / 3 (1 + 1 / (2 m^2)), of means over many samples the continuous one,
+K^2 tau / 3.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from selfcal.laws import Law
+from selfcal.laws import Law, averaged
 from selfcal.model import Group
 from selfcal.result import Estimate
 
@@ -47,17 +48,19 @@ _MOST_STRETCHES = 200
 class Terms:
     """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
     the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
-    times the interval between readings."""
+    times the interval between readings. `lacking`: variance of white noise that the drift's averages lack
+    (laws.averaged)."""
 
     variance: float
     lag1: float = 0.0
     step: float = 0.0
     markov: tuple[tuple[float, float], ...] = ()
+    lacking: float = 0.0
 
     def sums(self, j: _Floats) -> _Floats:
         """G at the distances `j`, whole or not."""
         j = np.abs(j)
-        found = -0.5 * self.variance * j + self.step / 12.0 * (j**3 - j)
+        found = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
         if self.lag1:
             found = found - self.variance * self.lag1 * np.maximum(j, 1.0)
         for variance, alpha in self.markov:
@@ -84,27 +87,31 @@ class Terms:
     def spectrum(self, omega: _Floats) -> _Floats:
         """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
-        found = self.variance * (1.0 + self.lag1 * (2.0 - step)) + self.step / step
+        found = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
         for variance, alpha in self.markov:
             found = found - variance * math.expm1(-2.0 * alpha) / (math.expm1(-alpha) ** 2 + math.exp(-alpha) * step)
         return np.asarray(found)
 
 
-def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float) -> Terms:
-    """A law at `parameters` (continuous time, units.py), for readings every `dt_s`."""
+def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
+    """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
     variance, lag1 = parameters["N"] ** 2 / dt_s, 0.0
     if law.coloured_noise:
         theta = (second - 1.0) / (second + 1.0)
         variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
     step = sum((term.deviation * drift) ** 2 * dt_s for term in law.terms if term.kind == "walk")
+    lacking = (1.0 - 1.0 / block**2) * step / 6.0
     markov = []
     for term in law.terms:
         if term.kind == "markov":
             alpha = term.bandwidth * (1.0 if term.stated else second)
             sigma = term.deviation * drift * (second if term.by_ratio else 1.0)
-            markov.append((sigma**2 / (alpha if law.has_walk else 1.0), alpha * dt_s))
-    return Terms(variance, lag1, step, tuple(markov))
+            own = sigma**2 / (alpha if law.has_walk else 1.0)
+            gain, without = averaged(alpha * dt_s, block)
+            markov.append((own * gain, alpha * dt_s))
+            lacking += own * without
+    return Terms(variance, lag1, step, tuple(markov), lacking)
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
@@ -153,18 +160,25 @@ class Fit:
 
 
 def fit_of(
-    law: str, parameters: Mapping[str, float], group: Group, dt_s: float, n: float, m: _Floats, white: float = 1.0
+    law: str,
+    parameters: Mapping[str, float],
+    group: Group,
+    dt_s: float,
+    n: float,
+    m: _Floats,
+    white: float = 1.0,
+    block: int = 1,
 ) -> Fit:
     """The curve at `parameters` that `n` readings have determined, beside the group's priors. The information in them
     is Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum. `white` multiplies
-    the white noise's variance."""
+    the white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
     names = of.parameters
     ln_estimate = np.log([parameters[name] for name in names])
 
     def at(ln_theta: _Floats) -> Terms:
         theta = dict(zip(names, np.exp(ln_theta).tolist(), strict=True))
-        terms = terms_of(of, theta, dt_s)
+        terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
     k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
@@ -235,8 +249,11 @@ def curve_of(
     *,
     white: float = 1.0,
     half_life_s: float = 0.0,
+    block: int = 1,
 ) -> Curve | None:
-    """Readings `y` every `dt_s` (NaN: missing) beside `law` at its posterior medians; None if there are too few.
+    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, beside `law` at its posterior medians.
+
+    None if there are too few.
 
     The record has also determined the parameters, so the two are nearer to each other than a record is to a curve known
     beforehand. With a the logarithm of the record's Allan variance, S its variance about the true curve, and V the
@@ -257,11 +274,11 @@ def curve_of(
     m = np.array([entry[0] for entry in found], float)
     recorded = np.array([entry[1] for entry in found])
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    fit = fit_of(law, medians, group, dt_s, n, m, white)
+    fit = fit_of(law, medians, group, dt_s, n, m, white, block)
     own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in found])
     left = np.maximum(own - known * fit.variance, _LEAST_LEFT * own)
     ratio = recorded / fit.allan_variance
-    low, high = _band(law, estimates, fit, group, dt_s, m, white)
+    low, high = _band(law, estimates, fit, group, dt_s, m, white, block)
     return Curve(
         m * dt_s,
         np.sqrt(recorded),
@@ -283,6 +300,7 @@ def _band(
     dt_s: float,
     m: _Floats,
     white: float,
+    block: int,
 ) -> tuple[_Floats, _Floats]:
     """5 % and 95 % limits of the model's deviation over posterior draws: each parameter's own quantiles, and between
     parameters the correlation that the information has."""
@@ -295,7 +313,7 @@ def _band(
     draws = np.exp(middle + z * np.where(z > 0.0, up, down))
     curves = []
     for draw in draws.tolist():
-        terms = terms_of(group.laws[law], dict(zip(estimates, draw, strict=True)), dt_s)
+        terms = terms_of(group.laws[law], dict(zip(estimates, draw, strict=True)), dt_s, block)
         curves.append(replace(terms, variance=terms.variance * white).allan_variance(m))
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
     return low, high

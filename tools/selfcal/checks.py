@@ -55,6 +55,7 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
         group,
         white=float(blocks.r[np.isfinite(blocks.mean)].mean()),
         half_life_s=tables.half_life_s,
+        block=tables.block,
     )
     checks = innovation_checks(blocks, tables, group, result, list(used))
     return Judged({**checks, **(allan_checks(curve) if curve else {})}, curve)
@@ -144,6 +145,7 @@ def innovation_checks(
         blocks.r,
         np.ascontiguousarray(z[:, used]) if used else None,
         sd[used] if used else None,
+        tables.block,
     )[1 + len(used) :]  # the first ones are the bias and the coefficients
     pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
     whole = nu[np.isfinite(nu)]

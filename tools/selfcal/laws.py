@@ -22,6 +22,9 @@ PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3,
 RATIOS = ("spectral_ratio", "markov_ratio")
 RATIO_LIMITS = (1e-3, 1e3)
 
+#: Correlation times in an interval beyond which the means of a drift count as white: neighbours' correlate by 0.02.
+FORGOTTEN = 20.0
+
 #: (walk, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
 LawTuple = tuple[list[tuple[bool, float, float, bool, bool]], bool]
 
@@ -103,6 +106,22 @@ class Law:
             for t, is_open in zip(self.terms, open_terms, strict=True)
         )
         return replace(self, terms=tuple(terms))
+
+
+def averaged(x: float, block: int) -> tuple[float, float]:
+    """Means of a Gauss-Markov drift over `block` readings, `x` its bandwidth times the interval of a mean.
+
+    They are a first-order process beside white noise of a negative variance. Returns the process's variance and what
+    the white noise lacks, both over the drift's own (lib/DESIGN.md, "Block means of the drift"). Of a walk of step
+    variance q per interval the white noise lacks (1 - 1 / block^2) q / 6.
+    """
+    if block == 1:
+        return 1.0, 0.0
+    rate, phi = -block * math.expm1(-x / block), math.exp(-x / block)
+    gain = phi * math.exp(min(x, FORGOTTEN)) * (math.expm1(-x) / rate) ** 2
+    if x < 1e-3:  # right to x^2 / 20; the difference below would lose its digits
+        return gain, (1.0 - 1.0 / block**2) * x / 3.0
+    return gain, gain - (1.0 + phi + 2.0 * phi * math.expm1(-x) / rate) / rate
 
 
 def _flicker() -> Law:

@@ -16,7 +16,7 @@ from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.ending import Stopped
 from selfcal.errors import remark
-from selfcal.laws import RATIO_LIMITS
+from selfcal.laws import RATIO_LIMITS, averaged
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
 
@@ -62,10 +62,11 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
     colored = any(one.state.extras.color for one in found.values())
+    block = 1 if colored else max(1, round(record.recorded_hz / record.rate_hz))
     tree["simulate"] = {
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
-        "axes": {name: fitted_law(one) for name, one in found.items()},
+        "axes": {name: fitted_law(one, block) for name, one in found.items()},
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
@@ -193,8 +194,13 @@ def _color(tree: dict[str, Any], one: Diagnosed) -> None:
     _law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
 
 
-def fitted_law(one: Diagnosed) -> dict[str, Any]:
-    """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias."""
+def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
+    """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias.
+
+    The fit takes the drift for a point at each of its samples, which are means of `block` others (laws.averaged), by
+    default of the recording's.
+    """
+    block = max(1, round(one.record.recorded_hz / one.record.rate_hz)) if block is None else block
     fit = one.state.best
     N = fit.sigma * math.sqrt(fit.dt)
     if fit.terms.color:
@@ -204,29 +210,30 @@ def fitted_law(one: Diagnosed) -> dict[str, Any]:
         N *= math.sqrt((1.0 + lag1) / (1.0 - lag1))
     # The read-out adds lsb^2 / 12 by itself.
     N = math.sqrt(max(N * N - one.state.lsb**2 / 12.0 * fit.dt, 1e-4 * N * N))
+    drift: dict[str, Any] = {"hypothesis": "constant"}
+    lacking = 0.0
+    if fit.terms.walk:
+        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
+        drift = {"hypothesis": "random_walk", "K": _digits(K)}
+        lacking = (1.0 - 1.0 / block**2) / 6.0 * K**2 * fit.dt
+    elif fit.terms.markov:
+        alpha = math.exp(fit.value("ln_alpha"))
+        gain, rest = averaged(alpha * fit.dt, block)
+        sigma_m = fit.sigma * math.exp(fit.value("ln_markov")) / math.sqrt(gain)
+        drift = {"hypothesis": "gauss_markov", "sigma_m": _digits(sigma_m), "alpha": _digits(alpha)}
+        lacking = rest * sigma_m**2
     # The simulator's ramp and temperature begin at 0.
     at_first = sum(
         float(c * column.values[0])
         for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
         if column.cause in ("ramp", "temperature")
     )
-    truth: dict[str, Any] = {
-        "hypothesis": "constant",
+    return {
+        "hypothesis": drift.pop("hypothesis"),
         "bias": _digits(one.state.level + float(fit.c[0]) + at_first),
-        "N": _digits(N),
+        "N": _digits(math.sqrt(N**2 + lacking * fit.dt)),
+        **drift,
     }
-    if fit.terms.walk:
-        truth |= {
-            "hypothesis": "random_walk",
-            "K": _digits(fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)),
-        }
-    elif fit.terms.markov:
-        truth |= {
-            "hypothesis": "gauss_markov",
-            "sigma_m": _digits(fit.sigma * math.exp(fit.value("ln_markov"))),
-            "alpha": _digits(math.exp(fit.value("ln_alpha"))),
-        }
-    return truth
 
 
 def _seconds(value: float) -> str:

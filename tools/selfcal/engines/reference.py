@@ -67,12 +67,14 @@ def identify_axis(
     r: _Floats | None = None,
     z: _Floats | None = None,
     coefficient_sd: Sequence[float] = (),
+    block: int = 1,
 ) -> AxisResult:
     """Posterior of one axis under the continuous priors of its group.
 
     `y` float64[n] in the group's unit every `dt` s, NaN where a sample is missing; `r` float64[n] is the factor on the
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
-    of the regressors in use, less their references, with the prior `coefficient_sd` of each. Raises UserError without a
+    of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
+    samples. Raises UserError without a
     sample, and when a posterior would take more than `_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
@@ -83,7 +85,7 @@ def identify_axis(
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
     columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
-    found = {name: _posterior(centred, dt, offset, group, name, factors, columns) for name in hypotheses}
+    found = {name: _posterior(centred, dt, offset, group, name, factors, columns, block) for name in hypotheses}
     ln_weight = {name: math.log(hypotheses[name]) + found[name].ln_evidence for name in found if hypotheses[name] > 0.0}
     top = max(ln_weight.values())
     total = sum(math.exp(value - top) for value in ln_weight.values())
@@ -109,11 +111,12 @@ def _posterior(
     law: str,
     r: _Floats | None,
     columns: tuple[_Floats, _Floats] | None,
+    block: int,
 ) -> _Posterior:
     z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
-    states = max(1, len(of.terms))
-    drift = [*[1.0] * states, *[0.0] * (2 if of.coloured_noise else 0)]  # e_i and e_(i-1) are noise
+    means = len(of.terms) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
+    drift = [*[1.0] * max(1, len(of.terms)), *[0.0] * (means + (2 if of.coloured_noise else 0))]
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     now = np.concatenate([drift, [1.0], columns_now])
     names = of.parameters
@@ -139,6 +142,7 @@ def _posterior(
             r,
             z,
             sd,
+            block,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
         own = np.diagonal(covariance, axis1=1, axis2=2)[:, len(drift) + 1 :]

@@ -257,9 +257,18 @@ def identify_axis(
             raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")
         for choice in choices:
             used = _used(mask_of(regressors, choice))
-            with_columns = (z[:, used], sd[used].tolist()) if used else ()
+            beside, coefficient_sd = (z[:, used] if used else None), sd[used].tolist()
             results.append(
-                reference.identify_axis(blocks.mean, tables.dt_s, group, model.hypotheses, blocks.r, *with_columns)
+                reference.identify_axis(
+                    blocks.mean,
+                    tables.dt_s,
+                    group,
+                    model.hypotheses,
+                    blocks.r,
+                    beside,
+                    coefficient_sd,
+                    tables.block,
+                )
             )
             advance()
     kept = kept_out_of(blocks, recording)

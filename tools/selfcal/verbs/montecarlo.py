@@ -20,19 +20,25 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from selfcal.allan import terms_of
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.laws import Law, named
 from selfcal.model import Group, Model, Prior
 from selfcal.spread import Row, record_seeds, spread
 from selfcal.table import TABLE_WIDTH
-from selfcal.tables import make_tables
+from selfcal.tables import Tables, bank_block, make_tables
 
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.
 MIN_SAMPLES = 10
 #: Of a record: 80 MB.
 MOST_SAMPLES = 10_000_000
+
+
+#: Samples drawn of a bank interval and averaged as the intake does, where the sensor gives as many: their drift's mean
+#: is that of infinitely many to a hundredth of the averaging's effect.
+BLOCK = 10
 
 
 #: What of each estimate of the true law a row has.
@@ -50,7 +56,10 @@ def montecarlo(
     scheduler: str | None = None,
     results: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Simulate `records` records per law at the bank rate, identify each with the library, and compare with the truth.
+    """Simulate `records` records per law, at most BLOCK samples a bank interval, identify each with the library, and
+    compare with the truth.
+
+    Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law.
 
     `scheduler`: address of a Dask scheduler, else the work is done here; the numbers are the same. `results`: a folder
     that keeps finished records, so that a run that was stopped goes on, and one of more records adds to it.
@@ -98,10 +107,18 @@ def _draw(prior: Prior, rng: np.random.Generator) -> float:
     return math.exp(rng.uniform(math.log(prior.min), math.log(prior.max)))
 
 
+def has_nodes(law: Law, truth: Mapping[str, float], tables: Tables) -> bool:
+    """Whether the grid can have a node for the law. Averages of a faster drift have less white noise than none."""
+    terms = terms_of(law, truth, tables.dt_s, tables.block)
+    return terms.lacking < terms.variance * (1.0 - 2.0 * abs(terms.lag1))
+
+
 def simulate_bank_samples(
-    law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int
+    law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int, bank_block: int = 1
 ) -> tuple[NDArray[np.float64], float]:
     """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
+
+    Of `bank_block` samples a bank interval coloured noise is a moving average.
 
     A law by its name takes a stated correlation time from the truth's `correlation_time_s`.
     """
@@ -109,6 +126,7 @@ def simulate_bank_samples(
 
     scene = _reference.Scene()
     scene.seed, scene.rate_hz, scene.samples, scene.block, scene.filter_taps = seed, rate_hz, samples, 1, 1
+    scene.bank_block = bank_block
     axis = _reference.Axis()
     of = named(law, truth.get("correlation_time_s", math.nan)) if isinstance(law, str) else law
     axis.law, axis.N, axis.bias = of.as_tuple, truth["N"], truth.get("bias", 0.0)
@@ -122,16 +140,28 @@ def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     from selfcal.engines.library import Bank
 
     law, seed = job
-    tables = make_tables(model, model.bank_rate_hz, (axis,))
+    block = min(BLOCK, bank_block(model.sensor_rate_hz, model.bank_rate_hz))
+    rate_hz = block * model.bank_rate_hz
+    tables = make_tables(model, rate_hz, (axis,))
     place = list(model.hypotheses).index(law)
-    truth = draw(model.group_of(axis), law, np.random.default_rng([seed, place]))
+    rng = np.random.default_rng([seed, place])
+    truth = draw(model.group_of(axis), law, rng)
+    drawn = 1
+    while not has_nodes(model.laws[law], truth, tables):
+        truth = draw(model.group_of(axis), law, rng)
+        drawn += 1
     y, bias_now = simulate_bank_samples(
-        model.laws[law], truth, model.bank_rate_hz, round(duration_s * model.bank_rate_hz), seed
+        model.laws[law], truth, rate_hz, block * round(duration_s * model.bank_rate_hz), seed, block
     )
     bank = Bank(tables)
     bank.push(y[:, None])
     result = bank.report(0)
-    row: Row = {"law": law, "seed": seed, "bias_error_sd": (result.bias_mean - bias_now) / result.bias_sd}
+    row: Row = {
+        "law": law,
+        "seed": seed,
+        "drawn": drawn,
+        "bias_error_sd": (result.bias_mean - bias_now) / result.bias_sd,
+    }
     row |= {f"truth.{name}": value for name, value in truth.items()}
     row |= {f"probability.{name}": value for name, value in result.probability.items()}
     for name, estimate in result.parameters[law].items():
@@ -158,6 +188,7 @@ def _summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) ->
             "parameters": parameters,
             "false_identification": float(np.mean([_chosen(row) != law for row in mine])),
             "bias_coverage_90": float((np.abs(errors) < 1.6449).mean()),
+            "without_nodes": float(1.0 - len(mine) / sum(row["drawn"] for row in mine)),
         }
     top = np.array([max(_probability(row).values()) for row in rows])
     wrong = np.array([_chosen(row) != row["law"] for row in rows])
