@@ -72,7 +72,7 @@ static points_t points_of(const selfcal_model_t *model, const selfcal_law_t *law
                           selfcal_wide_t drift, selfcal_wide_t second) {
     const selfcal_wide_t dt = (selfcal_wide_t)model->dt_s, white = N * N / dt;
     const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0);
-    const selfcal_wide_t variance = fmax(white - white_left_out(law, second, dt, model->block) * square,
+    const selfcal_wide_t variance = fmax(white - selfcal_white_left_out(law, second, dt, model->block) * square,
                                          WHITE_LEAST * white);
     const points_t points = {variance, square / variance};
     return points;
@@ -94,7 +94,7 @@ static selfcal_reopening_t likely_place(const selfcal_model_t *model, const self
     if (has_drift(law)) {
         const bool pole = has_alpha(law) && !is_sum(law);
         const selfcal_real_t x = (selfcal_real_t)(second * (selfcal_wide_t)model->dt_s);
-        const selfcal_wide_t gain = pole ? (selfcal_wide_t)averaged(x, model->block).gain : 1.0;
+        const selfcal_wide_t gain = pole ? (selfcal_wide_t)selfcal_averaged(x, model->block).gain : 1.0;
         at.ln_rho = (float)(0.5 * log(points.square * gain));
     }
     if (has_second) {
@@ -140,7 +140,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
         }
         const size_t at = watch->next.states++;
         const selfcal_wide_t rate = bandwidth_of(term, second) * dt, pole = exp(-fmin(rate, ALPHA_DT_MAX));
-        const selfcal_wide_t stationary = (selfcal_wide_t)averaged((selfcal_real_t)rate, model->block).gain *
+        const selfcal_wide_t stationary = (selfcal_wide_t)selfcal_averaged((selfcal_real_t)rate, model->block).gain *
                                           markov_variance(law, term, square, second, dt);
         watch->next.pole[at] = (selfcal_real_t)pole;
         watch->next.variance[at] = (selfcal_real_t)stationary;

@@ -663,7 +663,7 @@ void selfcal_bank_ln_s(const selfcal_t *self, uint16_t index, selfcal_node_view_
 }
 
 static selfcal_averaged_t averaged_at(const selfcal_t *self, selfcal_place_t place) {
-    return averaged(r_exp(place.ln_alpha) * (selfcal_real_t)self->model->dt_s, self->model->block);
+    return selfcal_averaged(r_exp(place.ln_alpha) * (selfcal_real_t)self->model->dt_s, self->model->block);
 }
 
 selfcal_wide_t selfcal_bank_per_prediction(const selfcal_t *self, uint16_t index) {

@@ -88,7 +88,8 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
             node->p[term_pair(a, a)] = deviation * deviation * square; /* x_0 = 0 */
         } else {
             const selfcal_wide_t rate = bandwidth_of(term, second) * dt_s; /* of an interval */
-            const selfcal_wide_t variance = (selfcal_wide_t)averaged((selfcal_real_t)rate, self->model->block).gain *
+            const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)rate, self->model->block);
+            const selfcal_wide_t variance = (selfcal_wide_t)of.gain *
                                             markov_variance(law, term, square, second, dt_s); /* stationary */
             node->beta[a] = (selfcal_real_t)-expm1(-fmin(rate, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
@@ -99,7 +100,7 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
     if (law->coloured_noise) {
         const size_t last = law->terms;
         /* White noise that the drift leaves out is missing at all frequencies. */
-        const selfcal_wide_t out = white_left_out(law, second, dt_s, self->model->block) * square;
+        const selfcal_wide_t out = selfcal_white_left_out(law, second, dt_s, self->model->block) * square;
         const selfcal_wide_t per_ratio_sq = fmax((1.0 + out) / (second * second) - out,
                                                  exp(-2.0 * (selfcal_wide_t)LN_RATIO_MAX));
         node->theta = (selfcal_real_t)tanh(-0.25 * log(per_ratio_sq)); /* (ratio - 1)/(ratio + 1) */
@@ -355,7 +356,7 @@ static void terms_now(const selfcal_t *self, size_t j, term_now_t now[SELFCAL_TE
             now[a].after = (selfcal_wide_t)(node->q[a] * averaged_walk_after(block));
         } else {
             const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
-            const selfcal_averaged_t of = averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
+            const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
             now[a].per_prediction = (selfcal_wide_t)of.now / phi_of(node, a);
             now[a].after = markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
         }

@@ -45,13 +45,13 @@ uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension) {
 
 selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln_alpha) {
     const selfcal_model_t *model = work->bank->model;
-    return has_pole(work) ? averaged(r_exp(ln_alpha) * (selfcal_real_t)model->dt_s, model->block).gain : R(1.0);
+    return has_pole(work) ? selfcal_averaged(r_exp(ln_alpha) * (selfcal_real_t)model->dt_s, model->block).gain : R(1.0);
 }
 
 /* White noise that the drift leaves out at rho = 1, over sigma_v^2. `ln_second`: of alpha or of the ratio. */
 static selfcal_real_t left_out_of(const selfcal_work_t *work, selfcal_real_t ln_second) {
     const selfcal_model_t *model = work->bank->model;
-    return (selfcal_real_t)white_left_out(hypothesis_of(work)->law, (selfcal_wide_t)r_exp(ln_second),
+    return (selfcal_real_t)selfcal_white_left_out(hypothesis_of(work)->law, (selfcal_wide_t)r_exp(ln_second),
                                           (selfcal_wide_t)model->dt_s, model->block) /
            selfcal_points_gain(work, ln_second);
 }
