@@ -28,7 +28,7 @@ from scipy.signal import lfilter
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 UNITS = {"g": "deg/s", "a": "m/s^2"}
-#: White noise density N by kind of axis; offsets cover 0 to one g, where eight digits leave one decimal fewer.
+#: White noise density N by kind of axis.
 N = {"g": 0.04, "a": 0.005}
 FORMS = ("float", "lattice", "digits", "means")
 #: Readings that the form `means` averages.
@@ -38,8 +38,11 @@ SECONDS = 1800.0
 MOST = 0.008
 
 
-def axis(random: np.random.Generator, kind: str, n: int, dt: float, form: str) -> NDArray[np.float64]:
-    """[n]: readings of one clean axis every `dt` s."""
+def axis(random: np.random.Generator, name: str, n: int, dt: float, form: str) -> NDArray[np.float64]:
+    """[n]: readings of one clean axis every `dt` s. az is upright; gyros have levels on both sides of 1."""
+    kind = name[0]
+    upright = random.choice([-9.80665, 9.80665]) if name == "az" else random.uniform(-0.3, 0.3)
+    offset = upright if kind == "a" else random.choice([0.0, random.uniform(-0.5, 0.5), random.uniform(0.9, 1.1)])
     fine = MEANT if form == "means" else 1
     step = dt / fine
     count = n * fine
@@ -55,8 +58,6 @@ def axis(random: np.random.Generator, kind: str, n: int, dt: float, form: str) -
         kick = sigma * np.sqrt(1.0 - phi**2) * random.normal(size=count)
         kick[0] = sigma * random.normal()
         drift = lfilter([1.0], [1.0, -phi], kick)
-    gravity = random.choice([-9.80665, 9.80665])
-    offset = random.choice([0.0, random.uniform(-0.5, 0.5), random.uniform(0.9, 1.1), gravity])
     values = offset + drift + white
     if form in ("lattice", "means"):
         q = 0.25 * density / np.sqrt(step)
@@ -69,7 +70,7 @@ def write(path: Path, seed: int, rate: float, form: str) -> None:
     """One record of six clean axes."""
     random = np.random.default_rng([seed, round(rate * 1000)])
     n = round(SECONDS * rate)
-    columns = {f"{name}[{UNITS[name[0]]}]": axis(random, name[0], n, 1.0 / rate, form) for name in AXES}
+    columns = {f"{name}[{UNITS[name[0]]}]": axis(random, name, n, 1.0 / rate, form) for name in AXES}
     t = np.arange(n) / rate
     if path.suffix == ".npz":
         np.savez(path, allow_pickle=False, **{"t[s]": t, **columns})
