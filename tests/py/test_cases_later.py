@@ -1,0 +1,67 @@
+"""Logs whose right answer takes a part that is not built yet. Each test fails, and names the step that builds it.
+
+Truth: the numbers in each script of the shared cases. The day an answer is right the test fails as `strict`: move it to
+the file of its kind.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from selfcal.errors import UserError
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify
+
+from conftest import shared_case
+
+
+def later(step: int, part: str) -> pytest.MarkDecorator:
+    """Strict: an answer that has become right is a failure of this file."""
+    return pytest.mark.xfail(strict=True, raises=(AssertionError, UserError), reason=f"step {step}: {part}")
+
+
+def causes_of(log: Path) -> dict[str, dict[str, Any]]:
+    """Estimates by cause, of every axis, from means of 1 s."""
+    axes = diagnose(log, decimate=1.0)["axes"]
+    return {finding["cause"]: finding["estimate"] for axis in axes.values() for finding in axis.get("findings", [])}
+
+
+@later(12, "forms of a channel's influence")
+def test_a_cubic_of_the_temperature_has_its_curvature(tmp_path: Path) -> None:
+    """P30: from -5 to 40 degC. The form's keys are those of the contract; `ramp` is wrong."""
+    found = causes_of(shared_case("P30_cubic.py", tmp_path))
+    assert "ramp" not in found
+    assert found.get("temperature", {}).get("form") in ("square", "cube")
+
+
+@later(12, "turn_on")
+@pytest.mark.parametrize(
+    ("case", "amplitude", "tau_s"), [("P31_warmup.py", 0.4, 600.0), ("P31c_warmup_short.py", 0.2, 300.0)]
+)
+def test_self_heating_without_a_channel_is_a_turn_on(case: str, amplitude: float, tau_s: float, tmp_path: Path) -> None:
+    """Amplitude and time constant within 4 sd of 0.4 or 0.2 deg/s, 600 or 300 s."""
+    found = causes_of(shared_case(case, tmp_path))
+    assert "turn_on" in found
+    for key, truth in (("amplitude", amplitude), ("tau_s", tau_s)):
+        assert abs(abs(found["turn_on"][key]["median"]) - truth) < 4.0 * found["turn_on"][key]["sd"]
+
+
+@later(14, "priors from the record")
+def test_a_tactical_gyro_has_an_answer(tmp_path: Path) -> None:
+    """P94: 0.012 deg/sqrt(h) is N = 2e-4 deg/s/sqrt(Hz), without a model file. 4 sd."""
+    (axis,) = identify(shared_case("P94_tactical.py", tmp_path), json=tmp_path / "out.json")["axes"].values()
+    assert "error" not in axis
+    law = max(axis["hypotheses"], key=axis["hypotheses"].get)
+    N = axis["parameters"][law]["N"]
+    assert abs(N["median"] - 2e-4) < 4.0 * N["sd"]
+    assert not any(one.get("off_grid") for one in axis["parameters"][law].values())
+
+
+@later(15, "quantization noise Q")
+def test_quantization_noise_stands_beside_white_noise(tmp_path: Path) -> None:
+    """P23: increments counted in steps of 2e-3 m/s beside N = 8e-4 m/s^2/sqrt(Hz). 4 sd."""
+    (axis,) = identify(shared_case("P23_qn_accel.py", tmp_path))["axes"].values()
+    law = max(axis["hypotheses"], key=axis["hypotheses"].get)
+    N = axis["parameters"][law]["N"]
+    assert abs(N["median"] - 8e-4) < 4.0 * N["sd"]
