@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import signal
 import socket
 import struct
@@ -29,6 +31,8 @@ SHARED_CASES = Path(os.environ.get("SELFCAL_CASES_DIR", ROOT.parent / "shared" /
 #: Records of each kind in `test_cases_*.py`. 0: `make test`, a few. 1: `make cases`, as many as each test wants.
 CASE_RECORDS = int(os.environ.get("SELFCAL_CASES", "0"))
 COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
+#: The command in a printed line, which runs when it is pasted.
+CALLED = "selfcal" if shutil.which("selfcal") == COMMAND[0] else shlex.quote(COMMAND[0])
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -29,7 +29,7 @@ from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
-from conftest import run
+from conftest import CALLED, run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "hidden"))
 from generator import CAUSES, CLEAN, Record, draw
@@ -369,7 +369,7 @@ def test_identify_names_the_strongest_suspicion(tmp_path: Path) -> None:
     done = run("identify", "log.npz", "--axis", "gx", "--axis", "gy", "--json", "found.json", cwd=tmp_path)
     lines = done.stdout.splitlines()
     at = lines.index("strongest suspicion: gx: periodic")
-    assert lines[at + 1] == "why, and what mends it: selfcal diagnose log.npz"
+    assert lines[at + 1] == f"why, and what mends it: {CALLED} diagnose log.npz"
     axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert not axes["gx"]["adequate"] and axes["gx"]["suspicion"] == "periodic"
     assert axes["gy"]["adequate"] and "suspicion" not in axes["gy"]
