@@ -282,7 +282,7 @@ def test_a_bad_entry_is_one_clear_line(entry: str, said: str, tmp_path: Path) ->
 def test_codegen_writes_tables_that_compile(tmp_path: Path) -> None:
     """gcc with the library's warnings; the sizes in the header make the memory that selfcal_init() asks for."""
     folder = tmp_path / "model"
-    codegen(model_file(tmp_path, ENTRIES), folder, target="cortex-m0")
+    codegen(model_file(tmp_path, ENTRIES), folder, target="cortex-m4f")
     (tmp_path / "main.c").write_text(
         "#include <stdlib.h>\n"
         '#include "selfcal_model.h"\n'

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -97,7 +98,7 @@ def demonstration(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         try:
             assert process.stdout is not None
             said = [process.stdout.readline() for _ in range(3)]
-            yield process, said[1].partition("selfcal monitor ")[2].strip()
+            yield process, said[1].partition(f"{shlex.join(COMMAND)} monitor ")[2].strip()
         finally:
             process.kill()
 

@@ -269,6 +269,11 @@ def _document(
         rate_hz=block / interval if interval > 0.0 else math.nan,
         samples=int(status["samples"]) if "samples" in status else None,
         duration_s=max(reports[-1].time_s for reports in history.values()),
+        start_s=0.0,
+        columns={axis: SimpleNamespace(clock=None) for axis in history},
+        paths=(),
+        options=(),
+        notes=(),
     )
     found = {
         axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
