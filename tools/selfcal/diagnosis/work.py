@@ -13,9 +13,9 @@ from typing import TypeVar
 
 from selfcal.ending import Stopped
 
-#: Work of an axis at most, samples times columns that the filter has run over: some 30 s of a processor. A record of
-#: more than half a million samples has 3000 passes over the readings and the bias: some 50 s a million samples.
-MOST, MOST_PASSES = 3e9, 3000
+#: Work of an axis at most, samples times columns that the filter has run over: some 40 s of a processor. A record of
+#: more than 0.7 million samples has 6000 passes over the readings and the bias: some 50 s a million samples.
+MOST, MOST_PASSES = 8e9, 6000
 
 T = TypeVar("T")
 R = TypeVar("R")
