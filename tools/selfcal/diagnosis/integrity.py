@@ -136,7 +136,7 @@ def stuck(record: Record, axis: str) -> Look | None:
 
 def _averaged(steps: float) -> bool:
     """Whether the stated lattice has a whole number of these `steps`: the log has means of so many readings."""
-    return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.005 * steps
+    return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.002 * steps
 
 
 def quantization(state: State) -> Look | None:
