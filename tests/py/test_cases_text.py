@@ -596,3 +596,17 @@ def test_sound_stamps_are_neither_bursts_nor_wraps(tmp_path: Path) -> None:
         assert int(recording.missing_before.sum()) == pytest.approx(lost, abs=0.01 * n)
         assert recording.rate_hz == pytest.approx(rate, rel=0.011)
         assert recording.notes == ()
+
+
+def test_the_fast_axis_beside_a_slower_one_can_be_taken_along_twice(tmp_path: Path) -> None:
+    """`replay` does. A bridged column has the clock that it was bridged to."""
+    random = np.random.default_rng(7)
+    names = []
+    for name, rate, unit in (("gx", 25.0, "deg/s"), ("az", 10.0, "m/s^2")):
+        n = round(60.0 * rate)
+        names.append(tmp_path / f"{name}.csv")
+        rows = np.column_stack([np.arange(n) / rate, random.normal(size=n)])
+        np.savetxt(names[-1], rows, "%.9g", ",", header=f"t[s],{name}[{unit}]", comments="")
+    once = load(names).along("gx")
+    assert {one.values.size for one in once.columns.values()} == {1500}
+    assert {one.values.size for one in once.along("gx").columns.values()} == {1500}

@@ -212,7 +212,7 @@ class Recording:
             columns = {
                 name: replace(one, values=one.values[used])
                 if name in names or (one.clock is own_clock and np.isfinite(one.values).all())
-                else replace(one, values=_bridged(self.clock_of(name), one.values, time))
+                else replace(one, values=_bridged(self.clock_of(name), one.values, time), clock=own_clock)
                 for name, one in self.columns.items()
             }
         if own_clock is None and used.all():
