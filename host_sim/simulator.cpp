@@ -234,7 +234,7 @@ double read_out(double value, const Axis &axis) {
 
 } // namespace
 
-Simulated simulate(const Scene &scene, const std::vector<Axis> &axes) {
+Simulated simulate(const Scene &scene, const std::vector<Axis> &axes, const Added &added) {
     Simulated out;
     out.temperature = temperature_curve(scene);
     out.supply = supply_curve(scene);
@@ -252,10 +252,17 @@ Simulated simulate(const Scene &scene, const std::vector<Axis> &axes) {
         const Axis &axis = axes[a];
         for (std::size_t i = 0; i < scene.samples; ++i) {
             const double other = axis.cross_coefficient * error[axis.cross_axis][i];
-            out.axes[a][i] = read_out(axis.bias + error[a][i] + other +
-                                          axis.temperature_coefficient * (out.temperature[i] - out.temperature[0]) +
-                                          axis.supply_coefficient * (out.supply[i] - nominal_supply_v),
-                                      axis);
+            out.axes[a][i] = axis.bias + error[a][i] + other +
+                             axis.temperature_coefficient * (out.temperature[i] - out.temperature[0]) +
+                             axis.supply_coefficient * (out.supply[i] - nominal_supply_v);
+        }
+    }
+    if (added) {
+        added(out);
+    }
+    for (std::size_t a = 0; a < axes.size(); ++a) {
+        for (double &value : out.axes[a]) {
+            value = read_out(value, axes[a]);
         }
     }
     for (std::size_t i = 0; i < scene.samples; ++i) { // the temperature register's zero is 25 degC

@@ -12,6 +12,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <vector>
 
 namespace selfcal_reference {
@@ -66,7 +67,10 @@ constexpr double nominal_supply_v = 5.0;
 constexpr double temperature_lsb = 0.14;   // ADIS16405
 constexpr double supply_lsb = 2.418e-3;
 
+// What a caller adds to the readings of all axes before the read-out.
+using Added = std::function<void(Simulated &)>;
+
 // The same arguments give the same recording, and an effect leaves everything else of it as it was.
-Simulated simulate(const Scene &scene, const std::vector<Axis> &axes);
+Simulated simulate(const Scene &scene, const std::vector<Axis> &axes, const Added &added = {});
 
 } // namespace selfcal_reference

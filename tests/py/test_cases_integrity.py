@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.diagnosis.loop import Diagnosed, diagnose_record
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.model import Model
 from selfcal.readings import evened, look

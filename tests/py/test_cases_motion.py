@@ -15,7 +15,8 @@ from scipy.stats import binom
 
 from selfcal.diagnosis import integrity, words
 from selfcal.diagnosis.causes.motion import loud
-from selfcal.diagnosis.loop import Diagnosed, diagnose_record
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.diagnosis.causes import noise, periodic, step
+from selfcal.diagnosis.causes import periodic, step, variance_change
 from selfcal.diagnosis.fit import Series, finish, run
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State
@@ -106,7 +106,7 @@ def test_a_change_of_the_noise_beside_a_gap(place: str) -> None:
         white = random.standard_normal(t.size) * np.where(t >= time, ratio, 1.0)
         y = white + math.exp(random.uniform(-4.5, -2.5)) * random.standard_normal(t.size).cumsum()
         y[begin:end] = np.nan
-        look = looked(y, rate, noise.variance_change)
+        look = looked(y, rate, variance_change.looks)
         assert look is not None
         times.append(holds(look.estimate["time_s"], time))
         ratios.append(holds(look.estimate["ratio"], ratio))

@@ -18,8 +18,9 @@ import pytest
 import yaml
 
 from selfcal.diagnosis.extend import extended
+from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import Fit, run
-from selfcal.diagnosis.loop import Diagnosed, diagnose_record
+from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.state import State
 from selfcal.model import DEFAULT, Model

@@ -23,10 +23,12 @@ import numpy as np
 import pytest
 
 from selfcal.diagnosis import chart, integrity, pictures
-from selfcal.diagnosis.causes import noise, periodic, regressors, step
+from selfcal.diagnosis.causes import colored_noise, periodic, regressors, step, variance_change
+from selfcal.diagnosis.causes import outliers as outliers_cause
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, outside_of
 from selfcal.diagnosis.document import to_document
-from selfcal.diagnosis.loop import Diagnosed, Finding, diagnose_record
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.page import page, write_page
 from selfcal.diagnosis.record import Record, of_recording
 from selfcal.diagnosis.state import Look, State
@@ -92,19 +94,19 @@ def a_line(y: Array) -> Finding:
 
 def a_color(y: Array) -> Finding:
     record = record_of(y + 0.7 * np.append(0.0, y[:-1]))
-    return found(record, noise.colored(record.axes["gx"], record)[0])
+    return found(record, colored_noise.looks(record.axes["gx"], record)[0])
 
 
 def a_change(y: Array) -> Finding:
     record = record_of(y * np.where(np.arange(N) < 900, 1.0, 1.6))
-    return found(record, noise.variance_change(record.axes["gx"], record)[0])
+    return found(record, variance_change.looks(record.axes["gx"], record)[0])
 
 
 def outliers(y: Array) -> Finding:
     y = y.copy()
     y[100:1900:150] += 12.0
     record = record_of(y)
-    return found(record, noise.outliers(record.axes["gx"], record)[0])
+    return found(record, outliers_cause.looks(record.axes["gx"], record)[0])
 
 
 def a_lattice(y: Array) -> Finding:

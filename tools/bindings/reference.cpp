@@ -211,8 +211,8 @@ Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_s
     return out.numpy();
 }
 
-std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<double>> simulate(const sr::Scene &scene,
-                                                                         const std::vector<sr::Axis> &axes) {
+std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<double>> simulate(
+    const sr::Scene &scene, const std::vector<sr::Axis> &axes, nb::object added) {
     if (!(scene.rate_hz > 0.0) || scene.block < 1 || scene.filter_taps < 1)
         throw std::invalid_argument("rate_hz, block and filter_taps must be positive");
     for (const sr::Axis &axis : axes)
@@ -221,7 +221,20 @@ std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<dou
     sr::Simulated simulated;
     {
         nb::gil_scoped_release release;
-        simulated = sr::simulate(scene, axes);
+        // A callable gets the readings [axes][samples], the temperature and the supply, and adds to the first.
+        const sr::Added own = [&](sr::Simulated &made) {
+            const nb::gil_scoped_acquire acquire;
+            const std::size_t length = scene.samples;
+            const Array<double> values({axes.size(), length}), temperature({length}), supply({length});
+            for (std::size_t a = 0; a < axes.size(); a++)
+                std::copy(made.axes[a].begin(), made.axes[a].end(), values.data() + a * length);
+            std::copy(made.temperature.begin(), made.temperature.end(), temperature.data());
+            std::copy(made.supply.begin(), made.supply.end(), supply.data());
+            added(values.numpy(), temperature.numpy(), supply.numpy());
+            for (std::size_t a = 0; a < axes.size(); a++)
+                std::copy_n(values.data() + a * length, length, made.axes[a].begin());
+        };
+        simulated = sr::simulate(scene, axes, added.is_none() ? sr::Added{} : own);
     }
     const std::size_t n = scene.samples;
     const Array<double> values({axes.size(), n}), temperature({n}), supply({n});
@@ -286,7 +299,7 @@ NB_MODULE(_reference, m) {
         .def_rw("motion_amplitude", &sr::Axis::motion_amplitude)
         .def_rw("cross_axis", &sr::Axis::cross_axis)
         .def_rw("cross_coefficient", &sr::Axis::cross_coefficient);
-    m.def("simulate", &simulate, "scene"_a, "axes"_a);
+    m.def("simulate", &simulate, "scene"_a, "axes"_a, "added"_a = nb::none());
     nb::class_<sr::Random>(m, "Random")
         .def(nb::init<std::uint64_t, std::uint64_t>(), "seed"_a, "stream"_a)
         .def("uniform", &sr::Random::uniform)

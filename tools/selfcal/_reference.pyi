@@ -13,7 +13,7 @@ y is, with coefficients c normal about 0 with `coefficient_sd` float64[p], in th
 Arguments that do not fit raise ValueError. All cores are used, the interpreter's lock is released.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,9 +124,12 @@ class Axis:
     cross_coefficient: float
     def __init__(self) -> None: ...
 
-def simulate(scene: Scene, axes: Sequence[Axis]) -> tuple[_Floats, _Floats, _Floats, NDArray[np.bool_], list[float]]:
+def simulate(
+    scene: Scene, axes: Sequence[Axis], added: Callable[[_Floats, _Floats, _Floats], None] | None = None
+) -> tuple[_Floats, _Floats, _Floats, NDArray[np.bool_], list[float]]:
     """A recording: values [axes, samples] in each axis's unit, temperature [samples] in degC, supply [samples] in V,
-    which samples are present [samples], and the true x0 + drift of each axis [axes] at the last sample."""
+    which samples are present [samples], and the true x0 + drift of each axis [axes] at the last sample. `added` gets
+    values, temperature and supply before the read-out, and may change the values in place."""
 
 class Random:
     """SplitMix64 with Box-Muller normals: the same numbers on every machine."""

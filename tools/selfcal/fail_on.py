@@ -23,9 +23,9 @@ class Outcome:
 
 def check(wanted: str | None, more: Collection[str] = ()) -> None:
     """Raise UserError for what is no cause. `more`: what the verb takes besides."""
-    from selfcal.diagnosis.words import WORDS
+    from selfcal.diagnosis.causes import CAUSES
 
-    known = (INADEQUATE, *more, *WORDS)
+    known = (INADEQUATE, *more, *CAUSES)
     if wanted is not None and wanted not in known:
         raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
 

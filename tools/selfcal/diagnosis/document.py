@@ -9,7 +9,8 @@ from typing import Any
 
 from selfcal import units as unit_module
 from selfcal.diagnosis import findable, words
-from selfcal.diagnosis.loop import Diagnosed, Finding
+from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
 from selfcal.diagnosis.state import Look
@@ -106,7 +107,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
         "also_possible": list(finding.also_possible),
-        "record_next": words.NEXT[look.cause],
+        "record_next": CAUSES[look.cause].record_next,
         "shared_with": list(finding.shared_with),
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),

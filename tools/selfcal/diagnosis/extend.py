@@ -8,26 +8,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
+from selfcal.diagnosis.cause import Cause, Extension
+from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import finish
-from selfcal.diagnosis.loop import Diagnosed
+from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.ending import Stopped
 from selfcal.errors import remark
-from selfcal.laws import RATIO_LIMITS, averaged
+from selfcal.laws import averaged
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
-#: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
-OUTLIER_SD = 6.0
-#: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
-NODES = [24, 20]
-#: ... on the Cortex-M0, whose RAM holds one such law beside the random walk.
-SMALL_NODES = [12, 8]
 #: Windows of a channel's trailing mean, s.
 WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
@@ -41,24 +37,10 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
     for name, one in found.items():
-        group = tree["groups"][model.group_of(name).name]
         for finding in one.findings:
-            estimate = finding.look.estimate
-            if finding.look.cause == "flicker":
-                _law(tree, "flicker", "B", dict(group["priors"]["sigma_m"]))
-            elif finding.look.cause == "colored_noise":
-                _color(tree, one)
-            elif finding.look.cause == "quantization":
-                group["lsb"] = _digits(estimate["lsb"]["median"])
-            elif finding.look.cause == "saturation":
-                limit = abs(estimate["limit"]["median"])
-                # A model file states one range for a group: not one that keeps another axis out that was looked at.
-                if all(_within(record, other, limit) for other in group["axes"] if other != name and other in found):
-                    group["range"] = _digits(limit)
-            elif finding.look.cause == "outliers":
-                _handle(tree, "outlier_sd", OUTLIER_SD)
-            elif finding.look.cause == "variance_change" and not tree.get("regressors"):
-                _handle(tree, "variance_changes", True)
+            extend = CAUSES[finding.look.cause].extend
+            if extend is not None:
+                extend(Extension(tree, model, record, name, found, finding))
     _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
     colored = any(one.state.extras.color for one in found.values())
@@ -70,17 +52,6 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
     return tree
-
-
-def _handle(tree: dict[str, Any], what: str, value: float | bool) -> None:
-    """Have the module handle something by itself, unless the model says already how."""
-    tree["handle"] = {what: value, **(tree.get("handle") or {})}
-
-
-def _within(record: Record, axis: str, limit: float) -> bool:
-    """Whether all readings of an axis are within the limit; one that was not recorded is."""
-    state = record.axes.get(axis)
-    return state is None or bool(np.nanmax(np.abs(state.y + state.level)) < limit)
 
 
 def _columns_of(entry: Mapping[str, Any]) -> int:
@@ -109,12 +80,8 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             if regressor.name in stated:
                 continue
             key = _key(regressor.name)
-            entry = entries.setdefault(key, {"name": key, **regressor.entry, "sd": {}, "probability": 0.5})
-            if regressor.cause == "step":  # its time is one of the whole recording's
-                time_s = float(regressor.entry["time_s"]) + record.start_s
-                entry |= {"name": f"step_{time_s:.6g}s", "time_s": time_s}
-            if regressor.cause == "cross_axis":
-                entry["reference"] = _digits(record.axes[str(regressor.entry["column"])].level)
+            own = CAUSES[regressor.cause].entry(regressor.entry, record)
+            entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))
             strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
@@ -164,36 +131,6 @@ def _with_values(one: Diagnosed, channel: str, width: float, reference: float) -
     return finish(replace(one.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
 
 
-def _law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any]) -> None:
-    """Have the model one law more, with a prior of its parameter in every group and nodes on every target."""
-    tree["hypotheses"].setdefault(law, 1)
-    for target, nodes in tree["nodes"].items():
-        own = {"host": NODES, "cortex-m0": SMALL_NODES}.get(target, nodes["gauss_markov"])
-        nodes.setdefault(law, list(own))
-    for group in tree["groups"].values():
-        own = dict(group["priors"]["sigma_m"]) if parameter == "B" else dict(prior)
-        group["priors"].setdefault(parameter, own)
-
-
-def _color(tree: dict[str, Any], one: Diagnosed) -> None:
-    """A law for white noise with memory.
-
-    A first-order process at the bank's own rate is a Gauss-Markov drift of its correlation time, beside a walk. Block
-    means of a faster one, and a moving average, are correlated with their neighbours alone."""
-    fit = one.state.best
-    correlation = math.tanh(fit.value("color"))
-    at_bank_rate = abs(fit.dt * float(tree["bank_rate_hz"]) - 1.0) < 0.01
-    if fit.terms.color == "ar" and correlation > 0.0 and at_bank_rate and "correlation_time_s" not in tree:
-        time_s = -fit.dt / math.log(correlation)
-        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt) if fit.terms.walk else 0.0
-        most = min(10.0 * fit.sigma / max(K * math.sqrt(time_s), 1e-300), RATIO_LIMITS[1])
-        tree["correlation_time_s"] = _digits(time_s)
-        prior = {"law": "log_uniform", "min": _digits(0.01 * most), "max": _digits(most)}
-        _law(tree, "walk_and_markov", "markov_ratio", prior)
-        return
-    _law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
-
-
 def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias.
 
@@ -214,34 +151,26 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     lacking = 0.0
     if fit.terms.walk:
         K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
-        drift = {"hypothesis": "random_walk", "K": _digits(K)}
+        drift = {"hypothesis": "random_walk", "K": digits(K)}
         lacking = (1.0 - 1.0 / block**2) / 6.0 * K**2 * fit.dt
     elif fit.terms.markov:
         alpha = math.exp(fit.value("ln_alpha"))
         gain, rest = averaged(alpha * fit.dt, block)
         sigma_m = fit.sigma * math.exp(fit.value("ln_markov")) / math.sqrt(gain)
-        drift = {"hypothesis": "gauss_markov", "sigma_m": _digits(sigma_m), "alpha": _digits(alpha)}
+        drift = {"hypothesis": "gauss_markov", "sigma_m": digits(sigma_m), "alpha": digits(alpha)}
         lacking = rest * sigma_m**2
     # The simulator's ramp and temperature begin at 0.
     at_first = sum(
         float(c * column.values[0])
         for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
-        if column.cause in ("ramp", "temperature")
+        if column.cause in CAUSES and CAUSES[column.cause].from_zero
     )
     return {
         "hypothesis": drift.pop("hypothesis"),
-        "bias": _digits(one.state.level + float(fit.c[0]) + at_first),
-        "N": _digits(math.sqrt(N**2 + lacking * fit.dt)),
+        "bias": digits(one.state.level + float(fit.c[0]) + at_first),
+        "N": digits(math.sqrt(N**2 + lacking * fit.dt)),
         **drift,
     }
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.4f}".rstrip("0").rstrip(".")
-
-
-def _digits(value: float) -> float:
-    return float(f"{value:.6g}")
 
 
 def _key(column: str) -> str:
@@ -253,19 +182,29 @@ def _effects(name: str, one: Diagnosed) -> list[str]:
     """`--effect` texts that put what an axis has into a simulated record. The simulator has one effect of a kind on an
     axis: the strongest."""
     found = [*_of_columns(one), *_of_findings(one)]
-    strongest: dict[str, tuple[float, dict[str, Any]]] = {}
+    strongest: dict[str, tuple[Cause, float, dict[str, Any]]] = {}
     for cause, strength, pairs in found:
-        if cause not in strongest or strongest[cause][0] < strength:
-            strongest[cause] = (strength, pairs)
+        if cause.id not in strongest or strongest[cause.id][1] < strength:
+            strongest[cause.id] = (cause, strength, pairs)
     texts = []
-    for cause, (_, pairs) in strongest.items():
-        where = {} if cause == "missing_samples" else {"axis": name}
+    for cause, _, pairs in strongest.values():
+        where = {} if cause.common else {"axis": name}
         values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in pairs.items()}
-        texts.append(f"{cause}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
+        texts.append(f"{cause.id}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
     return texts
 
 
-def _of_columns(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
+def _of_findings(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]:
+    """Cause, strength in nats, and the effect's keys, of what is no column. The lattice and the range are in the
+    groups."""
+    for finding in one.findings:
+        cause = CAUSES[finding.look.cause]
+        keys = cause.of_estimate(finding.look) if cause.of_estimate is not None else None
+        if keys is not None:
+            yield cause, finding.look.gain, keys
+
+
+def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]:
     """Cause, strength in nats, and the effect's keys, of the columns in an axis' model."""
     fit = one.state.best
     sizes: dict[str, list[int]] = {}
@@ -277,39 +216,9 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
         strength = sum(
             0.5 * (value / max(float(fit.sd[1 + k]), 1e-300)) ** 2 for value, k in zip(c, places, strict=True)
         )
-        entry = column.entry
-        if column.cause in ("temperature", "supply"):
-            yield column.cause, strength, {"coefficient": c[0]}
-        elif column.cause == "cross_axis":
-            yield column.cause, strength, {"coefficient": c[0], "other": str(entry["column"])}
-        elif column.cause == "ramp":
-            yield column.cause, strength, {"slope": c[0]}
-        elif column.cause == "step":
-            yield column.cause, strength, {"time_s": float(entry["time_s"]), "amplitude": c[0]}
-        elif column.cause == "periodic":
-            yield column.cause, strength, {"frequency_hz": float(entry["frequency_hz"]), "amplitude": math.hypot(*c)}
-
-
-def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
-    """The same of what is no column. The lattice and the range are in the groups."""
-    for finding in one.findings:
-        look = finding.look
-        median = {key: value["median"] for key, value in look.estimate.items() if isinstance(value, Mapping)}
-        if look.cause in ("flicker", "colored_noise"):
-            yield look.cause, look.gain, median
-        elif look.cause == "periodic" and "width_hz" in median:
-            yield look.cause, look.gain, {key: median[key] for key in ("frequency_hz", "amplitude")}
-        elif look.cause == "outliers":
-            yield look.cause, look.gain, {"fraction": median["fraction"]}
-        elif look.cause == "variance_change":
-            yield look.cause, look.gain, {key: median[key] for key in ("time_s", "ratio")}
-        elif look.cause == "motion":
-            times = "+".join(f"{_seconds(a)}-{_seconds(b)}" for a, b in look.estimate["intervals"])
-            yield look.cause, look.gain, {"intervals": times}
-        elif look.cause == "stuck":
-            yield look.cause, look.gain, {"intervals": len(look.estimate["intervals"])}
-        elif look.cause == "missing_samples":
-            yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
+        cause = CAUSES.get(column.cause)
+        if cause is not None and cause.of_column is not None:
+            yield cause, strength, cause.of_column(column, c)
 
 
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:

@@ -11,13 +11,12 @@ from scipy.ndimage import median_filter
 from scipy.special import ndtr
 from scipy.stats import poisson
 
+from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
 from selfcal.diagnosis.statemodel import Array, Mask
 
-#: Missing samples are told of from this share on.
-MISSING_LEAST = 1e-3
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
 #: Readings at most of which a log's means show by their lattice.

@@ -6,28 +6,22 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from selfcal.diagnosis import integrity, score, work
-from selfcal.diagnosis.causes import motion, noise, periodic, regressors, step
+from selfcal.diagnosis.cause import Looks
+from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
 from selfcal.diagnosis.causes.motion import Moved
+from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State
-from selfcal.diagnosis.statistics import Statistic, combined, judged
+from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
+from selfcal.diagnosis.statistics import combined, judged
 from selfcal.ending import Stopped
 
-#: Causes that one round tries on an axis.
-LOOKS: tuple[Callable[[State, Record], list[Look]], ...] = (
-    regressors.looks,
-    step.looks,
-    periodic.looks,
-    noise.colored,
-    noise.flicker,
-    noise.variance_change,
-    noise.outliers,
-)
+#: Looks that one round tries on an axis.
+LOOKS: tuple[Looks, ...] = tuple(dict.fromkeys(cause.looks for cause in CAUSES.values() if cause.looks is not None))
 #: Those that motion must not be taken for, and what they must show to be taken first.
-STATIONARY = (periodic.looks, noise.colored, noise.variance_change)
+STATIONARY: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and cause.stationary)
 CERTAIN = 25.0
 #: Motion whose held-out gain lies so many standard deviations below 0 is none.
 HARM_SD = 2.0
@@ -38,48 +32,11 @@ INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
-#: Times that one cause is named on an axis: more jumps or changes of the noise are none of single ones.
-MOST = {"step": 3, "variance_change": 3}
-#: A band wider than this share of a line's frequency lies at one of its multiples by chance.
-HARMONIC_MOST = 0.1
-#: Two causes whose worth differs by less than this, nats, cannot be told apart.
-ALIKE = 3.0
 #: Probability that the statistics together call an axis of a fitting record inadequate.
 P_UNEXPLAINED = 1e-3
 #: What is not so improbable is judged once more, by an ensemble that shows how long the tails are. With the first alone
 #: 4 of 1351 clean axes were called inadequate.
 P_CERTAIN, AGAIN = 1e-12, 240
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One named cause on one axis."""
-
-    look: Look
-    round: int
-    before: State
-    after: State
-    also_possible: tuple[str, ...] = ()
-    shared_with: tuple[str, ...] = ()
-
-
-@dataclass
-class Diagnosed:
-    """One axis after the loop: what it began as, what it is, and what was found in which record. `unfinished`: why it
-    is not done, "" if it is."""
-
-    first: State
-    state: State
-    record: Record
-    findings: list[Finding] = field(default_factory=list)
-    before: list[Statistic] = field(default_factory=list)
-    after: list[Statistic] = field(default_factory=list)
-    refused: list[Look] = field(default_factory=list)
-    unfinished: str = ""
-
-    @property
-    def adequate(self) -> bool:
-        return not self.findings
 
 
 def diagnose_record(
@@ -122,9 +79,8 @@ def diagnose_record(
             one.unfinished = spent
 
     work.each(walk, found)
-    changed = _directions(record, found)
-    for one in found.values():
-        _harmonics(one)
+    settled = [cause.settle(record, found) for cause in CAUSES.values() if cause.settle is not None]
+    changed = list(dict.fromkeys(name for names in settled for name in names))
     _share(found)
     work.each(lambda name: _end(found[name], advance), changed)
     if any(one.unfinished == INTERRUPTED for one in found.values()):
@@ -149,7 +105,7 @@ def _provisional(
     state: State,
     record: Record,
     advance: Callable[[str], None],
-    causes: tuple[Callable[[State, Record], list[Look]], ...] = STATIONARY,
+    causes: tuple[Looks, ...] = STATIONARY,
 ) -> State:
     """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
     one = Diagnosed(state, state, record)
@@ -160,7 +116,7 @@ def _provisional(
 
 def _wild(state: State, record: Record) -> float:
     """Share of the samples that are outliers beyond doubt: they make an axis loud by itself."""
-    looks = noise.mixed(state, record)
+    looks = outliers.mixed(state, record)
     return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
 
 
@@ -236,11 +192,11 @@ def _rounds(
     record: Record,
     one: Diagnosed,
     advance: Callable[[str], None],
-    causes: tuple[Callable[[State, Record], list[Look]], ...] = LOOKS,
+    causes: tuple[Looks, ...] = LOOKS,
     least: float = NET_LEAST,
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
-    idle: set[Callable[[State, Record], list[Look]]] = set()
+    idle: set[Looks] = set()
     for number in range(first, ROUNDS + 1):
         if one.state.below_lattice:
             return
@@ -268,81 +224,19 @@ def _rounds(
 def _looked(
     one: Diagnosed,
     record: Record,
-    causes: Sequence[Callable[[State, Record], list[Look]]],
+    causes: Sequence[Looks],
     least: float,
-) -> tuple[list[Look], set[Callable[[State, Record], list[Look]]]]:
+) -> tuple[list[Look], set[Looks]]:
     """The looks of `causes`, the most worth first, and the causes of which none is worth `least`."""
     named = Counter(finding.look.cause for finding in one.findings)
     found: list[Look] = []
-    idle: set[Callable[[State, Record], list[Look]]] = set()
+    idle: set[Looks] = set()
     for cause in causes:
-        looks = [look for look in cause(one.state, record) if named[look.cause] < MOST.get(look.cause, ROUNDS)]
+        looks = [look for look in cause(one.state, record) if named[look.cause] < (CAUSES[look.cause].most or ROUNDS)]
         found += looks
         if all(look.net < least for look in looks):
             idle.add(cause)
     return sorted(found, key=lambda look: -look.net), idle
-
-
-def _harmonics(one: Diagnosed) -> None:
-    """Lines at multiples of a stronger one's frequency are one finding with it: their gains are added."""
-    lines = sorted((f for f in one.findings if f.look.cause == "periodic"), key=lambda f: -f.look.gain)
-    for base in lines:
-        if base not in one.findings:
-            continue
-        f = base.look.estimate["frequency_hz"]
-        harmonics: list[int] = []
-        gain, worth = base.look.gain, base.look.net
-        for other in lines:
-            g = other.look.estimate["frequency_hz"]
-            k = round(g["median"] / f["median"])
-            if other is base or other not in one.findings or k < 2:
-                continue
-            apart = k * _breadth(base.look) + _breadth(other.look)
-            if apart < HARMONIC_MOST * f["median"] and abs(g["median"] - k * f["median"]) < apart:
-                harmonics.append(k)
-                gain, worth = gain + other.look.gain, worth + other.look.net
-                one.findings.remove(other)
-        if harmonics:
-            estimate = {**base.look.estimate, "harmonics": sorted(harmonics)}
-            one.findings[one.findings.index(base)] = replace(
-                base, look=replace(base.look, gain=gain, net=worth, estimate=estimate)
-            )
-
-
-def _breadth(line: Look) -> float:
-    """How far off the frequency may be, Hz: half the width of a band, three standard deviations of a line."""
-    if "width_hz" in line.estimate:
-        return float(line.estimate["width_hz"]["median"])
-    return 3.0 * float(line.estimate["frequency_hz"]["sd"])
-
-
-def _directions(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """Two axes that each blame the other: the reading that follows is the one that gains more by it.
-
-    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
-    coupling is kept: a mechanical one is below 1. Returns the axes that are blamed less."""
-    changed: list[str] = []
-    pairs = {
-        (name, str(finding.look.estimate["other"])): finding
-        for name, one in found.items()
-        for finding in one.findings
-        if finding.look.cause == "cross_axis"
-    }
-    for (name, other), finding in pairs.items():
-        back = pairs.get((other, name))
-        if back is None:
-            continue
-        ahead = back.look.gain - finding.look.gain
-        if abs(ahead) < ALIKE:
-            sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
-            ahead = sizes[0] - sizes[1]
-        if ahead > 0.0:
-            one = found[name]
-            one.findings.remove(finding)
-            kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
-            one.state = one.state.refit(regressors=kept)
-            changed.append(name)
-    return changed
 
 
 def _share(found: Mapping[str, Diagnosed]) -> None:
@@ -358,16 +252,7 @@ def _share(found: Mapping[str, Diagnosed]) -> None:
 
 
 def _same(a: Look, b: Look) -> bool:
-    if a.cause != b.cause:
-        return False
-    if a.cause == "step":
-        return a.when is not None and b.when is not None and abs(a.when[0] - b.when[0]) < 30.0
-    if a.cause == "periodic":
-        f, g = a.estimate["frequency_hz"]["median"], b.estimate["frequency_hz"]["median"]
-        return bool(abs(f / g - 1.0) < 0.01)
-    if a.cause == "stuck":
-        return bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0])
-    return a.cause in ("temperature", "supply", "motion", "missing_samples", "held_samples")
+    return a.cause == b.cause and CAUSES[a.cause].alike(a, b)
 
 
 def _unexplained(one: Diagnosed) -> None:

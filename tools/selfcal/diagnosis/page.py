@@ -16,11 +16,11 @@ import yaml
 import selfcal
 from selfcal import units as unit_module
 from selfcal.diagnosis import pictures
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.chart import Figure, draw, number, outside_of, scrolled
 from selfcal.diagnosis.extend import fitted_law
-from selfcal.diagnosis.loop import Diagnosed, Finding
+from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.words import WORDS
 from selfcal.ending import Stopped
 from selfcal.output import write_text
 from selfcal.units import parameter_unit
@@ -372,7 +372,7 @@ def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
     if len(set(sizes)) == 1:
         told = escape(str(first.get("words") or sizes[0]))
     else:
-        told = f"{escape(WORDS.get(first['cause'], ''))} "
+        told = f"{escape(CAUSES[first['cause']].words)} "
         told += "; ".join(f"{escape(axis)}: {escape(size)}" for (axis, _, _), size in zip(members, sizes, strict=True))
         told += "."
     nats = sorted(_nats(finding) for finding in findings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, envelope
+from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.fit import run
-from selfcal.diagnosis.loop import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array
@@ -131,28 +132,8 @@ def _figure(item: Compared, pairs: Mapping[tuple[int, int], _Pair]) -> Figure:
 
 def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Compared | Figure]:
     """The pictures for a cause."""
-    cause, before, after = finding.look.cause, finding.before, finding.after
-    if cause in ("temperature", "supply", "cross_axis", "ramp", "step"):
-        return [_series(finding, record, factor, unit), *_evidence(finding, record)]
-    if cause == "periodic":
-        if not np.ptp(_effect(finding)) > 0.0:  # a band about a frequency that wanders, a term of the noise
-            return [_spectrum(before, after, factor, unit), _correlation(before, after)]
-        return [_line(finding, factor, unit), *_evidence(finding, record)]
-    if cause == "flicker":
-        return [_allan(before, after, factor, unit)]
-    if cause == "colored_noise":
-        return [_correlation(before, after)]
-    if cause == "variance_change":
-        return [_level(finding, record)]
-    if cause == "outliers":
-        return [_largest(finding, record), _histogram(before, after)]
-    if cause == "motion":
-        return [_largest(finding, record), _level(finding, record, pieces=POINTS // 2)]
-    if cause in ("quantization", "saturation"):
-        return [_readings(finding, factor, unit)]
-    if cause == "missing_samples":
-        return [_missing(finding, record)]
-    return [_unexplained(finding, record, factor, unit)]
+    names = CAUSES[finding.look.cause].pictures(finding.look)
+    return [figure for name in names for figure in _PICTURES[name](finding, record, factor, unit)]
 
 
 def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
@@ -314,7 +295,9 @@ def _reduced(edges: Indices, values: Array | NDArray[np.bool_]) -> Array:
         return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
 
 
-def _level(finding: Finding, record: Record, means: bool = False, pieces: int = PIECES) -> Compared:
+def _level(
+    finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES
+) -> Compared:
     edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
 
@@ -330,9 +313,7 @@ def _level(finding: Finding, record: Record, means: bool = False, pieces: int = 
         middle,
         (finding.before, finding.after),
         (summary, summary),
-        marks=finding.look.when[:1]
-        if finding.look.when and finding.look.cause in ("variance_change", "motion")
-        else (),
+        marks=finding.look.when[:1] if marked and finding.look.when else (),
     )
 
 
@@ -374,47 +355,61 @@ def _histogram(before: State, after: State) -> Compared:
 
 
 def _readings(finding: Finding, factor: float, unit: str) -> Compared:
-    """Histogram of the readings; before, the model reads out on no lattice and without a limit."""
-    before, after = finding.before, finding.after
+    """Histogram of the readings."""
+    return _histogram_of_readings((finding.before, finding.after), "How often each reading comes.", factor, unit)
+
+
+def _lattice(finding: Finding, factor: float, unit: str) -> Compared:
+    """The same; before, the model reads out on no lattice."""
+    free = replace(finding.before, lsb=0.0)
+    return _histogram_of_readings((free, finding.after), "Before: without a lattice.", factor, unit, finding.before.lsb)
+
+
+def _limit(finding: Finding, factor: float, unit: str) -> Compared:
+    """The same; before, the model reads out without a limit."""
+    before = finding.before
+    # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
+    states = (before, replace(finding.after, y=before.y))
+    edge = float(finding.look.estimate["limit"]["median"]) - before.level
+    return _histogram_of_readings(states, "How often each reading comes.", factor, unit, edge=edge)
+
+
+def _histogram_of_readings(
+    states: tuple[State, State], caption: str, factor: float, unit: str, lattice: float = 0.0, edge: float = math.inf
+) -> Compared:
+    """`lattice`: of the readings where it is to be seen; `edge`: the limit, less the level, that clips them after."""
+    before, after = states
     y = before.y[np.isfinite(before.y)]
-    cause = finding.look.cause
-    sigma = before.best.sigma
+    sigma, lsb = before.best.sigma, max(before.lsb, lattice)
     low, high = float(y.min()), float(y.max())
-    if high - low > 0.5 * BINS * max(before.lsb, 0.2 * sigma):
+    if high - low > 0.5 * BINS * max(lsb, 0.2 * sigma):
         low, high = (float(value) for value in np.quantile(y, [0.001, 0.999]))
-    limit = math.inf
-    if cause == "saturation":
-        edge = float(finding.look.estimate["limit"]["median"]) - before.level
-        low, high, limit = min(low, edge), max(high, edge), abs(edge)
-    low, high = low - 0.5 * sigma - before.lsb, high + 0.5 * sigma + before.lsb
-    if before.lsb > 0.0:
+    if math.isfinite(edge):
+        low, high = min(low, edge), max(high, edge)
+    low, high = low - 0.5 * sigma - lsb, high + 0.5 * sigma + lsb
+    if lsb > 0.0:
         # Whole codes a bin, about each code; four bins a code show that the readings lie on the codes alone.
-        codes = max(1, math.ceil((high - low) / before.lsb / (2 * BINS)))
-        width = codes * before.lsb / (4 if cause == "quantization" and codes == 1 else 1)
-        first = math.floor((low + before.level) / before.lsb) * before.lsb - before.level
+        codes = max(1, math.ceil((high - low) / lsb / (2 * BINS)))
+        width = codes * lsb / (4 if lattice > 0.0 and codes == 1 else 1)
+        first = math.floor((low + before.level) / lsb) * lsb - before.level
         edges = first + (np.arange(math.ceil((high - first) / width) + 1) - 0.5) * width
     else:
         edges = np.linspace(low, high, BINS + 1)
 
-    def counted(clip: bool) -> Summary:
+    def counted(limit: float) -> Summary:
         def summary(y: Array, w: Array) -> Array:
-            read = y[np.isfinite(y)]
-            read = np.clip(read, -limit, limit) if clip else read
-            return np.histogram(read, edges)[0].astype(float)
+            return np.histogram(np.clip(y[np.isfinite(y)], -limit, limit), edges)[0].astype(float)
 
         return summary
 
-    free = replace(before, lsb=0.0) if cause == "quantization" else before
-    # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
-    last = replace(after, y=before.y) if cause == "saturation" else after
     return Compared(
         "Histogram of the readings",
-        "Before: without a lattice." if cause == "quantization" else "How often each reading comes.",
+        caption,
         f"reading less {factor * before.level:.6g}, {unit}" if before.level else f"reading, {unit}",
         "count",
         factor * 0.5 * (edges[1:] + edges[:-1]),
-        (free, last),
-        (counted(False), counted(cause == "saturation")),
+        (before, after),
+        (counted(math.inf), counted(abs(edge))),
         whitened=False,
         stairs=True,
     )
@@ -527,3 +522,22 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
         (path(finding.before), path(finding.after)),
         marks=finding.look.when[:1] if finding.look.when else (),
     )
+
+
+#: The pictures by the names that causes give: of a finding, in a record, with the factor to a unit.
+_PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[Compared | Figure]]] = {
+    "means": lambda finding, record, factor, unit: [_series(finding, record, factor, unit)],
+    "evidence": lambda finding, record, factor, unit: _evidence(finding, record),
+    "spectrum": lambda finding, record, factor, unit: [_spectrum(finding.before, finding.after, factor, unit)],
+    "correlation": lambda finding, record, factor, unit: [_correlation(finding.before, finding.after)],
+    "line": lambda finding, record, factor, unit: [_line(finding, factor, unit)],
+    "allan": lambda finding, record, factor, unit: [_allan(finding.before, finding.after, factor, unit)],
+    "marked_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True)],
+    "fine_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True, pieces=POINTS // 2)],
+    "largest": lambda finding, record, factor, unit: [_largest(finding, record)],
+    "histogram": lambda finding, record, factor, unit: [_histogram(finding.before, finding.after)],
+    "lattice": lambda finding, record, factor, unit: [_lattice(finding, factor, unit)],
+    "limit": lambda finding, record, factor, unit: [_limit(finding, factor, unit)],
+    "missing": lambda finding, record, factor, unit: [_missing(finding, record)],
+    "unexplained": lambda finding, record, factor, unit: [_unexplained(finding, record, factor, unit)],
+}

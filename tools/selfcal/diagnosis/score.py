@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.causes import periodic
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.fit import Fit, Series, best, fit, moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State
@@ -25,16 +25,6 @@ HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 PIECES = 24
 #: Predictions of the bias at most.
 PREDICTIONS = 300
-#: Causes whose gain on a better prediction is not defined, with the reason.
-UNDEFINED = {
-    "missing_samples": "gaps are bridged before and after: the model of the noise is the same",
-    "quantization": "the lattice is in the reading and not in the prediction",
-    "saturation": "readings at the limit are scored by no density",
-    "stuck": "readings that stick are no readings: none is scored",
-    "held_samples": "repeats are left out before and after",
-    "rate_change": "the record has one rate before and after",
-    "unexplained": "no model was extended",
-}
 
 
 @dataclass(frozen=True)
@@ -48,20 +38,19 @@ class Trained:
 
 def gain(look: Look, before: State, after: State, record: Record) -> tuple[dict[str, Any] | None, str | None]:
     """The contract's `gain` of one finding, or None with the reason."""
-    if look.cause in UNDEFINED:
-        return None, UNDEFINED[look.cause]
+    cause = CAUSES[look.cause]
+    if cause.no_gain:
+        return None, cause.no_gain
     n = before.y.size
     split = n // 2
-    if look.cause in ("step", "variance_change") and look.when is not None:
+    if cause.onset and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
             split = place + max(20, (n - place) // 4)
         if n - split < max(60, n // 20):
             return None, "too little of the record is left after its detection"
-    if look.cause == "periodic":
-        after = _line_anew(before, after, record, split)
-    if look.cause == "variance_change":
-        after = _ratio_anew(before, after, round((look.when or (0.0, 0.0))[0] * record.rate_hz), split)
+    if cause.trained is not None:
+        after = cause.trained(look, before, after, record, split)
     old, new = _trained(before, split), _trained(after, split)
     both = np.isfinite(old.ln_density) & np.isfinite(new.ln_density)
     both[:split] = False
@@ -149,42 +138,6 @@ def _predicted(one: Trained, marks: Array, ahead: int, window: int) -> Array:
         column = one.series.columns[:, at + ahead - 1 : at + ahead - 1 + window].mean(axis=1)
         found.append(float(forward @ state + one.fit.c @ column))
     return np.array(found)
-
-
-def _line_anew(before: State, after: State, record: Record, split: int) -> State:
-    """The line that the first half alone shows."""
-    y = before.y[:split]
-    half = replace(
-        before,
-        y=y,
-        r=before.r[:split],
-        regressors=tuple(replace(one, values=one.values[:split]) for one in before.regressors),
-        fits=(),
-    ).refit()
-    part = replace(record, present=record.present[:split])
-    looks = periodic.looks(half, part)
-    if not looks:
-        return after
-    f = float(looks[0].estimate["frequency_hz"]["median"])
-    t = record.time_s
-    turns = 2.0 * math.pi * np.mod(f * t, 1.0)
-    pair = {".sin": np.sin(turns), ".cos": np.cos(turns)}
-    known = {one.name for one in before.regressors}
-    return replace(
-        after,
-        regressors=tuple(
-            one if one.name in known else replace(one, values=pair[one.name[-4:]]) for one in after.regressors
-        ),
-    )
-
-
-def _ratio_anew(before: State, after: State, place: int, split: int) -> State:
-    """The change of the noise as the training samples have it."""
-    w2 = np.minimum(before.whitened**2, 12.0)
-    ratio = float(np.nanmean(w2[place:split]) / np.nanmean(w2[:place]))
-    r = before.r.copy()
-    r[place:] *= ratio
-    return replace(after, r=r)
 
 
 def inflation(before: State, after: State) -> Mapping[str, float]:

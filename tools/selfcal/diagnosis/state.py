@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2
 
@@ -22,6 +23,8 @@ P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
 FAR = 40.0
+#: Two causes whose worth differs by less than this, nats, cannot be told apart.
+ALIKE = 3.0
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
 
@@ -159,6 +162,21 @@ class State:
                 B = G[k, 0] - cross @ inner @ G[1:known, 0]
                 found.append(0.5 * B * B / A if 1e-9 * G[k, k] < A and A > 0.0 else 0.0)
         return np.array(found)
+
+    def least(self, column: Array) -> float:
+        """The coefficient of a column that gains NET_LEAST at the fitted noise."""
+        series = self.series.beside(column)
+        G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
+        k = len(G) - 1
+        cross = G[1:k, k]
+        A = G[k, k] - cross @ np.linalg.pinv(G[1:k, 1:k], rcond=1e-12, hermitian=True) @ cross
+        return math.sqrt(2.0 * NET_LEAST / A) if 1e-9 * G[k, k] < A else math.inf
+
+
+def gain_for(worth: Callable[[float], float]) -> float:
+    """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
+    gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
+    return float(gain) / NET_LEAST
 
 
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:

@@ -15,8 +15,7 @@ from scipy.signal import fftconvolve
 from scipy.stats import norm, pearson3, skew
 from scipy.stats import t as student
 
-from selfcal.diagnosis.causes import step
-from selfcal.diagnosis.fit import run
+from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Matrices, matrices
 
@@ -277,9 +276,17 @@ def whitened_of(state: State, y: Array) -> Array:
     return (white[:, 0] - white[:, 1:] @ c) / math.sqrt(rss / sums[0].n)
 
 
+def _step_response(series: Series, fit: Fit) -> Array:
+    """Whitened innovations of a unit step once the filter has settled, over sigma."""
+    n = series.y.size
+    clean = Series(np.zeros(2 * n), series.dt, np.ones(2 * n), np.vstack([np.repeat([0.0, 1.0], n)]))
+    _, white, _ = run(clean, fit.terms, fit.theta, innovations=True)
+    return white[n:, 1] / fit.sigma
+
+
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
     """Every statistic of the state against its band; the most striking first."""
-    response = step.response_of(state.series, state.best)
+    response = _step_response(state.series, state.best)
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
     random = np.random.default_rng(seed)
     rows: dict[str, list[float]] = {name: [] for name in measured}

@@ -6,48 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-WORDS: Mapping[str, str] = {
-    "temperature": "The bias follows the temperature.",
-    "supply": "The bias follows the supply voltage.",
-    "cross_axis": "Another axis leaks into this one.",
-    "ramp": "The bias drifts at a constant rate.",
-    "step": "The bias jumps once.",
-    "periodic": "A periodic disturbance of one frequency is in the readings.",
-    "flicker": "The bias has flicker (1/f) noise, or drifts on two time scales at once.",
-    "colored_noise": "The white noise has memory: neighbouring samples are correlated.",
-    "quantization": "The readings lie on a coarse lattice that the model file does not state.",
-    "outliers": "Single samples are far off.",
-    "variance_change": "The noise level changes once.",
-    "saturation": "Readings are clipped at a limit.",
-    "missing_samples": "Samples are missing.",
-    "stuck": "The readings stop at one value for a while.",
-    "held_samples": "The logger asks oftener than the sensor measures: each reading repeats.",
-    "rate_change": "The sampling rate changes once.",
-    "motion": "The sensor was moved or shaken while it should have rested.",
-    "unexplained": "The readings differ from every model tried, and no known cause explains it.",
-}
-
-NEXT: Mapping[str, str] = {
-    "temperature": "Cycle the temperature up and down, so that it does not only rise with time.",
-    "supply": "Change the supply by 0.1 V and back, twice, at a constant temperature.",
-    "cross_axis": "Turn the sensor so that the other axis reads something else.",
-    "ramp": "Record three times as long, with the temperature beside it.",
-    "step": "Record again without touching the mount or the cable.",
-    "periodic": "Record at another rate: a line that moves is an alias.",
-    "flicker": "Record three times as long, and at 10 Hz or more.",
-    "colored_noise": "Record at the sensor's full rate with its filter off.",
-    "quantization": "State the lsb in the model file, or record with a finer range.",
-    "outliers": "Check the bus: log the raw words of those samples.",
-    "variance_change": "Look for what was switched on at that time.",
-    "saturation": "Choose a wider range.",
-    "missing_samples": "Check the logger's buffer and the data-ready line.",
-    "stuck": "Check the bus and the sensor's data-ready line at that time.",
-    "held_samples": "Log at the sensor's own rate, on its data-ready line.",
-    "rate_change": "Look for what set the rate at that time; record at one rate.",
-    "motion": "Record on a heavy table, away from traffic.",
-    "unexplained": "Record again: if the statistic stands out a second time, it is the sensor's own.",
-}
-
+from selfcal.diagnosis.causes import CAUSES
 
 #: Stretches of time that a sentence names.
 INTERVALS_SHOWN = 3
@@ -96,7 +55,7 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
-    return f"{WORDS[cause]} {text[:1].upper()}{text[1:]}."
+    return f"{CAUSES[cause].words} {text[:1].upper()}{text[1:]}."
 
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:

@@ -15,7 +15,8 @@ from rich.console import Console
 from selfcal.diagnosis import work
 from selfcal.diagnosis.document import SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, extended
-from selfcal.diagnosis.loop import INTERRUPTED, Diagnosed, diagnose_record
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
 from selfcal.document import check_writable, of_errors, parameters_entry, regressors_entry, write_json
 from selfcal.ending import Held, Stopped, abandon, held

@@ -39,8 +39,6 @@ SPACING_LEAST = 0.01
 #: Intervals at most that the laws of `models/sums.yaml` are weighed on: their filters cost twenty times the others'.
 #: Half as many as runs 1 and 2 have at 1 Hz move no probability there by more than 0.08.
 MORE_LAWS_MOST = 5000
-#: Suspicions that a sum of drifts, or coloured noise, may be.
-SLOW = ("flicker", "colored_noise", "ramp", "step")
 
 
 def identify(
@@ -162,13 +160,14 @@ def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequ
     """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them.
 
     At the model's own bank rate; of a longer record than MORE_LAWS_MOST such intervals at a lower one."""
+    from selfcal.diagnosis.causes import CAUSES
     from selfcal.engines.library import Bank
 
     more = Model.load(DEFAULT.parent / "sums.yaml")
     rate_hz = min(more.bank_rate_hz, MORE_LAWS_MOST / recording.duration_s)
     for name in names:
         axis = document["axes"][name]
-        if axis.get("suspicion", "flicker") in SLOW:
+        if "suspicion" not in axis or CAUSES[axis["suspicion"]].slow:
             with suppress(UserError):  # a record too long for these laws
                 tables = make_tables(more, recording.rate_hz, (name,), bank_rate_hz=rate_hz)
                 bank = Bank(tables)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from selfcal import _reference, recording, units
+from selfcal.diagnosis.cause import Channels, Key, Setting, is_count
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.errors import UserError, printable
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
 from selfcal.model import Group, Model, Prior
@@ -26,77 +27,6 @@ MOST_READINGS = 100_000_000
 MOST_TAKEN = 10_000_000_000
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
 _DRAWS = 2**32
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """What an effect's default is made from: white noise density, white noise sd per sample, length, and the bias."""
-
-    n: float
-    sd: float
-    duration_s: float
-    samples: int
-    bias: float
-
-
-@dataclass(frozen=True)
-class _Key:
-    """One key of an effect: the simulator's field it sets, and its value when it is not given."""
-
-    field: str
-    default: Callable[[_Setting], float]
-
-
-#: Effects by id (design: the causes of a diagnosis); keys are those of a finding's estimate.
-_EFFECTS: dict[str, dict[str, _Key]] = {
-    "temperature": {"coefficient": _Key("temperature_coefficient", lambda s: 0.3 * s.n)},
-    "supply": {"coefficient": _Key("supply_coefficient", lambda s: 50.0 * s.n)},
-    "cross_axis": {"coefficient": _Key("cross_coefficient", lambda s: 0.5)},
-    "ramp": {"slope": _Key("ramp_slope", lambda s: 5.0 * s.n / s.duration_s)},
-    "step": {
-        "time_s": _Key("step_time_s", lambda s: s.duration_s / 2.0),
-        "amplitude": _Key("step_amplitude", lambda s: 2.0 * s.n),
-    },
-    "periodic": {
-        "frequency_hz": _Key("periodic_frequency_hz", lambda s: 0.05),
-        "amplitude": _Key("periodic_amplitude", lambda s: 0.5 * s.n),
-    },
-    "flicker": {"B": _Key("flicker_B", lambda s: 0.5 * s.n)},
-    "colored_noise": {"lag1": _Key("noise_lag1", lambda s: 0.5)},
-    "quantization": {"lsb": _Key("lsb", lambda s: 2.0 * s.sd)},
-    "outliers": {"fraction": _Key("outlier_fraction", lambda s: 0.005)},
-    "variance_change": {
-        "time_s": _Key("variance_time_s", lambda s: s.duration_s / 2.0),
-        "ratio": _Key("noise_ratio", lambda s: 2.0),
-    },
-    "saturation": {"limit": _Key("range", lambda s: abs(s.bias) + s.sd)},
-    "motion": {
-        "intervals": _Key("motion_intervals", lambda s: 5),
-        "amplitude": _Key("motion_amplitude", lambda s: 20.0 * s.sd),
-    },
-    "missing_samples": {"missing": _Key("missing", lambda s: max(1, round(0.02 * s.samples)))},
-    # Of the logger and the bus: put into the finished readings by _read_out().
-    "stuck": {"intervals": _Key("", lambda s: 2)},
-    "held_samples": {"rate_hz": _Key("", lambda s: 0.2 * s.samples / s.duration_s)},
-    "rate_change": {
-        "time_s": _Key("", lambda s: s.duration_s / 2.0),
-        "after_hz": _Key("", lambda s: 0.5 * s.samples / s.duration_s),
-    },
-}
-#: Effects of the whole recording: they have no axis.
-_COMMON = ("missing_samples", "rate_change")
-#: Values an effect's key may have, where not every number will do: test and what the complaint says.
-_LIMITS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "lag1": (lambda v: -1.0 < v < 1.0, "between -1 and 1"),
-    "fraction": (lambda v: 0.0 <= v <= 1.0, "from 0 to 1"),
-    "ratio": (lambda v: v > 0.0, "above 0"),
-    "lsb": (lambda v: v > 0.0, "above 0"),
-    "limit": (lambda v: v > 0.0, "above 0"),
-    "intervals": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
-    "missing": (lambda v: v >= 1.0 and v == int(v), "a whole number of at least 1"),
-    "rate_hz": (lambda v: v > 0.0, "above 0"),
-    "after_hz": (lambda v: v > 0.0, "above 0"),
-}
 
 
 def simulate(
@@ -125,7 +55,8 @@ def simulate(
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
-        values, temperature, supply, present, bias_now = _reference.simulate(scene, axes)
+        added = _added(applied, model, scene.rate_hz)
+        values, temperature, supply, present, bias_now = _reference.simulate(scene, axes, added)
         changed = _read_out(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, _DRAWS + len(axes)))
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
         truth[name] |= {
@@ -154,6 +85,25 @@ def simulate(
     return {**meta, "samples": rows, "rate_hz": scene.rate_hz}
 
 
+def _added(
+    applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float
+) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
+    """Adds the effects that a cause forms by itself to `values` [axes, n] before the read-out; None without any."""
+    own = [one for one in applied if CAUSES[one["id"]].add is not None]
+    if not own:
+        return None
+
+    def add(values: NDArray[np.float64], temperature: NDArray[np.float64], supply: NDArray[np.float64]) -> None:
+        time_s = np.arange(temperature.size) / rate_hz
+        channels = Channels(time_s, temperature, supply, dict(zip(model.axes, values.copy(), strict=True)))
+        for one in own:
+            form = CAUSES[one["id"]].add
+            for name, keys in one["axes"].items() if form is not None else ():
+                values[model.axes.index(name)] += form(keys, channels)
+
+    return add
+
+
 def _read_out(
     applied: Sequence[Mapping[str, Any]],
     model: Model,
@@ -164,22 +114,14 @@ def _read_out(
 ) -> tuple[float, int] | None:
     """Put the faults of the bus and the logger into `values` [axes, n]. Returns the time of a change of the rate,
     s, and how many readings make one from there on; None without."""
-    n, changed = values.shape[1], None
+    changed = None
     for effect in applied:
+        spoil = CAUSES[effect["id"]].spoil
         for name, keys in effect["axes"].items():
             place = model.axes.index(name)
-            row = values[place]
-            if effect["id"] == "stuck":
-                piece = n // keys["intervals"]
-                for k in range(keys["intervals"]):
-                    start = k * piece + int(random.uniform() * 0.8 * piece)
-                    row[start : start + max(1, piece // 10)] = row[start]
-            elif effect["id"] == "held_samples":
-                cell = np.floor(np.arange(n) * min(keys["rate_hz"] / rate_hz, 1.0)).astype(np.int64)
-                lsb = axes[place].lsb
-                mean = np.bincount(cell, row) / np.bincount(cell)
-                row[:] = (np.rint(mean / lsb) * lsb if lsb > 0.0 else mean)[cell]
-            elif effect["id"] == "rate_change":
+            if spoil is not None:
+                spoil(values[place], keys, rate_hz, axes[place].lsb, random)
+            elif "after_hz" in keys:
                 changed = (keys["time_s"], max(1, round(rate_hz / keys["after_hz"])))
     return changed
 
@@ -291,10 +233,12 @@ def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
 def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_reference.Axis]) -> dict[str, Any]:
     """Put one effect, ID[:key=value,...], into the scene. Returns what was applied, default values filled in."""
     name, *pairs = re.split("[:,]", text)
-    if name not in _EFFECTS:
-        raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(_EFFECTS)})")
-    keys = _EFFECTS[name]
-    names = [*keys, *(["other"] if name == "cross_axis" else []), *([] if name in _COMMON else ["axis"])]
+    known = [cause.id for cause in CAUSES.values() if cause.keys]
+    if name not in known:
+        raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(known)})")
+    cause = CAUSES[name]
+    keys = cause.keys
+    names = [*keys, *(["other"] if cause.follows else []), *([] if cause.common else ["axis"])]
     given: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -309,24 +253,24 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
         group = model.group_of(axis_name)
         axis = axes[model.axes.index(axis_name)]
         sd = axis.N * math.sqrt(scene.rate_hz)
-        setting = _Setting(axis.N, sd, scene.samples / scene.rate_hz, scene.samples, axis.bias)
+        setting = Setting(axis.N, sd, scene.samples / scene.rate_hz, scene.samples, axis.bias)
         record: dict[str, Any] = {}
         for key, entry in keys.items():
             if key == "intervals" and "-" in given.get(key, ""):
                 record[key] = _intervals(given[key])
                 scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
                 continue
-            value = _number(name, key, given[key]) if key in given else entry.default(setting)
-            whole = key in ("missing", "intervals")
+            value = _number(name, key, entry, given[key]) if key in given else entry.default(setting)
+            whole = entry.fits is is_count
             record[key] = int(value) if whole else value
             if entry.field:
                 setattr(scene if whole else axis, entry.field, record[key])
-        if name == "cross_axis":
+        if cause.follows:
             following = group.axes[(group.axes.index(axis_name) + 1) % len(group.axes)]
             record["other"] = given.get("other", following)
             model.group_of(record["other"])
             if record["other"] == axis_name:
-                raise UserError(f"--effect cross_axis: axis {axis_name} cannot be its own other")
+                raise UserError(f"--effect {name}: axis {axis_name} cannot be its own other")
             axis.cross_axis = model.axes.index(record["other"])
         applied["axes"][axis_name] = record
     return applied
@@ -346,12 +290,11 @@ def _intervals(text: str) -> list[list[float]]:
     return found
 
 
-def _number(effect: str, key: str, text: str) -> float:
+def _number(effect: str, key: str, of: Key, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    fits, what = _LIMITS.get(key, (lambda v: True, "finite"))
-    if not math.isfinite(value) or not fits(value):
-        raise UserError(f"--effect {effect}: {key} must be a number, {what}, not '{text}'")
+    if not math.isfinite(value) or not of.fits(value):
+        raise UserError(f"--effect {effect}: {key} must be a number, {of.limits}, not '{text}'")
     return value

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.stats import binom
 
+from selfcal.diagnosis.cause import A_COUNT, Cause, Key, is_count, shown
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.recording import bridged
@@ -168,3 +170,25 @@ def joined(intervals: list[Interval]) -> list[Interval]:
         else:
             found.append((a, b))
     return found
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.4f}".rstrip("0").rstrip(".")
+
+
+def _of_estimate(look: Look) -> dict[str, Any]:
+    return {"intervals": "+".join(f"{_seconds(a)}-{_seconds(b)}" for a, b in look.estimate["intervals"])}
+
+
+CAUSE = Cause(
+    "motion",
+    "The sensor was moved or shaken while it should have rested.",
+    "Record on a heavy table, away from traffic.",
+    alike=lambda a, b: True,
+    pictures=shown("largest", "fine_level"),
+    of_estimate=_of_estimate,
+    keys={
+        "intervals": Key(lambda s: 5, "motion_intervals", is_count, A_COUNT),
+        "amplitude": Key(lambda s: 20.0 * s.sd, "motion_amplitude"),
+    },
+)

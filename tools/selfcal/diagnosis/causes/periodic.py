@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
+from selfcal.diagnosis.cause import Cause, Key, medians
+from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import Fit, finish, fit, moved
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, interval, mixture, net
+from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
 
 #: Fewer turns in a record than this are drift.
@@ -24,6 +28,10 @@ BAND_LEAST = 12.0
 BAND_DEARER = 6.0
 #: Bands that one model may have.
 BANDS_MOST = 5
+#: A band wider than this share of a line's frequency lies at one of its multiples by chance.
+HARMONIC_MOST = 0.1
+#: Lines of two axes whose frequencies differ by less are one.
+ONE_LINE = 0.01
 #: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
 NARROW = 4
 
@@ -172,3 +180,117 @@ def _line(state: State, record: Record) -> list[Look]:
             {"regressors": (*state.regressors, *added)},
         )
     ]
+
+
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    for one in found.values():
+        _harmonics(one)
+    return []
+
+
+def _harmonics(one: Diagnosed) -> None:
+    """Lines at multiples of a stronger one's frequency are one finding with it: their gains are added."""
+    lines = sorted((f for f in one.findings if f.look.cause == "periodic"), key=lambda f: -f.look.gain)
+    for base in lines:
+        if base not in one.findings:
+            continue
+        f = base.look.estimate["frequency_hz"]
+        harmonics: list[int] = []
+        gain, worth = base.look.gain, base.look.net
+        for other in lines:
+            g = other.look.estimate["frequency_hz"]
+            k = round(g["median"] / f["median"])
+            if other is base or other not in one.findings or k < 2:
+                continue
+            apart = k * _breadth(base.look) + _breadth(other.look)
+            if apart < HARMONIC_MOST * f["median"] and abs(g["median"] - k * f["median"]) < apart:
+                harmonics.append(k)
+                gain, worth = gain + other.look.gain, worth + other.look.net
+                one.findings.remove(other)
+        if harmonics:
+            estimate = {**base.look.estimate, "harmonics": sorted(harmonics)}
+            one.findings[one.findings.index(base)] = replace(
+                base, look=replace(base.look, gain=gain, net=worth, estimate=estimate)
+            )
+
+
+def _breadth(line: Look) -> float:
+    """How far off the frequency may be, Hz: half the width of a band, three standard deviations of a line."""
+    if "width_hz" in line.estimate:
+        return float(line.estimate["width_hz"]["median"])
+    return 3.0 * float(line.estimate["frequency_hz"]["sd"])
+
+
+def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
+    """The line that the first half alone shows."""
+    y = before.y[:split]
+    half = replace(
+        before,
+        y=y,
+        r=before.r[:split],
+        regressors=tuple(replace(one, values=one.values[:split]) for one in before.regressors),
+        fits=(),
+    ).refit()
+    part = replace(record, present=record.present[:split])
+    found = looks(half, part)
+    if not found:
+        return after
+    f = float(found[0].estimate["frequency_hz"]["median"])
+    t = record.time_s
+    turns = 2.0 * math.pi * np.mod(f * t, 1.0)
+    pair = {".sin": np.sin(turns), ".cos": np.cos(turns)}
+    known = {one.name for one in before.regressors}
+    return replace(
+        after,
+        regressors=tuple(
+            one if one.name in known else replace(one, values=pair[one.name[-4:]]) for one in after.regressors
+        ),
+    )
+
+
+def _alike(a: Look, b: Look) -> bool:
+    f, g = a.estimate["frequency_hz"]["median"], b.estimate["frequency_hz"]["median"]
+    return bool(abs(f / g - 1.0) < ONE_LINE)
+
+
+def _pictures(look: Look) -> Sequence[str]:
+    """A band about a frequency that wanders is a term of the noise, and no column."""
+    return ("spectrum", "correlation") if "width_hz" in look.estimate else ("line", "evidence")
+
+
+def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
+    """A line half way between the slowest one looked for and the fastest, in octaves."""
+    t = record.time_s
+    n = int(np.isfinite(state.y).sum())
+    frequency = math.sqrt(TURNS_LEAST / t[-1] * 0.5 * record.rate_hz)
+    gain = gain_for(lambda gain: net(gain, 2, ln_lines(n, gain)))
+    amplitude = state.least(np.sin(2.0 * math.pi * frequency * t)) * math.sqrt(gain)
+    return {"amplitude": (amplitude, state.unit), "frequency_hz": (frequency, "Hz")}
+
+
+def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    return {"frequency_hz": float(column.entry["frequency_hz"]), "amplitude": math.hypot(*c)}
+
+
+def _of_estimate(look: Look) -> dict[str, Any] | None:
+    return medians(look, "frequency_hz", "amplitude") if "width_hz" in look.estimate else None
+
+
+CAUSE = Cause(
+    "periodic",
+    "A periodic disturbance of one frequency is in the readings.",
+    "Record at another rate: a line that moves is an alias.",
+    looks=looks,
+    stationary=True,
+    alike=_alike,
+    settle=_settle,
+    pictures=_pictures,
+    trained=_trained,
+    least=_least,
+    of_column=_of_column,
+    of_estimate=_of_estimate,
+    keys={
+        "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
+        "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),
+    },
+)

@@ -156,3 +156,13 @@ def _linear(
     if cause == "cross_axis":
         estimate["other"] = chosen.name.removeprefix("axis_")
     return [Look(cause, gain, worth, estimate, {"regressors": (*state.regressors, chosen)})]
+
+
+def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, str]] | None:
+    """The coefficient of a channel that this record would have shown; None where it has none that changes."""
+    if channel not in record.channels:
+        return None
+    values = record.channels[channel]
+    size = state.least(smoothed(values, round(10.0 * record.rate_hz)) - float(values.mean()))
+    unit = coefficient_unit(state.unit, SIDE_CHANNELS[channel][1])
+    return {"coefficient": (size, unit)} if math.isfinite(size) else None

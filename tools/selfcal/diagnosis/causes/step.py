@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.fit import Fit, Series, nodes, run, shifts
+from selfcal.diagnosis.cause import Cause, Key, shown
+from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, ln_looks, mixture, net
+from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
 
 #: A place is looked at where the level before it leaves this share of a step's information, at least; and until what is
@@ -23,6 +25,8 @@ FORGETS = 5.0
 VALLEY = 8.0
 #: Places of the posterior that hold less than this are left out.
 WEIGHT_LEAST = 1e-7
+#: Jumps of two axes so close to each other, s, are one event.
+ONE_EVENT_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -62,14 +66,6 @@ def scan(series: Series, fit: Fit) -> Scan:
     turns = 0.5 * present.size * float(np.median(found.impulse[present] / found.A[present]))
     none = -0.5 * (rss / fit.sigma**2 + found.sums.D)
     return Scan(B / fit.sigma**2, A / fit.sigma**2, _bend(A, found.impulse), turns, none)
-
-
-def response_of(series: Series, fit: Fit) -> Array:
-    """Whitened innovations of a unit step once the filter has settled, over sigma."""
-    n = series.y.size
-    clean = Series(np.zeros(2 * n), series.dt, np.ones(2 * n), np.vstack([_column(2 * n, n)]))
-    _, white, _ = run(clean, fit.terms, fit.theta, innovations=True)
-    return white[n:, 1] / fit.sigma
 
 
 def _bend(A: Array, impulse: Array) -> Array:
@@ -178,3 +174,44 @@ def _peaks(gain: Array, count: int, apart: int) -> list[int]:
         found.append(at)
         left[max(0, at - apart) : at + apart + 1] = 0.0
     return found
+
+
+def _alike(a: Look, b: Look) -> bool:
+    return a.when is not None and b.when is not None and abs(a.when[0] - b.when[0]) < ONE_EVENT_S
+
+
+def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
+    """One in the middle of the record."""
+    n = record.present.size
+    worth = scan(state.series, state.best).worth
+    return {"amplitude": (state.least(_column(n, n // 2)) * math.sqrt(gain_for(worth)), state.unit)}
+
+
+def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+    """Its time is one of the whole recording's."""
+    time_s = float(entry["time_s"]) + record.start_s
+    return {**entry, "name": f"step_{time_s:.6g}s", "time_s": time_s}
+
+
+def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    return {"time_s": float(column.entry["time_s"]), "amplitude": c[0]}
+
+
+CAUSE = Cause(
+    "step",
+    "The bias jumps once.",
+    "Record again without touching the mount or the cable.",
+    looks=looks,
+    most=3,
+    slow=True,
+    alike=_alike,
+    pictures=shown("means", "evidence"),
+    onset=True,
+    least=_least,
+    entry=_entry,
+    of_column=_of_column,
+    keys={
+        "time_s": Key(lambda s: s.duration_s / 2.0, "step_time_s"),
+        "amplitude": Key(lambda s: 2.0 * s.n, "step_amplitude"),
+    },
+)

@@ -1,0 +1,156 @@
+"""A cause: one file in `causes/` states everything about it, and nobody else branches on its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from selfcal.diagnosis.statemodel import Array
+
+if TYPE_CHECKING:
+    from selfcal._reference import Random
+    from selfcal.diagnosis.finding import Diagnosed, Finding
+    from selfcal.diagnosis.record import Record
+    from selfcal.diagnosis.state import Look, Regressor, State
+    from selfcal.model import Model
+
+#: Looks at one axis: the candidates of one cause or of several.
+Looks = Callable[["State", "Record"], "list[Look]"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an effect's default is made from: white noise density, white noise sd per sample, length, and the bias."""
+
+    n: float
+    sd: float
+    duration_s: float
+    samples: int
+    bias: float
+
+
+def _any(value: float) -> bool:
+    return True
+
+
+#: What `is_count` asks for.
+A_COUNT = "a whole number of at least 1"
+
+
+def is_count(value: float) -> bool:
+    """Whether a key's value counts something."""
+    return value >= 1.0 and value == int(value)
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of `simulate --effect`: its value when it is not given, and which values it may have (`fits`, `limits` in
+    words). `field`: the member of the simulator's axis, or scene, that takes it; "" where `Cause.add` or the read-out
+    does."""
+
+    default: Callable[[Setting], float]
+    field: str = ""
+    fits: Callable[[float], bool] = _any
+    limits: str = "finite"
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Before the read-out, each [n]: time, s, temperature, degC, supply, V, and the other axes."""
+
+    time_s: Array
+    temperature: Array
+    supply: Array
+    axes: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Extension:
+    """The model file's `tree` that a finding extends, and where it was found."""
+
+    tree: dict[str, Any]
+    model: Model
+    record: Record
+    axis: str
+    found: Mapping[str, Diagnosed]
+    finding: Finding
+
+    @property
+    def group(self) -> dict[str, Any]:
+        """The tree of the axis' group."""
+        group: dict[str, Any] = self.tree["groups"][self.model.group_of(self.axis).name]
+        return group
+
+
+def _never(a: Look, b: Look) -> bool:
+    return False
+
+
+def _as_is(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+    return dict(entry)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Everything about one cause.
+
+    id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
+    looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
+    most         times at most that the loop names it on an axis; 0: as often as it is found.
+    stationary   motion must not be taken for it: it is looked for before motion.
+    slow         a drift of another law may show it: `identify` weighs more laws.
+    alike        whether two looks on two axes are one cause with its size on each.
+    settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
+    pictures     names of pictures.py for a look.
+    no_gain      why a gain on held-out time is not defined.
+    onset        scored from its on-line detection, `Look.when[0]`.
+    trained      look, states before and after, record and split: the state after as the first `split` samples show it.
+    least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
+    entry        the model file's entry of its column for the whole recording.
+    from_zero    the simulator's effect begins at 0, its column is about the middle.
+    extend       writes what is no column into the model file.
+    of_column    keys of `--effect` for its columns: the first one and the coefficients of all.
+    of_estimate  keys of `--effect` for a finding without a column; None: the column has them.
+    keys         keys of `simulate --effect`; empty: it cannot be simulated.
+    follows      the effect follows another axis: the key `other`.
+    common       the effect is of the whole recording and has no axis.
+    add          what the effect adds to a reading before the read-out, [n]: keys, channels.
+    spoil        changes the finished readings of an axis in place: those, keys, rate, Hz, lattice, random numbers.
+    """
+
+    id: str
+    words: str
+    record_next: str
+    looks: Looks | None = None
+    most: int = 0
+    stationary: bool = False
+    slow: bool = False
+    alike: Callable[[Look, Look], bool] = _never
+    settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
+    pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
+    no_gain: str = ""
+    onset: bool = False
+    trained: Callable[[Look, State, State, Record, int], State] | None = None
+    least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
+    entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
+    from_zero: bool = False
+    extend: Callable[[Extension], None] | None = None
+    of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
+    of_estimate: Callable[[Look], dict[str, Any] | None] | None = None
+    keys: Mapping[str, Key] = field(default_factory=dict)
+    follows: bool = False
+    common: bool = False
+    add: Callable[[Mapping[str, Any], Channels], Array] | None = None
+    spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+
+def shown(*names: str) -> Callable[[Look], Sequence[str]]:
+    """The same pictures for every look."""
+    return lambda look: names
+
+
+def medians(look: Look, *keys: str) -> dict[str, Any]:
+    """The medians of an estimate's intervals, of `keys` or all."""
+    intervals = {key: value["median"] for key, value in look.estimate.items() if isinstance(value, Mapping)}
+    return {key: intervals[key] for key in keys or intervals}

@@ -1,0 +1,88 @@
+"""White noise with memory: a moving average, whose correlation cuts off, or a first-order process."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.fit import best, fit, moved
+from selfcal.diagnosis.model_tree import add_law, digits
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+from selfcal.diagnosis.statemodel import Array
+from selfcal.laws import RATIO_LIMITS
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """The better of the two, the drift fitted with it."""
+    if state.extras.color:
+        return []
+    w = np.nan_to_num(state.whitened)
+    n = max(1, int(np.isfinite(state.y).sum()))
+    lags: Array = np.array([float(w[k:] @ w[:-k]) / n for k in (1, 2)])
+    if 0.5 * n * float(lags @ lags) < 2.0:
+        return []
+    found: list[Look] = []
+    for color in ("ma", "ar"):
+        fits = []
+        for drift in state.near():
+            terms = replace(drift, color=color)
+            start = moved(next(one for one in state.fits if one.terms == drift), terms)
+            start[terms.names.index("color")] = math.atanh(min(0.9, max(-0.9, float(lags[0]))))
+            fits.append(fit(state.series, terms, start, step=0.25))
+        chosen = best(fits)
+        gain = chosen.ln_likelihood - state.best.ln_likelihood
+        m = math.tanh(chosen.value("color"))
+        lag1 = m / (1.0 + m * m) if color == "ma" else m
+        sd = (1.0 - lag1 * lag1) / math.sqrt(n)
+        found.append(
+            Look(
+                "colored_noise",
+                gain,
+                net(gain),
+                {"lag1": interval(lag1, sd, "1")},
+                {"extras": replace(state.extras, color=color)},
+            )
+        )
+    return [max(found, key=lambda one: one.gain)]
+
+
+def _extend(at: Extension) -> None:
+    """A law for white noise with memory.
+
+    A first-order process at the bank's own rate is a Gauss-Markov drift of its correlation time, beside a walk. Block
+    means of a faster one, and a moving average, are correlated with their neighbours alone."""
+    tree, fit = at.tree, at.found[at.axis].state.best
+    correlation = math.tanh(fit.value("color"))
+    at_bank_rate = abs(fit.dt * float(tree["bank_rate_hz"]) - 1.0) < 0.01
+    if fit.terms.color == "ar" and correlation > 0.0 and at_bank_rate and "correlation_time_s" not in tree:
+        time_s = -fit.dt / math.log(correlation)
+        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt) if fit.terms.walk else 0.0
+        most = min(10.0 * fit.sigma / max(K * math.sqrt(time_s), 1e-300), RATIO_LIMITS[1])
+        tree["correlation_time_s"] = digits(time_s)
+        prior = {"law": "log_uniform", "min": digits(0.01 * most), "max": digits(most)}
+        add_law(tree, "walk_and_markov", "markov_ratio", prior)
+        return
+    add_law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
+
+
+def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
+    return {"lag1": (math.sqrt(2.0 * NET_LEAST / state.best.n), "1")}
+
+
+CAUSE = Cause(
+    "colored_noise",
+    "The white noise has memory: neighbouring samples are correlated.",
+    "Record at the sensor's full rate with its filter off.",
+    looks=looks,
+    stationary=True,
+    slow=True,
+    pictures=shown("correlation"),
+    least=_least,
+    extend=_extend,
+    of_estimate=medians,
+    keys={"lag1": Key(lambda s: 0.5, "noise_lag1", lambda v: -1.0 < v < 1.0, "between -1 and 1")},
+)

@@ -1,0 +1,78 @@
+"""Another axis leaks into this one: its readings as a column."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from selfcal.diagnosis.cause import Cause, Key, shown
+from selfcal.diagnosis.causes import regressors
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.model_tree import digits
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import ALIKE, Regressor, State
+from selfcal.regressors import coefficient_unit
+
+
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Two axes that each blame the other: the reading that follows is the one that gains more by it.
+
+    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
+    coupling is kept: a mechanical one is below 1. Returns the axes that are blamed less."""
+    changed: list[str] = []
+    pairs = {
+        (name, str(finding.look.estimate["other"])): finding
+        for name, one in found.items()
+        for finding in one.findings
+        if finding.look.cause == "cross_axis"
+    }
+    for (name, other), finding in pairs.items():
+        back = pairs.get((other, name))
+        if back is None:
+            continue
+        ahead = back.look.gain - finding.look.gain
+        if abs(ahead) < ALIKE:
+            sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
+            ahead = sizes[0] - sizes[1]
+        if ahead > 0.0:
+            one = found[name]
+            one.findings.remove(finding)
+            kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
+            one.state = one.state.refit(regressors=kept)
+            changed.append(name)
+    return changed
+
+
+def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
+    """Of the axis that would have to leak most."""
+    sizes = {name: state.least(values) for name, values in record.other_axes(state.axis).items()}
+    sizes = {name: value for name, value in sizes.items() if math.isfinite(value)}
+    if not sizes:
+        return None
+    worst = max(sizes, key=lambda name: sizes[name])
+    return {"coefficient": (sizes[worst], coefficient_unit(state.unit, record.axes[worst].unit))}
+
+
+def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+    """A module knows the reading and not its level."""
+    return {**entry, "reference": digits(record.axes[str(entry["column"])].level)}
+
+
+def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    return {"coefficient": c[0], "other": str(column.entry["column"])}
+
+
+CAUSE = Cause(
+    "cross_axis",
+    "Another axis leaks into this one.",
+    "Turn the sensor so that the other axis reads something else.",
+    looks=regressors.looks,
+    settle=_settle,
+    pictures=shown("means", "evidence"),
+    least=_least,
+    entry=_entry,
+    of_column=_of_column,
+    keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient")},
+    follows=True,
+)

@@ -1,0 +1,106 @@
+"""Single samples that are far off: a mixture of the innovations with a share of wider ones."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.model_tree import add_handling
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+
+#: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
+#: most of them: 5 instead of 1350 / e gained 2.5 nats.
+LN_LOOKS = -1.5
+#: Outliers are exceptions: a look that takes more of the samples for them has another cause.
+MOST = 0.05
+#: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
+KEPT_OUT_SD = 6.0
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """Isolated wild samples. They are exceptions: a mixture with many of them has another cause."""
+    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= MOST]
+
+
+def mixed(state: State, record: Record) -> list[Look]:
+    """A mixture of the innovations with a share of wider ones."""
+    w = state.whitened
+    present = np.isfinite(w)
+    x = w[present]
+    n = x.size
+    if n < 50 or np.abs(x).max() < 3.5:
+        return []
+    share, wide, core = max(1.0, float((np.abs(x) > 4.0).sum())) / n, max(3.0, float(np.abs(x).max()) / 2.0), 1.0
+    plain = -0.5 * (x**2).sum() / np.mean(x**2) - n * 0.5 * math.log(float(np.mean(x**2)))
+    weight = np.zeros(n)
+    before = -math.inf
+    value = before
+    for _ in range(200):
+        a = math.log(max(1e-12, 1.0 - share)) - 0.5 * (x / core) ** 2 - math.log(core)
+        b = math.log(share) - 0.5 * (x / wide) ** 2 - math.log(wide)
+        both = np.logaddexp(a, b)
+        value = float(both.sum())
+        weight = np.exp(b - both)
+        share = min(0.3, max(0.3 / n, float(weight.mean())))
+        wide = max(2.5 * core, math.sqrt(float(weight @ x**2 / max(weight.sum(), 1e-12))))
+        core = max(1e-6, math.sqrt(float((1.0 - weight) @ x**2 / max(1e-12, (1.0 - weight).sum()))))
+        if value - before < 1e-4:
+            break
+        before = value
+    gain = value - float(plain)
+    worth = net(gain, 2, LN_LOOKS)
+    picked = np.flatnonzero(present)[weight > 0.5]
+    if worth < 1.0 or not picked.size:
+        return []
+    # Several in a row are no outliers: motion, or a change of the noise.
+    alone = np.ones(picked.size, bool)
+    if picked.size > 1:
+        close = np.diff(picked) <= 3
+        alone[1:] &= ~close
+        alone[:-1] &= ~close
+    if alone.mean() < 0.6 and share < 0.1:
+        worth *= float(alone.mean())
+    y = state.y.copy()
+    y[picked] = np.nan
+    if not np.nanmax(y) > np.nanmin(y):
+        return []  # the others are all equal: a dead band
+    largest = int(picked[np.argmax(np.abs(w[picked]))])
+    fraction = picked.size / n
+    return [
+        Look(
+            "outliers",
+            gain,
+            worth,
+            {
+                "fraction": interval(fraction, math.sqrt(picked.size) / n, "1"),
+                "time_s": interval(float(record.time_s[largest]), 0.0, "s"),
+            },
+            {"y": y},
+            when=(float(record.time_s[picked[0]]), float(record.time_s[picked[-1]])),
+        )
+    ]
+
+
+def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
+    """One sample so far off that its evidence pays for the choice among n."""
+    return {"deviation": (math.sqrt(2.0 * (NET_LEAST + math.log(state.best.n))) * state.best.sigma, state.unit)}
+
+
+def _extend(at: Extension) -> None:
+    add_handling(at.tree, "outlier_sd", KEPT_OUT_SD)
+
+
+CAUSE = Cause(
+    "outliers",
+    "Single samples are far off.",
+    "Check the bus: log the raw words of those samples.",
+    looks=looks,
+    pictures=shown("largest", "histogram"),
+    least=_least,
+    extend=_extend,
+    of_estimate=lambda look: medians(look, "fraction"),
+    keys={"fraction": Key(lambda s: 0.005, "outlier_fraction", lambda v: 0.0 <= v <= 1.0, "from 0 to 1")},
+)

@@ -1,0 +1,17 @@
+"""The sampling rate changes once. sampling.py finds the time."""
+
+from __future__ import annotations
+
+from selfcal.diagnosis.cause import Cause, Key
+
+CAUSE = Cause(
+    "rate_change",
+    "The sampling rate changes once.",
+    "Look for what set the rate at that time; record at one rate.",
+    no_gain="the record has one rate before and after",
+    keys={
+        "time_s": Key(lambda s: s.duration_s / 2.0),
+        "after_hz": Key(lambda s: 0.5 * s.samples / s.duration_s, "", lambda v: v > 0.0, "above 0"),
+    },
+    common=True,
+)

@@ -1,0 +1,30 @@
+"""The readings stop at one value for a while. readings.py finds the stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from selfcal._reference import Random
+from selfcal.diagnosis.cause import A_COUNT, Cause, Key, is_count
+from selfcal.diagnosis.statemodel import Array
+
+
+def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
+    """Each interval a tenth of its piece of the record."""
+    piece = row.size // keys["intervals"]
+    for k in range(keys["intervals"]):
+        start = k * piece + int(random.uniform() * 0.8 * piece)
+        row[start : start + max(1, piece // 10)] = row[start]
+
+
+CAUSE = Cause(
+    "stuck",
+    "The readings stop at one value for a while.",
+    "Check the bus and the sensor's data-ready line at that time.",
+    alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0]),
+    no_gain="readings that stick are no readings: none is scored",
+    of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},
+    keys={"intervals": Key(lambda s: 2, "", is_count, A_COUNT)},
+    spoil=_spoil,
+)

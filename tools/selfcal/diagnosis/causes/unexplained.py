@@ -1,0 +1,12 @@
+"""The readings differ from every model tried, and no known cause explains it. The statistics of the verdict show it."""
+
+from __future__ import annotations
+
+from selfcal.diagnosis.cause import Cause
+
+CAUSE = Cause(
+    "unexplained",
+    "The readings differ from every model tried, and no known cause explains it.",
+    "Record again: if the statistic stands out a second time, it is the sensor's own.",
+    no_gain="no model was extended",
+)
