@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft
 
 #: Rows looked at on either side of a long time step to tell missing samples from a late one.
 _NEIGHBOURS = 10
@@ -41,9 +42,16 @@ _ODD = 10
 _STEPS, _PIECES = 20, 100
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
-#: Stamps lie on no grid if the mean step is so much longer than the usual one, and long steps are off whole ones by so
-#: many intervals rms (at random: 0.29). Then a step of so many mean ones is a gap.
-_MEAN, _BETWEEN, _GAP = 1.2, 0.2, 20.0
+#: Stamps that need missing samples, or whose mean step is so much longer than the usual one, are asked for a grid.
+#: Without one a step of so many mean ones is a gap.
+_MEAN, _GAP = 1.2, 20.0
+#: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
+#: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
+_STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
+#: Least share of the samples of an even grid that is left: of fewer, random stamps on a lattice look alike.
+_KEPT = 0.4
+#: Rows that are looked at for that, and the power of a line over the mean, beyond the largest of as many by chance.
+_ROWS, _LINE = 1 << 17, 8.0
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
@@ -76,15 +84,25 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
                 raise  # a stated rate decides, and is checked by who knows it
     positive = steps[steps > 0.0]
     first = float(np.median(positive[positive < 1.5 * np.median(positive)])) if rate is None else 1.0 / rate
-    if rate is None and typical > _MEAN * first and _between(steps / first):
+    dt, missing = _fine(time, steps, first)
+    if rate is None and (typical > _MEAN * first or missing.any()) and not _even(time, dt):
         return _mean_grid(steps)
-    return _fine(time, steps, first)
+    return dt, missing
 
 
-def _between(intervals: NDArray[np.float64]) -> bool:
-    """Whether long steps are of no whole number of intervals: those of missing samples are."""
-    long = intervals[intervals > 1.5]
-    return bool(((long - np.rint(long)) ** 2).mean() > _BETWEEN**2)
+def _even(time: NDArray[np.float64], dt: float) -> bool:
+    """Whether stamps lie on a grid of `dt`, jitter and lost samples or not.
+
+    exp(2 pi i t / dt) of grid times with jitter of the sd s has the mean length exp(-2 (pi s / dt)^2) in any stretch.
+    Of steps that are independent it decays along a stretch. A rate that is slightly off turns it, so a few are tried.
+    """
+    length = min(_STRETCH, time.size)
+    rows = time[: time.size // length * length].reshape(-1, length)
+    rows = rows[:: math.ceil(len(rows) / _STRETCHES)]
+    turns = (rows - rows[:, :1]) / dt
+    off = np.arange(-_TRIED, _TRIED + 1) / (2.0 * length)
+    lengths = [np.abs(np.exp(2j * math.pi * turns * (1.0 + each)).mean(axis=1)) ** 2 for each in off]
+    return bool(np.median(np.max(lengths, axis=0)) > _COHERENT)
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -207,6 +225,8 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     whole = _unbroken(time, lattice)
     if whole is not None:
         return whole, np.zeros(time.size, np.int64)
+    if rate is None and _lossy(np.rint(np.diff(time) / lattice)):
+        return _on_every_step(time, lattice)
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
     grid, scores = _scan(head, lattice, low, high)
@@ -226,6 +246,26 @@ def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) 
     own = int((steps[: rows - 1] > 1).sum())
     if steps.min() < 1 or own > gaps + 0.5 * math.sqrt(gaps) + _AS_GOOD:
         return None
+    return _on_every_step(time, lattice)
+
+
+def _lossy(steps: NDArray[np.float64]) -> bool:
+    """Whether whole numbers of lattice steps are those of an even grid of one step that loses samples at random.
+
+    A stamp is then on each lattice step with one probability, whatever the others: which steps have one is white noise.
+    Another rate on the lattice is a line in its spectrum, however many samples are lost."""
+    head = np.cumsum(steps[:_ROWS].astype(np.int64))
+    if steps.min() < 1.0 or not _KEPT < head.size / head[-1] < 1.0:
+        return False
+    taken = np.zeros(int(head[-1]) + 1)
+    taken[head] = 1.0
+    power = np.abs(rfft(taken - taken.mean())[1:]) ** 2
+    return float(power.max()) < (math.log(power.size) + _LINE) * float(power.mean())
+
+
+def _on_every_step(time: NDArray[np.float64], lattice: float) -> Found:
+    """The even grid of one lattice step."""
+    steps = np.rint(np.diff(time) / lattice).astype(np.int64)
     return float(time[-1] - time[0]) / int(steps.sum()), np.concatenate(([0], steps - 1))
 
 
