@@ -50,8 +50,8 @@ _MEAN, _GAP = 1.2, 20.0
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
 #: Least share of the samples of an even grid that is left: of fewer, random stamps on a lattice look alike.
 _KEPT = 0.4
-#: Rows that are looked at for that, and the power of a line over the mean, beyond the largest of as many by chance.
-_ROWS, _LINE = 1 << 17, 8.0
+#: Rows that show it, rows that are looked at, and the power of a line over the mean, beyond the largest of as many by chance.
+_ROWS_LEAST, _ROWS, _LINE = 500, 1 << 17, 8.0
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
@@ -255,7 +255,7 @@ def _lossy(steps: NDArray[np.float64]) -> bool:
     A stamp is then on each lattice step with one probability, whatever the others: which steps have one is white noise.
     Another rate on the lattice is a line in its spectrum, however many samples are lost."""
     head = np.cumsum(steps[:_ROWS].astype(np.int64))
-    if steps.min() < 1.0 or not _KEPT < head.size / head[-1] < 1.0:
+    if steps.size < _ROWS_LEAST or steps.min() < 1.0 or not _KEPT < head.size / head[-1] < 1.0:
         return False
     taken = np.zeros(int(head[-1]) + 1)
     taken[head] = 1.0
