@@ -1,8 +1,8 @@
 """Stamps without a grid, and grids that lose samples: the rate is the true one, and no sample is invented or lost.
 
 Truth: the stamps' own generator. A mean rate of n independent steps of the relative sd s is known to s/sqrt(n); four of
-those are allowed. With jitter of 0.09 and more a step of two now and then looks like one of one or three: 1 % of the lost samples
-and 0.2 % of all.
+those are allowed. With jitter of 0.09 and more a step of two now and then looks like one of one or three: 1 % of the
+lost samples and 0.2 % of all.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import case_records
 from numpy.typing import NDArray
 
 from selfcal.sampling import Ambiguous, sampling
+
+from conftest import case_records
 
 Floats = NDArray[np.float64]
 Random = np.random.Generator

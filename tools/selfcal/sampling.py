@@ -50,7 +50,7 @@ _MEAN, _GAP = 1.2, 20.0
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
 #: Least share of the samples of an even grid that is left: of fewer, random stamps on a lattice look alike.
 _KEPT = 0.4
-#: Rows that show it, rows that are looked at, and the power of a line over the mean, beyond the largest of as many by chance.
+#: Rows that show it, rows looked at, and the power of a line over the mean beyond the largest of as many by chance.
 _ROWS_LEAST, _ROWS, _LINE = 500, 1 << 17, 8.0
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
