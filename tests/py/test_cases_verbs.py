@@ -331,6 +331,57 @@ def test_identify_and_compare_take_fail_on(tmp_path: Path) -> None:
     assert outcome(same, "changed").code == 0
 
 
+def test_compare_names_the_axes_without_a_partner(tmp_path: Path) -> None:
+    """Truth: a has gx, gy and an ax that never moves; b has gy, gz, ax; c has gz in rad/s. gy is the same in a and b:
+    its only change by chance has a probability below 1 in 100."""
+    a, b = quiet(21, 2.0, 400.0, ("gx", "gy", "ax")), quiet(22, 2.0, 400.0, ("gy", "gz", "ax"))
+    a["ax"][1][:] = 1.5
+    save(tmp_path / "a.npz", a, 2.0)
+    save(tmp_path / "b.npz", b, 2.0)
+    save(tmp_path / "c.npz", {"gz": ("rad/s", np.radians(quiet(23, 2.0, 400.0, ("gz",))["gz"][1]))}, 2.0)
+    reasons = {
+        "ax": "a.npz: every reading is the same",
+        "gx": "b.npz does not have it",
+        "gz": "a.npz does not have it",
+    }
+    for wanted, code in ((None, 0), ("changed", 2)):
+        options = [] if wanted is None else ["--fail-on", wanted]
+        done = run("compare", "a.npz", "b.npz", "--json", "found.json", *options, cwd=tmp_path)
+        assert done.returncode == code, (wanted, done.stderr)
+        axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
+        assert axes == {"gy": [], **{name: {"error": why, "changes": []} for name, why in reasons.items()}}
+        assert "gy: nothing changed" in done.stdout
+        for name, why in reasons.items():
+            assert f"{name}: not compared: {why}" in done.stdout
+            assert wanted is None or f"{name}: {wanted} cannot be judged: {why}" in done.stderr
+    (tmp_path / "found.json").unlink()
+    done = run("compare", "--json", "found.json", "b.npz", "c.npz", cwd=tmp_path)
+    assert done.returncode == 2 and not (tmp_path / "found.json").exists()
+    assert "no axis can be compared (" in done.stderr
+    assert "gy: c.npz does not have it" in done.stderr
+    assert "gz: the recordings have it in deg/s and rad/s" in done.stderr
+    with pytest.raises(UserError, match=r"gz: \S*a.npz does not have it"):
+        logs = [tmp_path / "a.npz", tmp_path / "c.npz"]
+        compare(logs, axes=[], json=tmp_path / "found.json", fail_on="changed")
+    assert json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]["gz"]["changes"] == []
+
+
+def test_a_change_counts_beside_an_axis_without_a_partner(tmp_path: Path) -> None:
+    """Truth: the bias of gx moves by 2 deg/s from a to b; c has gy alone. Exit code 1 for the change, 2 for others."""
+    for name, seed in (("a", 31), ("b", 32), ("c", 33)):
+        columns = quiet(seed, 1.0, 500.0, ("gx", "gy") if name != "c" else ("gy",))
+        if name == "b":
+            columns["gx"][1][:] += 2.0
+        save(tmp_path / f"{name}.npz", columns, 1.0)
+    document = compare([tmp_path / f"{name}.npz" for name in "abc"])
+    gx = document["axes"]["gx"]
+    assert gx["error"] == f"{tmp_path / 'c.npz'} does not have it"
+    (row,) = gx["changes"]
+    assert row["quantity"] == "bias" and row["after"] - row["before"] == pytest.approx(2.0, abs=0.05)
+    assert document["axes"]["gy"] == []
+    assert [outcome(document, wanted).code for wanted in ("changed", "inadequate")] == [1, 2]
+
+
 # -------------------------------------------------------------------------------------------------- stages, work, ends
 
 
