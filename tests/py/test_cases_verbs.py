@@ -17,7 +17,7 @@ import pytest
 from gated import Gated
 from numpy.typing import NDArray
 
-from selfcal import gate
+from selfcal import ending, gate
 from selfcal.diagnosis import fit, loop, work
 from selfcal.diagnosis.record import of_recording
 from selfcal.errors import UserError
@@ -411,7 +411,9 @@ def test_means_come_first_and_every_sample_is_final(
         diagnose(tmp_path / "log.npz", decimate=1.0, full_rate=True)
 
 
-def test_work_is_bounded_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_is_bounded_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A bound that two jumps do not fit into: the axis ends with what it has, and that is told. The passes that are
     counted are within the bound, but for the ensemble and the gains that come after the rounds."""
     columns = quiet(12, 1.0, 2000.0, ("gx",))
@@ -429,8 +431,13 @@ def test_work_is_bounded_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     bound = 450 * 2.0 * 2000
     monkeypatch.setattr(work, "of_axis", lambda samples: Counted(lambda: False, bound))
-    axis = diagnose(tmp_path / "log.npz")["axes"]["gx"]
+    document = diagnose(tmp_path / "log.npz")
+    axis = document["axes"]["gx"]
     assert axis["unfinished"] == loop.SPENT
+    capsys.readouterr()
+    diagnose_module.show(document)
+    so_far = "inadequate" if axis["findings"] else "nothing found so far"
+    assert f"gx [deg/s]: {so_far}, not finished: {loop.SPENT}" in capsys.readouterr().out
     assert len(axis["findings"]) < 2 or axis["findings"] != whole["findings"]
     assert sum(spent) <= bound
     assert outcome({"axes": {"gx": axis}}, "ramp").code == 2
@@ -469,12 +476,34 @@ def test_a_signal_ends_it_with_the_first_look(number: int, code: int, tmp_path: 
         output, _ = process.communicate(timeout=60)
     assert process.returncode == code
     assert after - before < 2.0 or time.monotonic() - began < 2.0
-    assert "gx [deg/s]: inadequate" in output
+    assert "gx [deg/s]: inadequate, not finished: every sample: interrupted" in output
+    assert "gy [deg/s]: nothing found so far, not finished: every sample: interrupted" in output
     axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert [finding["cause"] for finding in axes["gx"]["findings"]] == ["step"]
     assert axes["gx"]["judged_at_hz"] == 1.0 and "interrupted" in axes["gx"]["unfinished"]
     assert axes["gy"]["verdict"] == "adequate"
-    assert "Not finished." in (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Not finished: gy." in page and "✓" not in page
+
+
+def test_a_first_look_that_is_broken_off_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Stopped before its fit or at an axis' first round, each without a finding: no axis is called clean."""
+    save(tmp_path / "log.npz", quiet(16, 10.0, 2100.0, ("gx", "gy")), 10.0)
+
+    def stopped_in_the_fit(*_: Any, **__: Any) -> None:
+        ending._state.came, ending._state.came_at = signal.SIGINT, time.monotonic()
+        raise ending.Stopped
+
+    for module, name in ((loop.motion, "handled"), (loop, "_rounds")):
+        with monkeypatch.context() as patched:
+            patched.setattr(module, name, stopped_in_the_fit)
+            with pytest.raises(ending.Ended):
+                diagnose(tmp_path / "log.npz")
+        first = capsys.readouterr().err.splitlines()
+        assert first[0].endswith("before every sample is looked at: ")
+        assert first[1:] == [f"selfcal: {axis}: not finished: {loop.INTERRUPTED}" for axis in ("gx", "gy")]
 
 
 def _cpu_s(pid: int) -> float:

@@ -27,6 +27,15 @@ WORDS: Mapping[str, str] = {
     "unexplained": "The readings differ from every model tried, and no known cause explains it.",
 }
 
+
+
+def verdict(axis: Mapping[str, Any]) -> str:
+    """The verdict on an axis of the document; one that is not finished is none."""
+    if not axis.get("unfinished"):
+        return str(axis["verdict"])
+    return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
+
+
 NEXT: Mapping[str, str] = {
     "temperature": "Cycle the temperature up and down, so that it does not only rise with time.",
     "supply": "Change the supply by 0.1 V and back, twice, at a constant temperature.",

@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
-from selfcal.diagnosis import work
+from selfcal.diagnosis import words, work
 from selfcal.diagnosis.document import SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, extended
 from selfcal.diagnosis.loop import INTERRUPTED, Diagnosed, diagnose_record
@@ -85,7 +85,7 @@ def diagnose(
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
             first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            _show_first(recording, first)
+            _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
         found = _joined(names, first, seen)
         errors = {
@@ -170,11 +170,13 @@ def _joined(
     return found
 
 
-def _show_first(recording: Recording, first: Mapping[str, Diagnosed]) -> None:
-    """The findings of the first look on stderr, as soon as they are there."""
+def _show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:
+    """The findings of the first look on stderr, as soon as they are there, and the axes `names` that it did not end."""
     with work.within(work.Work(lambda: True)):  # in words: nothing is measured for them
         axes = to_document(recording, first, {}, {})["axes"]
     told = [f"{name}: {finding['cause']}: {finding['words']}" for name in axes for finding in axes[name]["findings"]]
+    reasons = {name: first[name].unfinished if name in first else INTERRUPTED * ending.asked for name in names}
+    told += [f"{name}: not finished: {reason}" for name, reason in reasons.items() if reason]
     note(f"means of {1.0 / FIRST_HZ:g} s, before every sample is looked at: {'' if told else 'nothing found'}")
     for line in told:
         note(line)
@@ -233,8 +235,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         if "error" in axis:
             console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)
             continue
-        colour = "green" if axis["verdict"] == "adequate" else "bold red"
-        heading = f"{name} [{axis['unit']}]: {axis['verdict']}"
+        reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
+        colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
+        heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
         console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):
