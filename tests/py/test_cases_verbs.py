@@ -18,7 +18,7 @@ from gated import Gated
 from numpy.typing import NDArray
 
 from selfcal import ending, gate
-from selfcal.diagnosis import fit, loop, work
+from selfcal.diagnosis import fit, integrity, loop, work
 from selfcal.diagnosis.record import of_recording
 from selfcal.errors import UserError
 from selfcal.fail_on import outcome
@@ -203,6 +203,49 @@ def test_the_gate_leaves_the_noise_of_rest(tmp_path: Path) -> None:
         assert axis["samples_kept_out"]["missing"] == 0
     axes = diagnose(tmp_path / "moved.npz", gate=True, decimate=1.0, axes=["gx", "ax"])["axes"]
     assert [axis["verdict"] for axis in axes.values()] == ["adequate", "adequate"]
+
+
+@pytest.mark.parametrize(
+    ("seed", "rate_hz", "slow"), [(2, 24.0, 2), (1, 30.0, 3), (3, 50.0, 5), (4, 80.0, 8)][: case_records(1, 4)]
+)
+def test_what_is_missing_and_what_the_gate_left_out(seed: int, rate_hz: float, slow: int, tmp_path: Path) -> None:
+    """Gyros at `rate_hz`, accelerometers every `slow` rows; gaps of 1.2 s; both ends and the middle in the hand. Truth:
+    the rows of the file. Every cell of an axis is used or counted as motion, and every instant without a row is
+    missing on the clock of the axis. To `diagnose` motion that the gate left out is no missing sample."""
+    columns = quiet(40 + seed, rate_hz, 400.0)
+    shaken(columns, rate_hz, 0.0, 12.0)
+    shaken(columns, rate_hz, 201.0 + seed, 206.0 + seed)
+    shaken(columns, rate_hz, 388.0, 400.0)
+    t = np.arange(columns["gx"][1].size) / rate_hz
+    for holes in ((50.0, 90.0 + seed, 300.0), ()):
+        kept = np.ones(t.size, bool)
+        for at in holes:
+            kept &= (t < at) | (t >= at + 1.2)
+        for name in ("ax", "ay", "az"):
+            columns[name][1][np.arange(t.size) % slow != 0] = np.nan
+        log = tmp_path / "log.csv"
+        save(log, {name: (unit, y[kept]) for name, (unit, y) in columns.items()}, rate_hz, t=t[kept])
+        whole = load(log)
+        part = gate.gated(whole, Model.load())
+        for name, every in (("gx", 1), ("ax", slow)):
+            own = part.along(name)
+            assert own.samples + own.moving == np.isfinite(columns[name][1][kept]).sum(), name
+            assert own.moving > 29.0 * rate_hz / every
+            for one in (own, whole.along(name)):
+                assert one.lost == (~kept)[::every].sum(), name
+            assert identify(log, axes=[name], gate=True, suspicion=False)["axes"][name]["samples_kept_out"] == {
+                "missing": own.lost, "moving": own.moving, "not_finite": 0, "saturated": 0, "stuck": 0,
+            }  # fmt: skip
+        for decimate, axes in ((1.0, ["gx", "ax"]), (None, ["ax"])):
+            record = of_recording(part, Model.load(), decimate, axes)
+            looks, _ = integrity.missing(record)
+            if not holes:
+                assert not looks and record.present.mean() > 0.99
+                continue
+            for name in axes:
+                assert looks[name].estimate["missing"]["median"] == (~kept)[:: 1 if name == "gx" else slow].sum()
+                first, last = (time + record.start_s for time in looks[name].when)
+                assert abs(first - 50.0) < 9.0 and abs(last - 301.2) < 9.0  # a gap ends the gate's rest
 
 
 def test_a_model_without_a_gate_is_one_line(tmp_path: Path) -> None:
