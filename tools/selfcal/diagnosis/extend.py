@@ -15,7 +15,7 @@ from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.loop import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.ending import Stopped
-from selfcal.errors import remark
+from selfcal.errors import UserError, remark
 from selfcal.laws import RATIO_LIMITS, averaged
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
@@ -28,6 +28,8 @@ OUTLIER_SD = 6.0
 NODES = [24, 20]
 #: ... on the Cortex-M0, whose RAM holds one such law beside the random walk.
 SMALL_NODES = [12, 8]
+#: Begins each file that is written here.
+HEAD = "# Written by `selfcal diagnose`"
 #: Windows of a channel's trailing mean, s.
 WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
@@ -312,7 +314,20 @@ def _of_findings(one: Diagnosed) -> Iterator[tuple[str, float, dict[str, Any]]]:
             yield look.cause, look.gain, {key: max(1, round(value)) for key, value in median.items()}
 
 
+def check_not_by_hand(path: Path | str) -> None:
+    """Raise UserError for an older file that `as_text` has not made: its author wants to keep it."""
+    path = Path(path)
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    with path.open("rb") as file:
+        if not file.read(len(HEAD)) == HEAD.encode():
+            raise UserError(
+                f"{path}: `selfcal diagnose` did not write this file and does not write over it: give --write-model "
+                "another name, or delete the file"
+            )
+
+
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:
     """The file's text."""
-    head = f"# Written by `selfcal diagnose` from {remark(Path(source).name)}: the model with what was found in it.\n"
+    head = f"{HEAD} from {remark(Path(source).name)}: the model with what was found in it.\n"
     return head + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from selfcal.diagnosis import words, work
 from selfcal.diagnosis.document import SCHEMA, to_document
-from selfcal.diagnosis.extend import as_text, extended
+from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
 from selfcal.diagnosis.loop import INTERRUPTED, Diagnosed, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
 from selfcal.document import check_writable, of_errors, parameters_entry, regressors_entry, write_json
@@ -64,7 +64,8 @@ def diagnose(
     the means alone show stays in the axis' `only_in_means`, and counts for no verdict. An axis that the second look did
     not finish has the first one's result if it has none of its own. `full_rate`: no first look. `decimate`: look at
     block means at this rate alone, Hz.
-    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on`: see fail_on.py; it is
+    `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
+    write is kept, by a UserError. `fail_on`: see fail_on.py; it is
     only checked here. `start_s`, `end_s`, `gate`: as `identify` has them; times found are those of the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
@@ -75,6 +76,8 @@ def diagnose(
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
     check_writable(json, report, write_model, inputs=(*list_of(log), model))
+    if write_model is not None:
+        check_not_by_hand(write_model)
     loaded = Model.load(model)
     recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     recording = stretch_of(recording, loaded, start_s, end_s, gate)
