@@ -100,9 +100,10 @@ def test_a_stretch_is_the_rows_between_its_times(start_s: float | None, end_s: f
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"start_s": 9.0, "end_s": 4.0}, "--start 9 --end 4: takes two times in seconds"),
-        ({"start_s": -1.0}, "--start -1 --end inf: takes two times"),
-        ({"end_s": math.nan}, "takes two times in seconds"),
+        ({"start_s": 9.0, "end_s": 4.0}, "--start 9 --end 4: the start must lie before the end"),
+        ({"start_s": -1.0}, "--start -1: takes seconds from the beginning of the recording, 0 or more"),
+        ({"start_s": 3.0, "end_s": -7.5}, "--end -7.5: takes seconds from the beginning"),
+        ({"end_s": math.nan}, "lasts 40 s"),
         ({"start_s": 5000.0}, "fewer than two samples there; the recording lasts 40 s"),
     ],
 )

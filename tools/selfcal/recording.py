@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from selfcal.limits import (
 )
 from selfcal.output import together, whole
 from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
-from selfcal.text_table import TextTable, is_date
+from selfcal.text_table import TextTable, is_clock, is_date
 from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
 
 #: Sensor columns unless a model names others; a recording needs at least one.
@@ -176,11 +177,15 @@ class Recording:
         one, and for one that lies outside."""
         if start_s is None and end_s is None:
             return self
+        for option, value in (("--start", start_s), ("--end", end_s)):
+            if value is not None and not value >= 0.0:  # or not a number
+                raise UserError(
+                    f"{option} {value:g}: takes seconds from the beginning of the recording, 0 or more; {self.path} "
+                    f"lasts {self.duration_s:.6g} s"
+                )
         first, last = 0.0 if start_s is None else start_s, math.inf if end_s is None else end_s
-        if not 0.0 <= first < last:  # or not a number
-            raise UserError(
-                f"--start {first:g} --end {last:g}: takes two times in seconds, the first one before the other"
-            )
+        if not first < last:
+            raise UserError(f"--start {first:g} --end {last:g}: the start must lie before the end")
         kept = (self.time_s >= first) & (self.time_s < last)
         if np.count_nonzero(kept) < 2:
             raise UserError(
@@ -538,6 +543,8 @@ class _Header:
         self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
         self.no_time, self.several = no_time, several
         self.notes: list[str] = []
+        #: Heading of a column of dates that is not taken for the time.
+        self.dated = ""
         #: Columns whose unit the user states, or scales.
         self.decided = {*stated, *(scale if "" not in scale else sensors)}
 
@@ -559,7 +566,15 @@ class _Header:
         found: list[_Field] = []
         for place, (key, (name, unit)) in enumerate(zip(keys, self._named(keys, renamed), strict=True)):
             entry = described.get(_split(key)[0], {}) if unit is None else {}
-            dates = place < len(first) and is_date(first[place])
+            cell = first[place] if place < len(first) else ""
+            dates = is_date(cell)
+            if name == "t" and not self.no_time and not dates and is_clock(cell):
+                raise UserError(
+                    f"{self.path}: {where}column 't' begins with '{short(cell)}': write dates as "
+                    "2024-12-31 10:00:00.250, or seconds; or leave the column out with --no-time --rate HZ"
+                )
+            if dates or is_clock(cell):
+                self.dated = self.dated or key
             if not (name == "t" and self.no_time):
                 found += self._field(
                     key, name, entry.get("unit", unit), entry.get("lsb"), where, mapped=key in renamed, dates=dates
@@ -794,7 +809,8 @@ def _checked(
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(path, meta)
         if rate is None:
-            raise UserError(f"{path}: there is no time column: add t[s] or give --rate HZ")
+            mapped = f", map yours with --column t={shlex.quote(header.dated)}" if header.dated else ""
+            raise UserError(f"{path}: there is no time column: add t[s]{mapped} or give --rate HZ")
     else:
         unknown = np.isnan(stamps.values)
         if unknown.any():
