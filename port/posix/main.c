@@ -2,7 +2,7 @@
  * SLCAN, or by a CAN bus of the host.
  *
  *     selfcal-posix RECORDING [--report-every S] [--realtime X] [--timeout S] [--gate] [--node N]
- *                   [--stay | --can BUS]
+ *                   [--stay | --can BUS] [--leash]
  *
  * Prints `SELFCAL_PTY path`, waits for the host to open the channel, plays the recording (time stands still while the
  * channel is closed), and ends when the host closes the channel after the last frame. With --stay a host that goes away
@@ -10,6 +10,7 @@
  * With --can it prints `SELFCAL_CAN bus`, plays the recording whether anybody listens or not, and ends after the last
  * frame (port/posix/can.h).
  * With --gate motion is kept out, by the model's gate.
+ * With --leash the program ends when its standard input does: when its parent has died, however that came.
  * --node is the module's number on its bus, 0 to 11. It moves all identifiers.
  * Exit code: 0; 1 if the host went away or never came, or the bus failed; 2 for bad arguments or a bad recording.
  *
@@ -20,10 +21,12 @@
 #include <errno.h>
 #include <math.h>
 #include <poll.h>
+#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 
 #include "app.h"
 #include "can.h"
@@ -176,7 +179,7 @@ typedef struct {
     double report_every_s, timeout_s;
     double speed; /* times as fast as the recording's time; 0: as fast as it goes */
     long node;
-    bool gate, stay;
+    bool gate, stay, leash;
 } options_t;
 
 /* 0, or the exit code after a complaint. */
@@ -201,6 +204,8 @@ static int parse(options_t *options, int argc, char **argv)
             i++;
         } else if (strcmp(argv[i], "--stay") == 0) {
             options->stay = true;
+        } else if (strcmp(argv[i], "--leash") == 0) {
+            options->leash = true;
         } else if (strcmp(argv[i], "--can") == 0 && i + 1 < argc) {
             options->bus = argv[++i];
         } else if (options->path == NULL && argv[i][0] != '-') {
@@ -210,6 +215,18 @@ static int parse(options_t *options, int argc, char **argv)
         }
     }
     return options->path == NULL ? fail(2, "RECORDING", "is missing") : 0;
+}
+
+/* Waits for the end of the standard input, whatever the program waits for meanwhile. */
+static void *hold_leash(void *unused)
+{
+    char byte;
+    ssize_t got = 0;
+    do {
+        got = read(STDIN_FILENO, &byte, 1);
+    } while (got > 0 || (got < 0 && errno == EINTR));
+    _exit(1);
+    return unused;
 }
 
 static int run_on_can(host_t *host, app_t *app, const options_t *options)
@@ -264,6 +281,10 @@ int main(int argc, char **argv)
     const int refused = parse(&options, argc, argv);
     if (refused != 0) {
         return refused;
+    }
+    pthread_t thread;
+    if (options.leash && pthread_create(&thread, NULL, hold_leash, NULL) != 0) {
+        return fail(1, "--leash", "no thread for it");
     }
     host.speed = options.speed;
     const char *error = open_recording(&host, options.path);

@@ -15,4 +15,4 @@ $(OUT)/selfcal-posix: $(POSIX_SOURCES) $(POSIX_HEADERS) $(MODEL_DIR)/selfcal_mod
 	$(CC) -std=c99 -O2 -ffp-contract=off $(POSIX_WARNINGS) \
 	    $(NODE_FLAGS) $(POSIX_CFLAGS) \
 	    -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL_DIR) \
-	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm
+	    -o $@ $(POSIX_SOURCES) $(MODEL_DIR)/selfcal_model.c -lm -pthread

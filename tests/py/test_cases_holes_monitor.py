@@ -333,6 +333,49 @@ def test_a_killed_monitor_leaves_a_log_that_can_be_read(tmp_path: Path, suffix: 
     assert [one[:2] for one in frames_of(log)] == [(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in sent]
 
 
+CANDUMP_L = "({}) can0 200#C02709000080B588\n"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "head", "line", "stamp", "said"),
+    [
+        (".log", "", CANDUMP_L, "nan", "frame {} has the time stamp nan"),
+        (".log", "", CANDUMP_L, "-inf", "frame {} has the time stamp -inf"),
+        (".log", "", CANDUMP_L, "1e400", "frame {} has the time stamp inf"),
+        (".log", "", CANDUMP_L, "noon", "frame {} cannot be read"),
+        (".log", "", " ({})  can0  200   [8]  C0 27 09 00 00 80 B5 88\n", "nan", "line {} is no frame"),
+        (
+            ".csv",
+            "timestamp,arbitration_id,extended,remote,error,dlc,data\n",
+            "{},0x200,0,0,0,8,wCcJAACAtYg=\n",
+            "nan",
+            "frame {} has the time stamp nan",
+        ),
+    ],
+)
+def test_a_stamp_that_is_no_time_is_named(
+    suffix: str, head: str, line: str, stamp: str, said: str, tmp_path: Path
+) -> None:
+    """At once in the first frame; later as damage, after the frames before it. A clean log has neither."""
+    log = tmp_path / f"frames{suffix}"
+    stamps = ["1700000000.1", "1700000000.2", "1700000000.4", "1700000000.5"]
+    log.write_text(head + "".join(map(line.format, stamps)), encoding="ascii")
+    with FrameLog(log) as clean:
+        while not clean.closed:
+            clean.recv(1.0)
+        assert clean.damage == ""
+    log.write_text(head + "".join(map(line.format, [stamp, *stamps])), encoding="ascii")
+    with pytest.raises(UserError) as caught:
+        FrameLog(log)
+    assert said.format(1) in str(caught.value)
+    log.write_text(head + "".join(map(line.format, [*stamps[:3], stamp, *stamps[3:]])), encoding="ascii")
+    with FrameLog(log) as damaged:
+        frames = []
+        while not damaged.closed:
+            frames.append(damaged.recv(1.0))
+        assert len(frames) == 3 and said.format(4) in damaged.damage
+
+
 def test_a_full_disk_is_one_line() -> None:
     """Truth: /dev/full takes no byte."""
     with pytest.raises(UserError, match=r"cannot be written: No space left on device") as caught:

@@ -233,6 +233,30 @@ def test_dates_and_times(tmp_path: Path) -> None:
     assert load(log, skip_bad=True).missing_before.sum() == 1
 
 
+@pytest.mark.parametrize(
+    "cell",
+    ["31.12.2024 {}", "12/31/2024 {}", "2024/12/31 {}", "{}", "{}.250", "12/31/2024 {} PM", "31.12.24", "1-2-2024 {}"],
+)
+def test_times_of_other_forms_get_the_way_out(cell: str, tmp_path: Path) -> None:
+    """A unit would not mend them, and the message does not ask for one. The same stamps in ISO 8601 are read."""
+    times = [f"10:{k // 60:02d}:{k % 60:02d}" for k in range(120)]
+    for heading in ("t", "t[s]", "time", "timestamp"):
+        log = tmp_path / "log.csv"
+        rows = [f"{cell.format(time)},{k % 7}.5\n" for k, time in enumerate(times)]
+        log.write_text(f"{heading},gx[deg/s]\n" + "".join(rows), encoding="utf-8")
+        with pytest.raises(UserError) as caught:
+            load(log)
+        assert f"column 't' begins with '{cell.format(times[0])}': write dates as 2024-12-31 10:" in str(caught.value)
+        assert "--unit" not in str(caught.value)
+        assert load(log, rate=5.0, no_time=True).samples == 120
+    rows = [f"2024-12-31 {time},{k % 7}.5\n" for k, time in enumerate(times)]
+    log.write_text("when,gx[deg/s]\n" + "".join(rows), encoding="utf-8")
+    with pytest.raises(UserError, match="--column t=when"):
+        load(log)
+    assert load(log, columns={"t": "when"}).rate_hz == pytest.approx(1.0)
+
+
+
 def test_no_time_takes_the_stated_rate(tmp_path: Path) -> None:
     n = 500
     stamps = np.random.default_rng(1).uniform(0.0, 1.0, n)

@@ -17,8 +17,8 @@ import pytest
 from gated import Gated
 from numpy.typing import NDArray
 
-from selfcal import gate
-from selfcal.diagnosis import fit, loop, work
+from selfcal import ending, gate
+from selfcal.diagnosis import fit, integrity, loop, work
 from selfcal.diagnosis.record import of_recording
 from selfcal.errors import UserError
 from selfcal.fail_on import outcome
@@ -100,9 +100,10 @@ def test_a_stretch_is_the_rows_between_its_times(start_s: float | None, end_s: f
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"start_s": 9.0, "end_s": 4.0}, "--start 9 --end 4: takes two times in seconds"),
-        ({"start_s": -1.0}, "--start -1 --end inf: takes two times"),
-        ({"end_s": math.nan}, "takes two times in seconds"),
+        ({"start_s": 9.0, "end_s": 4.0}, "--start 9 --end 4: the start must lie before the end"),
+        ({"start_s": -1.0}, "--start -1: takes seconds from the beginning of the recording, 0 or more"),
+        ({"start_s": 3.0, "end_s": -7.5}, "--end -7.5: takes seconds from the beginning"),
+        ({"end_s": math.nan}, "lasts 40 s"),
         ({"start_s": 5000.0}, "fewer than two samples there; the recording lasts 40 s"),
     ],
 )
@@ -203,6 +204,49 @@ def test_the_gate_leaves_the_noise_of_rest(tmp_path: Path) -> None:
         assert axis["samples_kept_out"]["missing"] == 0
     axes = diagnose(tmp_path / "moved.npz", gate=True, decimate=1.0, axes=["gx", "ax"])["axes"]
     assert [axis["verdict"] for axis in axes.values()] == ["adequate", "adequate"]
+
+
+@pytest.mark.parametrize(
+    ("seed", "rate_hz", "slow"), [(2, 24.0, 2), (1, 30.0, 3), (3, 50.0, 5), (4, 80.0, 8)][: case_records(1, 4)]
+)
+def test_what_is_missing_and_what_the_gate_left_out(seed: int, rate_hz: float, slow: int, tmp_path: Path) -> None:
+    """Gyros at `rate_hz`, accelerometers every `slow` rows; gaps of 1.2 s; both ends and the middle in the hand. Truth:
+    the rows of the file. Every cell of an axis is used or counted as motion, and every instant without a row is
+    missing on the clock of the axis. To `diagnose` motion that the gate left out is no missing sample."""
+    columns = quiet(40 + seed, rate_hz, 400.0)
+    shaken(columns, rate_hz, 0.0, 12.0)
+    shaken(columns, rate_hz, 201.0 + seed, 206.0 + seed)
+    shaken(columns, rate_hz, 388.0, 400.0)
+    t = np.arange(columns["gx"][1].size) / rate_hz
+    for holes in ((50.0, 90.0 + seed, 300.0), ()):
+        kept = np.ones(t.size, bool)
+        for at in holes:
+            kept &= (t < at) | (t >= at + 1.2)
+        for name in ("ax", "ay", "az"):
+            columns[name][1][np.arange(t.size) % slow != 0] = np.nan
+        log = tmp_path / "log.csv"
+        save(log, {name: (unit, y[kept]) for name, (unit, y) in columns.items()}, rate_hz, t=t[kept])
+        whole = load(log)
+        part = gate.gated(whole, Model.load())
+        for name, every in (("gx", 1), ("ax", slow)):
+            own = part.along(name)
+            assert own.samples + own.moving == np.isfinite(columns[name][1][kept]).sum(), name
+            assert own.moving > 29.0 * rate_hz / every
+            for one in (own, whole.along(name)):
+                assert one.lost == (~kept)[::every].sum(), name
+            assert identify(log, axes=[name], gate=True, suspicion=False)["axes"][name]["samples_kept_out"] == {
+                "missing": own.lost, "moving": own.moving, "not_finite": 0, "saturated": 0, "stuck": 0,
+            }  # fmt: skip
+        for decimate, axes in ((1.0, ["gx", "ax"]), (None, ["ax"])):
+            record = of_recording(part, Model.load(), decimate, axes)
+            looks, _ = integrity.missing(record)
+            if not holes:
+                assert not looks and record.present.mean() > 0.99
+                continue
+            for name in axes:
+                assert looks[name].estimate["missing"]["median"] == (~kept)[:: 1 if name == "gx" else slow].sum()
+                first, last = (time + record.start_s for time in looks[name].when)
+                assert abs(first - 50.0) < 9.0 and abs(last - 301.2) < 9.0  # a gap ends the gate's rest
 
 
 def test_a_model_without_a_gate_is_one_line(tmp_path: Path) -> None:
@@ -331,6 +375,57 @@ def test_identify_and_compare_take_fail_on(tmp_path: Path) -> None:
     assert outcome(same, "changed").code == 0
 
 
+def test_compare_names_the_axes_without_a_partner(tmp_path: Path) -> None:
+    """Truth: a has gx, gy and an ax that never moves; b has gy, gz, ax; c has gz in rad/s. gy is the same in a and b:
+    its only change by chance has a probability below 1 in 100."""
+    a, b = quiet(21, 2.0, 400.0, ("gx", "gy", "ax")), quiet(22, 2.0, 400.0, ("gy", "gz", "ax"))
+    a["ax"][1][:] = 1.5
+    save(tmp_path / "a.npz", a, 2.0)
+    save(tmp_path / "b.npz", b, 2.0)
+    save(tmp_path / "c.npz", {"gz": ("rad/s", np.radians(quiet(23, 2.0, 400.0, ("gz",))["gz"][1]))}, 2.0)
+    reasons = {
+        "ax": "a.npz: every reading is the same",
+        "gx": "b.npz does not have it",
+        "gz": "a.npz does not have it",
+    }
+    for wanted, code in ((None, 0), ("changed", 2)):
+        options = [] if wanted is None else ["--fail-on", wanted]
+        done = run("compare", "a.npz", "b.npz", "--json", "found.json", *options, cwd=tmp_path)
+        assert done.returncode == code, (wanted, done.stderr)
+        axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
+        assert axes == {"gy": [], **{name: {"error": why, "changes": []} for name, why in reasons.items()}}
+        assert "gy: nothing changed" in done.stdout
+        for name, why in reasons.items():
+            assert f"{name}: not compared: {why}" in done.stdout
+            assert wanted is None or f"{name}: {wanted} cannot be judged: {why}" in done.stderr
+    (tmp_path / "found.json").unlink()
+    done = run("compare", "--json", "found.json", "b.npz", "c.npz", cwd=tmp_path)
+    assert done.returncode == 2 and not (tmp_path / "found.json").exists()
+    assert "no axis can be compared (" in done.stderr
+    assert "gy: c.npz does not have it" in done.stderr
+    assert "gz: the recordings have it in deg/s and rad/s" in done.stderr
+    with pytest.raises(UserError, match=r"gz: \S*a.npz does not have it"):
+        logs = [tmp_path / "a.npz", tmp_path / "c.npz"]
+        compare(logs, axes=[], json=tmp_path / "found.json", fail_on="changed")
+    assert json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]["gz"]["changes"] == []
+
+
+def test_a_change_counts_beside_an_axis_without_a_partner(tmp_path: Path) -> None:
+    """Truth: the bias of gx moves by 2 deg/s from a to b; c has gy alone. Exit code 1 for the change, 2 for others."""
+    for name, seed in (("a", 31), ("b", 32), ("c", 33)):
+        columns = quiet(seed, 1.0, 500.0, ("gx", "gy") if name != "c" else ("gy",))
+        if name == "b":
+            columns["gx"][1][:] += 2.0
+        save(tmp_path / f"{name}.npz", columns, 1.0)
+    document = compare([tmp_path / f"{name}.npz" for name in "abc"])
+    gx = document["axes"]["gx"]
+    assert gx["error"] == f"{tmp_path / 'c.npz'} does not have it"
+    (row,) = gx["changes"]
+    assert row["quantity"] == "bias" and row["after"] - row["before"] == pytest.approx(2.0, abs=0.05)
+    assert document["axes"]["gy"] == []
+    assert [outcome(document, wanted).code for wanted in ("changed", "inadequate")] == [1, 2]
+
+
 # -------------------------------------------------------------------------------------------------- stages, work, ends
 
 
@@ -360,7 +455,9 @@ def test_means_come_first_and_every_sample_is_final(
         diagnose(tmp_path / "log.npz", decimate=1.0, full_rate=True)
 
 
-def test_work_is_bounded_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_is_bounded_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A bound that two jumps do not fit into: the axis ends with what it has, and that is told. The passes that are
     counted are within the bound, but for the ensemble and the gains that come after the rounds."""
     columns = quiet(12, 1.0, 2000.0, ("gx",))
@@ -378,8 +475,13 @@ def test_work_is_bounded_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     bound = 450 * 2.0 * 2000
     monkeypatch.setattr(work, "of_axis", lambda samples: Counted(lambda: False, bound))
-    axis = diagnose(tmp_path / "log.npz")["axes"]["gx"]
+    document = diagnose(tmp_path / "log.npz")
+    axis = document["axes"]["gx"]
     assert axis["unfinished"] == loop.SPENT
+    capsys.readouterr()
+    diagnose_module.show(document)
+    so_far = "inadequate" if axis["findings"] else "nothing found so far"
+    assert f"gx [deg/s]: {so_far}, not finished: {loop.SPENT}" in capsys.readouterr().out
     assert len(axis["findings"]) < 2 or axis["findings"] != whole["findings"]
     assert sum(spent) <= bound
     assert outcome({"axes": {"gx": axis}}, "ramp").code == 2
@@ -418,12 +520,34 @@ def test_a_signal_ends_it_with_the_first_look(number: int, code: int, tmp_path: 
         output, _ = process.communicate(timeout=60)
     assert process.returncode == code
     assert after - before < 2.0 or time.monotonic() - began < 2.0
-    assert "gx [deg/s]: inadequate" in output
+    assert "gx [deg/s]: inadequate, not finished: every sample: interrupted" in output
+    assert "gy [deg/s]: nothing found so far, not finished: every sample: interrupted" in output
     axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert [finding["cause"] for finding in axes["gx"]["findings"]] == ["step"]
     assert axes["gx"]["judged_at_hz"] == 1.0 and "interrupted" in axes["gx"]["unfinished"]
     assert axes["gy"]["verdict"] == "adequate"
-    assert "Not finished." in (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Not finished: gy." in page and "✓" not in page
+
+
+def test_a_first_look_that_is_broken_off_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Stopped before its fit or at an axis' first round, each without a finding: no axis is called clean."""
+    save(tmp_path / "log.npz", quiet(16, 10.0, 2100.0, ("gx", "gy")), 10.0)
+
+    def stopped_in_the_fit(*_: Any, **__: Any) -> None:
+        ending._state.came, ending._state.came_at = signal.SIGINT, time.monotonic()
+        raise ending.Stopped
+
+    for module, name in ((loop.motion, "handled"), (loop, "_rounds")):
+        with monkeypatch.context() as patched:
+            patched.setattr(module, name, stopped_in_the_fit)
+            with pytest.raises(ending.Ended):
+                diagnose(tmp_path / "log.npz")
+        first = capsys.readouterr().err.splitlines()
+        assert first[0].endswith("before every sample is looked at: ")
+        assert first[1:] == [f"selfcal: {axis}: not finished: {loop.INTERRUPTED}" for axis in ("gx", "gy")]
 
 
 def _cpu_s(pid: int) -> float:

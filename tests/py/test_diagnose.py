@@ -455,6 +455,22 @@ cli.main()
 """
 
 
+def test_a_model_file_by_hand_is_not_written_over(tmp_path: Path) -> None:
+    """One line that names the way out, before any work, and not a byte of the file changes. An empty file, and one that
+    diagnose wrote, are written over."""
+    log, mine = tmp_path / "log.npz", tmp_path / "mine.yaml"
+    save(log, {"gx": ("deg/s", 0.1 * np.random.default_rng(3).standard_normal(300))}, 1.0)
+    for by_hand in (DEFAULT.read_bytes(), b"\xff\x00", b"# Written by"):
+        mine.write_bytes(by_hand)
+        with pytest.raises(UserError, match="give --write-model another name, or delete the file"):
+            diagnose(log, write_model=mine)
+        assert mine.read_bytes() == by_hand
+    mine.write_bytes(b"")
+    for _ in range(2):
+        diagnose(log, write_model=mine)
+        assert Model.load(mine).name.endswith(", extended")
+
+
 def test_ctrl_c_leaves_what_was_found(tmp_path: Path) -> None:
     """Three axes; the signal comes in the first round of the last one, when the others are done."""
     random = np.random.default_rng(6)

@@ -21,6 +21,7 @@ import pytest
 import typer
 
 from selfcal.cli import app
+from selfcal.diagnosis.extend import HEAD
 from selfcal.verbs.codegen import codegen
 
 from conftest import CASE_RECORDS, SHARED_DATA
@@ -163,8 +164,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = (ROOT / "tests" / "data" / "simulated_adis16405.yaml").read_text(encoding="utf-8")
     short_one = model.replace("duration_s: 3600.0", "duration_s: 600.0")
     assert short_one != model
-    for name in ("my.yaml", "extended.yaml"):
-        (folder / name).write_text(short_one, encoding="utf-8")
+    (folder / "my.yaml").write_text(short_one, encoding="utf-8")
+    (folder / "extended.yaml").write_text(f"{HEAD} from log.npz\n{short_one}", encoding="utf-8")
     shell(".venv/bin/selfcal simulate my.yaml -o log.csv --seed 2; cp log.csv part.csv", folder)
     return folder
 

@@ -30,7 +30,7 @@ from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.page import page, write_page
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import Missing, Record, of_recording
 from selfcal.diagnosis.state import Look, State
 from selfcal.diagnosis.statemodel import Array
 from selfcal.errors import UserError
@@ -161,10 +161,10 @@ def test_the_fitted_step_is_drawn_where_it_is() -> None:
 def test_missing_samples_are_counted_where_they_are() -> None:
     y = np.random.default_rng(3).standard_normal(N)
     y[500:600] = np.nan
-    record = replace(record_of(y), missing=100)
-    found_missing = integrity.missing(record)
-    assert found_missing is not None
-    finding = Finding(found_missing[0], 0, record.axes["gx"], record.axes["gx"])
+    record = replace(record_of(y), missing={"gx": Missing(100, N, (500.0, 600.0))})
+    looks, held = integrity.missing(record)
+    assert looks["gx"].when == (500.0, 600.0) and not held.any()
+    finding = Finding(looks["gx"], 0, record.axes["gx"], record.axes["gx"])
     (figure,) = drawn(finding, record)
     curve = figure.panels[0].curves[0]
     inside = (curve.x > 500.0) & (curve.x < 600.0)

@@ -165,6 +165,27 @@ def test_demo_says_what_is_wrong(options: dict[str, Any], complaint: str) -> Non
         demo(**options)
 
 
+@pytest.mark.parametrize("transport", ["slcan", pytest.param("can", marks=needs_multicast)])
+def test_a_killed_demo_leaves_no_module_behind(transport: str) -> None:
+    """SIGKILL cannot be caught: the firmware sees the end of its input, while it waits for a host or plays at its own
+    pace. It is there before, and gone within 5 s."""
+    command = [*COMMAND, "demo", "--transport", transport, "--speed", "1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("watch it by"):
+                break
+        (module,) = children(process)
+        time.sleep(0.5)
+        assert not gone(module)
+        process.kill()
+        process.wait(timeout=30)
+        end = time.monotonic() + 5.0
+        while not gone(module) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert gone(module)
+
+
 def test_a_signal_takes_the_emulator_and_the_folders_along(tmp_path: Path) -> None:
     command = [*COMMAND, "replay", str(SHIPPED), "--target", "cortex-m4f"]  # all axes: some seconds of emulation
     environment = os.environ | {"TMPDIR": str(tmp_path)}

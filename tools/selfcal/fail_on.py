@@ -32,8 +32,6 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
 
 def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
     """Of the document of `identify`, `diagnose` or `compare`."""
-    if wanted == CHANGED and any(document["axes"].values()):
-        return Outcome(1)
     told = list(_judged(document, wanted))
     lines = [line for applies, line in told if not applies and line]
     return Outcome(1 if any(applies for applies, _ in told) else 2 if lines else 0, lines)
@@ -42,10 +40,15 @@ def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
 def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
     """Of each axis whether it applies, and if not, why that is not known ("": it is)."""
     if "verdicts" in document:
+        for name, axis in document["axes"].items():
+            apart = isinstance(axis, Mapping)  # not all recordings could be compared
+            changed = wanted == CHANGED and bool(axis["changes"] if apart else axis)
+            yield changed, f"{name}: {wanted} cannot be judged: {axis['error']}" if apart else ""
         for path, axes in document["verdicts"].items():
             for name, axis in axes.items():
-                applies, line = _axis(axis, wanted)
-                yield applies, line and f"{path}: {name}: {line}"
+                if "error" not in axis:  # the axis has it in `axes`
+                    applies, line = _axis(axis, wanted)
+                    yield applies, line and f"{path}: {name}: {line}"
         return
     for name, axis in document["axes"].items():
         applies, line = _axis(axis, wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import struct
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, short
 
 if TYPE_CHECKING:
     import can
@@ -34,6 +35,10 @@ CANDUMP = re.compile(
     r"\[(?P<length>\d+)\](?P<data>\s+remote request|(?:\s+[0-9A-F]{2})*)\s*(?:'.*'?)?\s*"
 )
 GVRET = "Time Stamp,ID,Extended,"
+
+
+class _NoFrame(ValueError):
+    """A place of a log that is no frame, in words."""
 
 
 class FrameWriter:
@@ -102,6 +107,7 @@ class FrameLog:
     def __init__(self, path: Path | str, speed: float | None = None) -> None:
         import can
 
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers tell of lines that they leave out
         self.path = Path(path)
         self.malformed = 0
         self.closed = False
@@ -110,6 +116,7 @@ class FrameLog:
         self._waiting: can.Message | None = None
         self._due: float | None = None
         self._last_s = math.nan  # time stamp of the frame before
+        self._read = 0
         check_suffix(path)
         if not self.path.is_file():
             missing = "there is no such file" if not self.path.exists() else "this is no file"
@@ -119,9 +126,9 @@ class FrameLog:
         try:
             self._reader: Any = _foreign_reader(self.path) or can.LogReader(self.path)
             self._frames: Iterator[can.Message] = iter(self._reader)
-            self._waiting = next(self._frames, None)
+            self._waiting = self._next()
         except Exception as error:  # python-can's readers raise what they stumble over
-            raise UserError(f"{path}: no frame log as python-can writes it: {_said(error)}") from error
+            raise UserError(f"{path}: no frame log as python-can writes it: {self._said(error)}") from error
         if self._waiting is None:
             self.close()
             raise UserError(f"{path}: there is no frame in this log")
@@ -140,16 +147,28 @@ class FrameLog:
         self._due = None
         self._last_s = frame.timestamp
         try:
-            self._waiting = next(self._frames, None)
+            self._waiting = self._next()
         except Exception as error:
-            self._waiting, self.damage = None, _said(error)
+            self._waiting, self.damage = None, self._said(error)
         self.closed = self._waiting is None
         if self.closed and not self.damage and _is_cut(self.path):
             self.damage = "its last line is cut off"
         return frame
 
+    def _next(self) -> can.Message | None:
+        """The next frame of the file; None at its end. Raises _NoFrame, and whatever python-can's readers do."""
+        frame = next(self._frames, None)
+        if frame is not None:
+            self._read += 1
+            if not math.isfinite(frame.timestamp):
+                raise _NoFrame(f"frame {self._read} has the time stamp {frame.timestamp:g}")
+        return frame
+
+    def _said(self, error: Exception) -> str:
+        return str(error) if isinstance(error, _NoFrame) else f"frame {self._read + 1} cannot be read"
+
     def _wait(self, stamp_s: float) -> float:
-        """Seconds until the frame with this time stamp is due; a stamp that goes back or is no number does not wait."""
+        """Seconds until the frame with this time stamp is due; a stamp that goes back does not wait."""
         if self._speed is None:
             return 0.0
         now = time.monotonic()
@@ -179,7 +198,7 @@ def _is_cut(path: Path) -> bool:
 
 
 class _Lines:
-    """A reader of one frame a line, as python-can's are used. Raises ValueError for a line that is none."""
+    """A reader of one frame a line, as python-can's are used. Raises _NoFrame for a line that is none."""
 
     def __init__(self, path: Path, frame: Callable[[str], can.Message], skip: int) -> None:
         self._file: TextIO = path.open(encoding="ascii", errors="replace")
@@ -192,7 +211,7 @@ class _Lines:
                 try:
                     yield self._frame(line)
                 except (ValueError, IndexError) as error:
-                    raise ValueError(f"line {number} is no frame: {line.strip()[:60]}") from error
+                    raise _NoFrame(f"line {number} is no frame: {short(line.strip())}") from error
 
     def stop(self) -> None:
         self._file.close()
@@ -294,7 +313,3 @@ def _check_objects(path: Path, data: bytes) -> bytes:
             return data[at:]
         at += size
     return b""
-
-
-def _said(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

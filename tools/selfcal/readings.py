@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,7 +223,18 @@ def _regridded(recording: Recording, time: Array, row: int, before_s: float, aft
     missing = np.diff(whole, prepend=-1) - 1
     missing[0] = 0
     rate = float(f"{2.0 / (blocks[0] * before_s + blocks[1] * after_s):.10g}")
-    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None)
+    moved = _moving(recording, np.searchsorted(index, whole), missing, time.size / first)
+    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+
+
+def _moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
+    """The samples left out for motion of a recording of fewer rows: these `rows` [m] of it, each of `ratio` of its own,
+    and `missing` [m] before each."""
+    if recording.moving_before is None:
+        return {}
+    total = np.cumsum(recording.moving_before)[rows]
+    moved = np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64)
+    return {"moving_before": np.minimum(moved, missing), "moving": round(recording.moving / ratio)}
 
 
 def _common(before_s: float, after_s: float) -> tuple[int, int]:
@@ -260,8 +272,8 @@ def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, flo
         for name, one in recording.columns.items()
     }
     rate = recording.rate_hz / ratio
-    thin = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None)
-    return thin, rate
+    moved = _moving(recording, rows, missing, ratio)
+    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved), rate
 
 
 def own_rows(recording: Recording, axis: str) -> Rows | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from selfcal.limits import (
 )
 from selfcal.output import together, whole
 from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
-from selfcal.text_table import TextTable, is_date
+from selfcal.text_table import TextTable, is_clock, is_date
 from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
 
 #: Sensor columns unless a model names others; a recording needs at least one.
@@ -89,8 +90,8 @@ class Recording:
     """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row.
 
     `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps. `start_s`: where in the file's
-    recording the first row is, s. `moving`: how many of the missing samples are there, but were measured in motion.
-    `started_s`: the first stamp, s. `notes`: what a reader of the results must know of the file, one line each.
+    recording the first row is, s. `moving_before`, `moving`: samples left out for motion (`Clock`). `started_s`: the
+    first stamp, s. `notes`: what a reader of the results must know of the file, one line each.
     """
 
     path: Path
@@ -100,6 +101,7 @@ class Recording:
     meta: Mapping[str, Any]
     off_grid_s: NDArray[np.float64] | None = None
     start_s: float = 0.0
+    moving_before: NDArray[np.int64] | None = None
     moving: int = 0
     started_s: float | None = None
     notes: tuple[str, ...] = ()
@@ -120,13 +122,19 @@ class Recording:
 
     @property
     def lost(self) -> int:
-        """Samples that are not there at all."""
-        return int(self.missing_before.sum()) - self.moving
+        """Samples that were never measured."""
+        return int(self.clock.lost_before.sum())
 
     @property
     def clock(self) -> Clock:
         """The clock of all columns that have none of their own."""
-        return Clock(self.rate_hz, self.missing_before, self.off_grid_s)
+        return Clock(
+            self.rate_hz,
+            self.missing_before,
+            self.off_grid_s,
+            moving_before=self.moving_before,
+            moving=self.moving,
+        )
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -142,9 +150,8 @@ class Recording:
         that is why they are left out. Rows before the first and after the last that is kept are cut off."""
         at = self.clock.place
         where = np.flatnonzero(kept)
-        missing = np.diff(at[where], prepend=at[where[0]] - 1) - 1
-        inner = where[-1] - where[0] + 1 - where.size if moving else 0
         begin_s = float(at[where[0]] - at[0]) / self.rate_hz
+        clock = self.clock.of_rows(where, begin_s, moving=moving)
 
         def left(one: Column) -> Column:
             """An axis with a clock of its own keeps the samples that the row before them keeps."""
@@ -153,15 +160,16 @@ class Recording:
             time = one.clock.time_s
             rows = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, self.samples - 1)
             own = np.flatnonzero(kept[rows] & (rows >= where[0]) & (time < self.time_s[where[-1]] + 1.0 / self.rate_hz))
-            return replace(one, values=one.values[own], clock=one.clock.of_rows(own, begin_s))
+            return replace(one, values=one.values[own], clock=one.clock.of_rows(own, begin_s, moving=moving))
 
         return replace(
             self,
             columns={name: left(one) for name, one in self.columns.items()},
-            missing_before=missing,
-            off_grid_s=None if self.off_grid_s is None else self.off_grid_s[kept],
+            missing_before=clock.missing_before,
+            off_grid_s=clock.off_grid_s,
             start_s=self.start_s + begin_s,
-            moving=self.moving + int(inner),
+            moving_before=clock.moving_before,
+            moving=clock.moving,
         )
 
     def between(self, start_s: float | None, end_s: float | None) -> Recording:
@@ -169,11 +177,15 @@ class Recording:
         one, and for one that lies outside."""
         if start_s is None and end_s is None:
             return self
+        for option, value in (("--start", start_s), ("--end", end_s)):
+            if value is not None and not value >= 0.0:  # or not a number
+                raise UserError(
+                    f"{option} {value:g}: takes seconds from the beginning of the recording, 0 or more; {self.path} "
+                    f"lasts {self.duration_s:.6g} s"
+                )
         first, last = 0.0 if start_s is None else start_s, math.inf if end_s is None else end_s
-        if not 0.0 <= first < last:  # or not a number
-            raise UserError(
-                f"--start {first:g} --end {last:g}: takes two times in seconds, the first one before the other"
-            )
+        if not first < last:
+            raise UserError(f"--start {first:g} --end {last:g}: the start must lie before the end")
         kept = (self.time_s >= first) & (self.time_s < last)
         if np.count_nonzero(kept) < 2:
             raise UserError(
@@ -217,10 +229,18 @@ class Recording:
             }
         if own_clock is None and used.all():
             return self if columns is self.columns else replace(self, columns=columns)
-        missing = np.diff(clock.place[used], prepend=-1) - 1
-        off_grid = None if clock.off_grid_s is None else clock.off_grid_s[used]
-        columns = {name: replace(one, clock=None) for name, one in columns.items()}
-        return replace(self, rate_hz=clock.rate_hz, columns=columns, missing_before=missing, off_grid_s=off_grid)
+        own_rows = clock.of_rows(np.flatnonzero(used), 0.0)
+        missing = own_rows.missing_before
+        missing[0] = int(clock.place[np.argmax(used)])
+        return replace(
+            self,
+            rate_hz=clock.rate_hz,
+            columns={name: replace(one, clock=None) for name, one in columns.items()},
+            missing_before=missing,
+            off_grid_s=own_rows.off_grid_s,
+            moving_before=own_rows.moving_before,
+            moving=own_rows.moving,
+        )
 
 
 def _bridged(clock: Clock, values: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -523,6 +543,8 @@ class _Header:
         self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
         self.no_time, self.several = no_time, several
         self.notes: list[str] = []
+        #: Heading of a column of dates that is not taken for the time.
+        self.dated = ""
         #: Columns whose unit the user states, or scales.
         self.decided = {*stated, *(scale if "" not in scale else sensors)}
 
@@ -544,7 +566,15 @@ class _Header:
         found: list[_Field] = []
         for place, (key, (name, unit)) in enumerate(zip(keys, self._named(keys, renamed), strict=True)):
             entry = described.get(_split(key)[0], {}) if unit is None else {}
-            dates = place < len(first) and is_date(first[place])
+            cell = first[place] if place < len(first) else ""
+            dates = is_date(cell)
+            if name == "t" and not self.no_time and not dates and is_clock(cell):
+                raise UserError(
+                    f"{self.path}: {where}column 't' begins with '{short(cell)}': write dates as "
+                    "2024-12-31 10:00:00.250, or seconds; or leave the column out with --no-time --rate HZ"
+                )
+            if dates or is_clock(cell):
+                self.dated = self.dated or key
             if not (name == "t" and self.no_time):
                 found += self._field(
                     key, name, entry.get("unit", unit), entry.get("lsb"), where, mapped=key in renamed, dates=dates
@@ -779,7 +809,8 @@ def _checked(
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(path, meta)
         if rate is None:
-            raise UserError(f"{path}: there is no time column: add t[s] or give --rate HZ")
+            mapped = f", map yours with --column t={shlex.quote(header.dated)}" if header.dated else ""
+            raise UserError(f"{path}: there is no time column: add t[s]{mapped} or give --rate HZ")
     else:
         unknown = np.isnan(stamps.values)
         if unknown.any():
@@ -853,7 +884,7 @@ def _on_clocks(
     started_s = None if started_s is None else started_s + begins
     clocks = {
         id(names): clock_at(np.flatnonzero(axes[names[0]]), None if time is not None else rate)
-        for names in clocked.values()
+        for names in {id(names): names for names in clocked.values()}.values()
     }
     made: dict[str, Column] = {}
     missing: dict[str, int] = {}

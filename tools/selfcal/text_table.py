@@ -48,6 +48,8 @@ _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 _MISSING = re.compile(r"(nan?|n/a|null|none)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
+#: A date or a time of day in any form.
+_CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
 #: Lines that may be skipped at least, and their share at most, before a file is no recording.
 _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
@@ -321,6 +323,11 @@ class TextTable:
 def is_date(cell: str) -> bool:
     """Whether a cell is a date with a time of day."""
     return _ISO.fullmatch(cell) is not None
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a date, or a time of day, in any form."""
+    return _CLOCK.fullmatch(cell) is not None
 
 
 def _place(wanted: Sequence[int], place: int | None) -> int | None:

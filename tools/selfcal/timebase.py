@@ -41,13 +41,21 @@ class Clock:
     """When n samples were taken: an even grid of `rate_hz` that begins `start_s` after the recording does.
 
     `missing_before` int64[n]: samples missing just before each. `off_grid_s` float64[n]: stamp minus grid, s; None
-    without stamps.
+    without stamps. `moving_before` int64[n]: how many of the missing ones were measured, and left out for motion; None:
+    none. `moving` counts all that were left out for it, those beyond either end too.
     """
 
     rate_hz: float
     missing_before: NDArray[np.int64]
     off_grid_s: NDArray[np.float64] | None = None
     start_s: float = 0.0
+    moving_before: NDArray[np.int64] | None = None
+    moving: int = 0
+
+    @property
+    def lost_before(self) -> NDArray[np.int64]:
+        """int64[n]: samples just before each that were never measured."""
+        return self.missing_before if self.moving_before is None else self.missing_before - self.moving_before
 
     @property
     def place(self) -> NDArray[np.int64]:
@@ -59,13 +67,22 @@ class Clock:
         """float64[n]: time of each sample on the grid since the recording's first, s."""
         return self.start_s + self.place / self.rate_hz
 
-    def of_rows(self, rows: NDArray[np.int64], begin_s: float) -> Clock:
-        """The clock of these samples of it, in a recording that begins `begin_s` later."""
+    def of_rows(self, rows: NDArray[np.int64], begin_s: float, *, moving: bool = False) -> Clock:
+        """The clock of these samples of it, in a recording that begins `begin_s` later. `moving`: the others are left
+        out for motion."""
         place = self.place[rows]
         missing = np.diff(place, prepend=place[0] - 1 if place.size else 0) - 1
         off_grid = None if self.off_grid_s is None else self.off_grid_s[rows]
         start = float(self.time_s[rows[0]]) - begin_s if rows.size else self.start_s
-        return Clock(self.rate_hz, missing, off_grid, start)
+        moved, count = self.moving_before, self.moving
+        if moving:
+            count += self.missing_before.size - rows.size
+            lost = np.cumsum(self.lost_before)[rows]
+            moved = missing - np.diff(lost, prepend=lost[:1])
+        elif moved is not None:
+            total = np.cumsum(moved)[rows]
+            moved = np.diff(total, prepend=total[:1])
+        return Clock(self.rate_hz, missing, off_grid, start, moved, count)
 
     def alike(self, other: Clock) -> bool:
         """Whether both are one clock."""

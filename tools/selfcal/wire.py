@@ -861,6 +861,8 @@ def _can_devices() -> str:
 
 def _reason(interface: str, channel: str, error: BaseException) -> str:
     """Why a bus cannot be opened, and what to do about it."""
+    import can
+
     below: BaseException | None = error
     while below is not None and not (isinstance(below, OSError) and below.errno):
         below = below.__cause__ or below.__context__
@@ -878,13 +880,19 @@ def _reason(interface: str, channel: str, error: BaseException) -> str:
             return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
         if "msgpack" not in said:
             return "this is no multicast group: take 239.74.163.2, python-can's own"
-    if interface in ("slcan", "serial"):
-        if number in (errno.EACCES, errno.EPERM):
-            return "no permission to open it: `sudo usermod -aG dialout $USER`, then log in anew"
-        if "Could not configure port" in said:
-            return f"this is no serial port ({serial_ports()})"
-        if number == errno.EBUSY:
-            return "another program has it open"
-    if isinstance(error, NameError | ImportError):
-        return "its driver is not installed on this machine"
-    return f"cannot open: {said}"
+    if "://" in channel and number is None:
+        return "pyserial opens no such address: socket://HOST:PORT and rfc2217://HOST:PORT are some that it does"
+    if number in (errno.EACCES, errno.EPERM):
+        return "no permission to open it: `sudo usermod -aG dialout $USER`, then log in anew"
+    if "Could not configure port" in said:
+        return f"this is no serial port ({serial_ports()})"
+    if number == errno.EBUSY:
+        return "another program has it open"
+    if number is not None:
+        return f"cannot open: {os.strerror(number)}"
+    missing = (NameError, ImportError, can.CanInterfaceNotImplementedError)
+    if isinstance(error, missing) or type(error) is OSError:  # PEAK's library is an OSError without a number
+        return "its driver is not installed on this machine, or is none for this system"
+    if isinstance(error, TypeError):
+        return "this interface wants more than a channel: put the rest in python-can's configuration file"
+    return "cannot open: is the device plugged in, and the channel right?"

@@ -17,13 +17,15 @@ from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.ending import Stopped
-from selfcal.errors import remark
+from selfcal.errors import UserError, remark
 from selfcal.laws import averaged
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
+#: Begins each file that is written here.
+HEAD = "# Written by `selfcal diagnose`"
 #: Windows of a channel's trailing mean, s.
 WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
@@ -221,7 +223,20 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
             yield cause, strength, cause.of_column(column, c)
 
 
+def check_not_by_hand(path: Path | str) -> None:
+    """Raise UserError for an older file that `as_text` has not made: its author wants to keep it."""
+    path = Path(path)
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    with path.open("rb") as file:
+        if not file.read(len(HEAD)) == HEAD.encode():
+            raise UserError(
+                f"{path}: `selfcal diagnose` did not write this file and does not write over it: give --write-model "
+                "another name, or delete the file"
+            )
+
+
 def as_text(tree: Mapping[str, Any], source: Path | str) -> str:
     """The file's text."""
-    head = f"# Written by `selfcal diagnose` from {remark(Path(source).name)}: the model with what was found in it.\n"
+    head = f"{HEAD} from {remark(Path(source).name)}: the model with what was found in it.\n"
     return head + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))

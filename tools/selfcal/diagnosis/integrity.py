@@ -43,23 +43,27 @@ PIECES_MOST = 40_000
 MOTION_LEAST = 4.5
 
 
-def missing(record: Record) -> tuple[Look, Mask] | None:
-    """Gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is those."""
+def missing(record: Record) -> tuple[dict[str, Look], Mask]:
+    """By axis gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is
+    those, where an axis is found to miss samples."""
     held = _held(record)
-    gone = record.missing + int(held.sum())
-    span = max(record.present.size, record.missing)
-    where = np.flatnonzero(~record.present | held) / record.rate_hz
-    if gone <= MISSING_LEAST * span or not where.size:
-        return None
-    look = Look(
-        "missing_samples",
-        float(gone),
-        float(gone),
-        {"missing": interval(float(gone), 0.0, "samples")},
-        {},
-        when=(float(where[0]), float(where[-1])),
-    )
-    return look, held
+    rows = np.flatnonzero(held) / record.rate_hz
+    found: dict[str, Look] = {}
+    for name in record.axes:
+        gaps = record.missing.get(name)
+        gone = rows.size + (0 if gaps is None else gaps.samples)
+        if gone <= MISSING_LEAST * (record.present.size if gaps is None else gaps.of):
+            continue
+        times = [*rows[:1], *rows[-1:], *([] if gaps is None else gaps.when)]
+        found[name] = Look(
+            "missing_samples",
+            float(gone),
+            float(gone),
+            {"missing": interval(float(gone), 0.0, "samples")},
+            {},
+            when=(float(min(times)), float(max(times))),
+        )
+    return found, held if found else np.zeros_like(held)
 
 
 def _held(record: Record) -> Mask:

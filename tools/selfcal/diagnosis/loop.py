@@ -128,9 +128,9 @@ def _integrity(
     works: Mapping[str, work.Work],
 ) -> Record:
     """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
-    gone = integrity.missing(record)
-    if gone is not None and gone[1].any():
-        masked = {name: integrity.masked(state, gone[1]).refit() for name, state in record.axes.items()}
+    gone, held = integrity.missing(record)
+    if held.any():
+        masked = {name: integrity.masked(state, held).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
 
@@ -160,8 +160,8 @@ def _integrity(
         if look is not None and (name in handled or not _harms(look, one.state, states[name], record)):
             shared = tuple(other for other in {**handled, **moved} if other != name)
             one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))
-        if gone is not None:
-            one.findings.append(Finding(gone[0], 0, one.state, states[name]))
+        if name in gone:
+            one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
         clipped = None if states[name].below_lattice else integrity.saturation(replace(record, axes=states), name)
         if clipped is not None:

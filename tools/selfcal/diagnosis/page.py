@@ -15,7 +15,7 @@ import yaml
 
 import selfcal
 from selfcal import units as unit_module
-from selfcal.diagnosis import pictures
+from selfcal.diagnosis import pictures, words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.chart import Figure, draw, number, outside_of, scrolled
 from selfcal.diagnosis.extend import fitted_law
@@ -197,9 +197,10 @@ def _decimated(document: Mapping[str, Any], record: Record) -> bool:
 
 def _verdict(entry: Mapping[str, Any]) -> str:
     """With a sign beside the colour."""
-    if entry["verdict"] == "adequate":
-        return "<span class=good>✓ adequate</span>"
-    return f"<span class=bad>✗ {escape(str(entry['verdict']))}</span>"
+    verdict = escape(words.verdict(entry))
+    if entry["verdict"] != "adequate":
+        return f"<span class=bad>✗ {verdict}</span>"
+    return f"<strong>{verdict}</strong>" if entry.get("unfinished") else f"<span class=good>✓ {verdict}</span>"
 
 
 def _cause(cause: str) -> str:
@@ -226,7 +227,8 @@ def _summary(
     allan: Mapping[str, tuple[int, int]],
 ) -> Iterator[str]:
     bad = [name for name, entry in axes.items() if entry["verdict"] != "adequate"]
-    good = [name for name in axes if name not in bad]
+    begun = [name for name in axes if name not in bad and axes[name].get("unfinished")]
+    good = [name for name in axes if name not in (*bad, *begun)]
     yield "<section aria-labelledby=findings><h2 id=findings>What was found</h2>"
     if bad:
         yield (
@@ -238,6 +240,8 @@ def _summary(
             f"<p><span class=good>✓ Adequate: {escape(', '.join(good))}.</span> "
             "Nothing in the recording speaks against the model.</p>"
         )
+    if begun:
+        yield f"<p><strong>Not finished: {escape(', '.join(begun))}.</strong> Nothing was found so far.</p>"
     for axis, error in failed.items():
         yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
     groups = _grouped(axes)

@@ -29,18 +29,27 @@ SLOWEST = 0.99
 
 
 @dataclass(frozen=True)
+class Missing:
+    """Samples of an axis that were never measured: how many, `of` how many, and the first and last such time, s."""
+
+    samples: int
+    of: int
+    when: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
-    [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `missing` samples of the
-    recording, at its own rate `recorded_hz`. `start_s`: where
-    in the recording the grid begins, s; every time here counts from it."""
+    [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `present` [n]: where the grid
+    has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
+    the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it."""
 
     rate_hz: float
     axes: Mapping[str, State]
     channels: Mapping[str, Array]
     channel_names: Mapping[str, str]
     present: Mask
-    missing: int = 0
+    missing: Mapping[str, Missing] = field(default_factory=dict)
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
     change: RateChange | None = None
@@ -113,7 +122,18 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
         return tuple(found)
 
+    def missing(clock: Clock) -> Missing | None:
+        """The samples that a clock lacks."""
+        gaps = np.flatnonzero(clock.lost_before)
+        if not gaps.size:
+            return None
+        ends = clock.time_s[gaps] - base.time_s[0]
+        lost = int(clock.lost_before.sum())
+        first = float(ends[0] - clock.missing_before[gaps[0]] / clock.rate_hz)
+        return Missing(lost, clock.missing_before.size + lost, (max(0.0, first), float(ends[-1])))
+
     states: dict[str, State] = {}
+    gone: dict[str, Missing] = {}
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
     for name in known:
@@ -144,6 +164,9 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if np.isfinite(y).sum() < LEAST:
             continue
         read[name] = one
+        lost = missing(recording.clock_of(name))
+        if lost is not None:
+            gone[name] = lost
         found = one.lattice
         level = float(np.nanmedian(y))
         if each == 1 and one.clipped is not None:
@@ -161,6 +184,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             redrawn=each > 1,
             below_lattice=found is not None and found.too_coarse,
         )
+    present = np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0])
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
     for cause, (column, unit) in SIDE_CHANNELS.items():
@@ -174,14 +198,23 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         states,
         channels,
         names,
-        np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0]),
-        int(base.missing_before.sum()) - recording.moving,
+        present | _all_motion(base, n, block),
+        gone,
         base.rate_hz,
         read,
         change,
         unclipped,
         recording.start_s,
     )
+
+
+def _all_motion(clock: Clock, n: int, block: int) -> Mask:
+    """The cells of `block` samples [n] with some in a gap of a clock that motion alone makes."""
+    place = clock.place - clock.place[0]
+    found = np.zeros(n, bool)
+    for row in np.flatnonzero((clock.missing_before > 0) & (clock.lost_before == 0)):
+        found[(place[row] - clock.missing_before[row]) // block : (place[row] - 1) // block + 1] = True
+    return found
 
 
 def _held_on(values: Array) -> Array:

@@ -8,6 +8,13 @@ from typing import Any
 
 from selfcal.diagnosis.causes import CAUSES
 
+
+def verdict(axis: Mapping[str, Any]) -> str:
+    """The verdict on an axis of the document; one that is not finished is none."""
+    if not axis.get("unfinished"):
+        return str(axis["verdict"])
+    return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
+
 #: Stretches of time that a sentence names.
 INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,10 +42,12 @@ def compare(
 ) -> dict[str, Any]:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
 
-    Returns the document `selfcal.compare/1`: by axis the `changes`, each with the quantity, its values and the distance
-    in standard deviations; and the `verdicts` by recording and axis. `decimate`, `start_s`, `end_s`, `gate`: as
-    `diagnose` has them, of each recording. `fail_on`: see fail_on.py; it is only checked here.
-    Raises UserError for fewer than two recordings, and as `identify` and `diagnose` do.
+    Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
+    distance in standard deviations; and the `verdicts` by recording and axis. An axis that two successive recordings do
+    not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
+    `decimate`, `start_s`, `end_s`, `gate`: as `diagnose` has them, of each recording. `fail_on`: see fail_on.py; it is
+    only checked here.
+    Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
@@ -61,20 +64,60 @@ def compare(
             name: _verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
-    changes: dict[str, list[dict[str, Any]]] = {}
-    for (first, before), (second, after) in pairwise(zip(logs, seen, strict=True)):
-        for name in before.keys() & after.keys():
-            rows = _changes(before[name], after[name])
-            changes.setdefault(name, []).extend({"from": str(first), "to": str(second), **row} for row in rows)
+    compared = {name: _Compared() for name in sorted({name for one in verdicts.values() for name in one})}
+    for (first, before), (second, after) in pairwise(zip(map(str, logs), seen, strict=True)):
+        for name, one in compared.items():
+            error = _incomparable({log: verdicts[log].get(name) for log in (first, second)})
+            if error is not None:
+                one.errors += [error] if error not in one.errors else []
+            elif name in before and name in after:
+                one.pairs += 1
+                rows = _changes(before[name], after[name])
+                one.changes += [{"from": first, "to": second, **row} for row in rows]
     document = {
         "schema": SCHEMA,
         "recordings": [str(log) for log in logs],
-        "axes": dict(sorted(changes.items())),
+        "axes": {name: one.entry() for name, one in compared.items()},
         "verdicts": verdicts,
     }
-    if json is not None:
+    none = not any(one.pairs for one in compared.values())
+    if json is not None and not (none and fail_on is None):
         write_json(document, json)
+    if none:
+        told = "; ".join(f"{name}: {', '.join(one.errors)}" for name, one in compared.items())
+        raise UserError(f"no axis can be compared ({told})")
     return document
+
+
+@dataclass
+class _Compared:
+    """One axis: the `pairs` of recordings that could be compared, their `changes`, and why others could not."""
+
+    pairs: int = 0
+    changes: list[dict[str, Any]] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+    def entry(self) -> list[dict[str, Any]] | dict[str, Any]:
+        """As the document has it."""
+        return {"error": ", ".join(self.errors), "changes": self.changes} if self.errors else self.changes
+
+
+def changes_of(axis: Sequence[dict[str, Any]] | Mapping[str, Any]) -> Sequence[dict[str, Any]]:
+    """The changes of an axis of the document, whether all recordings could be compared or not."""
+    return axis["changes"] if isinstance(axis, Mapping) else axis
+
+
+def _incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None:
+    """Why an axis cannot be compared between two recordings; None where it can be, or neither has it."""
+    there = {log: one for log, one in verdicts.items() if one is not None}
+    absent = [log for log in verdicts if log not in there]
+    if absent and there:
+        return f"{absent[0]} does not have it"
+    for log, one in there.items():
+        if "error" in one:
+            return f"{log}: {one['error']}"
+    used = list(dict.fromkeys(str(one["unit"]) for one in there.values()))
+    return f"the recordings have it in {' and '.join(used)}" if len(used) > 1 else None
 
 
 def _verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,7 +125,7 @@ def _verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dic
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
         return {"error": error}
-    kept = {key: diagnosed[key] for key in ("verdict", "not_judged", "unfinished") if key in diagnosed}
+    kept = {key: diagnosed[key] for key in ("unit", "verdict", "not_judged", "unfinished") if key in diagnosed}
     return {**kept, "causes": sorted({finding["cause"] for finding in diagnosed["findings"]})}
 
 
@@ -152,8 +195,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     table = Table(box=box.SIMPLE_HEAD, title="changes beyond what the recordings leave open", title_justify="left")
     for heading in ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings"):
         table.add_column(heading, no_wrap=True)
-    for name, rows in document["axes"].items():
-        for row in rows:
+    for name, axis in document["axes"].items():
+        for row in changes_of(axis):
             changed = row["what"] == "changed"
             table.add_row(
                 name,
@@ -167,5 +210,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     if not console.is_terminal:
         console.width = max(console.width, 140)
     console.print(table)
-    if not any(document["axes"].values()):
-        console.print("nothing changed beyond what the recordings leave open")
+    errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
+    if not any(changes_of(axis) for axis in document["axes"].values()):
+        which = [name for name in document["axes"] if name not in errors] if errors else []
+        console.print(f"{', '.join(which)}{': ' if which else ''}nothing changed beyond what the recordings leave open")
+    for name, error in errors.items():
+        console.print(f"{name}: not compared: {printable(error)}", highlight=False, markup=False, soft_wrap=True)

@@ -12,9 +12,9 @@ from typing import Any
 
 from rich.console import Console
 
-from selfcal.diagnosis import work
+from selfcal.diagnosis import words, work
 from selfcal.diagnosis.document import SCHEMA, to_document
-from selfcal.diagnosis.extend import as_text, extended
+from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
@@ -65,7 +65,8 @@ def diagnose(
     the means alone show stays in the axis' `only_in_means`, and counts for no verdict. An axis that the second look did
     not finish has the first one's result if it has none of its own. `full_rate`: no first look. `decimate`: look at
     block means at this rate alone, Hz.
-    `report`: the page to write. `write_model`: where the extended model file goes. `fail_on`: see fail_on.py; it is
+    `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
+    write is kept, by a UserError. `fail_on`: see fail_on.py; it is
     only checked here. `start_s`, `end_s`, `gate`: as `identify` has them; times found are those of the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
@@ -76,6 +77,8 @@ def diagnose(
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
     check_writable(json, report, write_model, inputs=(*list_of(log), model))
+    if write_model is not None:
+        check_not_by_hand(write_model)
     loaded = Model.load(model)
     recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     recording = stretch_of(recording, loaded, start_s, end_s, gate)
@@ -86,7 +89,7 @@ def diagnose(
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
             first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            _show_first(recording, first)
+            _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
         found = _joined(names, first, seen)
         errors = {
@@ -171,11 +174,13 @@ def _joined(
     return found
 
 
-def _show_first(recording: Recording, first: Mapping[str, Diagnosed]) -> None:
-    """The findings of the first look on stderr, as soon as they are there."""
+def _show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:
+    """The findings of the first look on stderr, as soon as they are there, and the axes `names` that it did not end."""
     with work.within(work.Work(lambda: True)):  # in words: nothing is measured for them
         axes = to_document(recording, first, {}, {})["axes"]
     told = [f"{name}: {finding['cause']}: {finding['words']}" for name in axes for finding in axes[name]["findings"]]
+    reasons = {name: first[name].unfinished if name in first else INTERRUPTED * ending.asked for name in names}
+    told += [f"{name}: not finished: {reason}" for name, reason in reasons.items() if reason]
     note(f"means of {1.0 / FIRST_HZ:g} s, before every sample is looked at: {'' if told else 'nothing found'}")
     for line in told:
         note(line)
@@ -234,8 +239,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         if "error" in axis:
             console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)
             continue
-        colour = "green" if axis["verdict"] == "adequate" else "bold red"
-        heading = f"{name} [{axis['unit']}]: {axis['verdict']}"
+        reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
+        colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
+        heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
         console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):

@@ -335,24 +335,26 @@ def _ending(module: subprocess.Popen[str]) -> str:
 def running(
     firmware: Path, rows: Path, period_s: float, target: str, gate: bool = False, more: Sequence[str] = ()
 ) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
-    """The running firmware, the channel its telemetry comes by, and what it said before; killed at the end.
+    """The running firmware, the channel its telemetry comes by, and what it said before; killed at the end. The host's
+    ends by itself where this process is killed before.
 
     `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware did not get as far as
     having one: then it is ending.
     """
     with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
         if server is None:
-            command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", *more]
+            command = [str(firmware), str(rows), "--report-every", f"{period_s:.6f}", "--leash", *more]
             command += ["--gate"] if gate else []
         else:  # QEMU takes over a socket that listens already, so no port can be lost to another program
             uart = f"socket,id=uart,server=on,wait=off,fd={server.fileno()}"
             command = emulator(firmware, rows.name, period_s, target, uart, gate)
         with held() as ending:  # a signal between start and `try` would leave it running
+            leash, end_of_leash = os.pipe()  # its end closes with this process, whatever ends that
             try:
                 module = subprocess.Popen(
                     command,
                     cwd=rows.parent,
-                    stdin=subprocess.DEVNULL,
+                    stdin=leash,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
                     text=True,
@@ -360,7 +362,10 @@ def running(
                     pass_fds=() if server is None else (server.fileno(),),
                 )
             except OSError as error:
+                os.close(end_of_leash)
                 raise UserError(f"cannot run the firmware: {command[0]}: {error.strerror}") from error
+            finally:
+                os.close(leash)
         try:
             ending.check()
             assert module.stdout is not None
@@ -378,6 +383,7 @@ def running(
         finally:
             module.kill()
             module.wait()
+            os.close(end_of_leash)
 
 
 def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str, gate: bool = False) -> list[str]:
