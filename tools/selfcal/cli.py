@@ -236,6 +236,9 @@ def diagnose(
     write_model: Annotated[
         Path | None, typer.Option(metavar="MODEL.yaml", help="Write the model file with what was found in it")
     ] = None,
+    on: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="Measure each finding's gain on a second recording of the part")
+    ] = None,
     fail_on: FailOn = None,
     start: Start = None,
     end: End = None,
@@ -260,6 +263,7 @@ def diagnose(
         json=json,
         report=report,
         write_model=write_model,
+        on=on,
         fail_on=fail_on,
         start_s=start,
         end_s=end,

@@ -104,6 +104,8 @@ class Cause:
     settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
     pictures     names of pictures.py for a look.
     no_gain      why a gain on held-out time is not defined.
+    once         why another recording has it not: an event of its time, or of its read-out.
+    anew         its size belongs to one recording: another one weighs it anew under its prior.
     onset        scored from its on-line detection, `Look.when[0]`.
     trained      look, states before and after, record and split: the state after as the first `split` samples show it.
     least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
@@ -130,6 +132,8 @@ class Cause:
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
     pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
     no_gain: str = ""
+    once: str = ""
+    anew: bool = False
     onset: bool = False
     trained: Callable[[Look, State, State, Record, int], State] | None = None
     least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None

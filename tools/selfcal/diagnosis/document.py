@@ -47,14 +47,13 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None) -> dict[str, Any]:
     causes = {finding.look.cause for finding in one.findings}
     only = [] if first is None else [finding for finding in first.findings if finding.look.cause not in causes]
     factor = unit_module.factor(one.state.unit, unit)
-    findings = sorted(one.findings, key=lambda finding: finding.look.gain, reverse=True)
     after = {row.name: row for row in one.after}
     return {
         "unit": unit,
         "judged_at_hz": record.rate_hz,
         "verdict": "adequate" if one.adequate else "inadequate",
         **({"unfinished": one.unfinished} if one.unfinished else {}),
-        "findings": [_finding(finding, record, factor, unit) for finding in findings],
+        "findings": [_finding(finding, record, factor, unit) for finding in one.by_gain],
         **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit) for one in only]}),
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),

@@ -81,7 +81,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
         for k, regressor in enumerate(one.state.regressors):
             if regressor.name in stated:
                 continue
-            key = _key(regressor.name)
+            key = regressor_key(regressor.name)
             own = CAUSES[regressor.cause].entry(regressor.entry, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
@@ -175,7 +175,7 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     }
 
 
-def _key(column: str) -> str:
+def regressor_key(column: str) -> str:
     """Name of the regressor that a column belongs to."""
     return column.removesuffix(".sin").removesuffix(".cos")
 
@@ -211,7 +211,7 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
     fit = one.state.best
     sizes: dict[str, list[int]] = {}
     for k, column in enumerate(one.state.regressors):
-        sizes.setdefault(_key(column.name), []).append(k)
+        sizes.setdefault(regressor_key(column.name), []).append(k)
     for places in sizes.values():
         column = one.state.regressors[places[0]]
         c = [float(fit.c[1 + k]) for k in places]

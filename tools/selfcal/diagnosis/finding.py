@@ -36,5 +36,10 @@ class Diagnosed:
     unfinished: str = ""
 
     @property
+    def by_gain(self) -> list[Finding]:
+        """The findings, the one that gains most first."""
+        return sorted(self.findings, key=lambda finding: finding.look.gain, reverse=True)
+
+    @property
     def adequate(self) -> bool:
         return not self.findings

@@ -503,6 +503,8 @@ def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "Held-out gain", f"{_score(gain)} nats a sample"
     elif finding.get("gain_reason"):
         yield "Held-out gain", f"none: {escape(str(finding['gain_reason']))}"
+    for line in words.carried(finding):
+        yield "On the second recording", escape(line)
     if finding.get("inflation_words"):
         yield "Inflation", escape(str(finding["inflation_words"]))
 

@@ -65,6 +65,18 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     return f"{CAUSES[cause].words} {text[:1].upper()}{text[1:]}."
 
 
+def carried(finding: Mapping[str, Any]) -> list[str]:
+    """What a finding gains on a second recording, in a line; none without one."""
+    if finding.get("gain_on"):
+        score = finding["gain_on"]["log_score_per_sample"]
+        more = score["after"] - score["before"]
+        nats = f"{more * score['samples']:+.1f} nats on the second recording ({more:+.2g} ± {score['sd']:.1g} a sample)"
+        return [nats if more > 0.0 else f"its gain does not carry over: {nats}"]
+    if finding.get("gain_on_reason"):
+        return [f"no gain on the second recording: {finding['gain_on_reason']}"]
+    return []
+
+
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [

@@ -18,7 +18,7 @@ from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
-from selfcal.document import check_writable, of_errors, parameters_entry, regressors_entry, write_json
+from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
 from selfcal.ending import Held, Stopped, abandon, held
 from selfcal.errors import UserError, note, printable
 from selfcal.fail_on import check
@@ -47,6 +47,7 @@ def diagnose(
     json: Path | str | None = None,
     report: Path | str | None = None,
     write_model: Path | str | None = None,
+    on: Path | str | None = None,
     fail_on: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -65,6 +66,7 @@ def diagnose(
     the means alone show stays in the axis' `only_in_means`, and counts for no verdict. An axis that the second look did
     not finish has the first one's result if it has none of its own. `full_rate`: no first look. `decimate`: look at
     block means at this rate alone, Hz.
+    `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
     only checked here. `start_s`, `end_s`, `gate`: as `identify` has them; times found are those of the whole recording.
@@ -84,6 +86,9 @@ def diagnose(
     recording = stretch_of(recording, loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
+    second = None
+    if on is not None:
+        second = load(on, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
     first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)
@@ -113,6 +118,9 @@ def diagnose(
             doing.now("held-out gain")
             tree = extended(loaded, record, found)
             document = to_document(recording, found, errors, tree, first)
+            if second is not None:
+                doing.now(f"gain on {second.path}")
+                _add_carried(document, loaded, tree, record, found, second)
             doing.now("posterior")
             _add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             if write_model is not None:
@@ -126,6 +134,25 @@ def diagnose(
     if json is not None:
         write_json(document, json)
     return document
+
+
+def _add_carried(
+    document: dict[str, Any],
+    model: Model,
+    tree: Mapping[str, Any],
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    second: Recording,
+) -> None:
+    """The gain of each finding on a second recording."""
+    from selfcal.diagnosis.carried import gains
+
+    document["on"] = recording_entry(second)
+    for name, carried in gains(model, tree, record, found, second).items():
+        for finding, one in zip(document["axes"][name]["findings"], carried, strict=True):
+            finding["gain_on"] = one.gain
+            if one.gain is None:
+                finding["gain_on_reason"] = one.reason
 
 
 def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> dict[str, Diagnosed]:
@@ -269,6 +296,7 @@ def _lines(finding: Mapping[str, Any]) -> list[str]:
         )
     elif finding.get("gain_reason"):
         lines.append(f"  no held-out gain: {finding['gain_reason']}")
+    lines += [f"  {line}" for line in words.carried(finding)]
     if finding["inflation_words"]:
         lines.append(f"  {finding['inflation_words']}")
     if finding["shared_with"]:

@@ -98,7 +98,8 @@ def _added(
         channels = Channels(time_s, temperature, supply, dict(zip(model.axes, values.copy(), strict=True)))
         for one in own:
             form = CAUSES[one["id"]].add
-            for name, keys in one["axes"].items() if form is not None else ():
+            assert form is not None
+            for name, keys in one["axes"].items():
                 values[model.axes.index(name)] += form(keys, channels)
 
     return add

@@ -1,7 +1,9 @@
 """Every cause, in the order in which the tools list them."""
 
+from collections.abc import Mapping
 from types import MappingProxyType
 
+from selfcal.diagnosis.cause import Cause as _Cause
 from selfcal.diagnosis.causes import (
     colored_noise,
     cross_axis,
@@ -23,7 +25,7 @@ from selfcal.diagnosis.causes import (
     variance_change,
 )
 
-CAUSES = MappingProxyType(
+CAUSES: Mapping[str, _Cause] = MappingProxyType(
     {
         module.CAUSE.id: module.CAUSE
         for module in (

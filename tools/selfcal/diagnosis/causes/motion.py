@@ -185,6 +185,7 @@ CAUSE = Cause(
     "The sensor was moved or shaken while it should have rested.",
     "Record on a heavy table, away from traffic.",
     alike=lambda a, b: True,
+    once="motion is an event of its recording",
     pictures=shown("largest", "fine_level"),
     of_estimate=_of_estimate,
     keys={

@@ -98,6 +98,7 @@ CAUSE = Cause(
     "Single samples are far off.",
     "Check the bus: log the raw words of those samples.",
     looks=looks,
+    once="outliers are events of their recording",
     pictures=shown("largest", "histogram"),
     least=_least,
     extend=_extend,

@@ -285,6 +285,7 @@ CAUSE = Cause(
     alike=_alike,
     settle=_settle,
     pictures=_pictures,
+    anew=True,
     trained=_trained,
     least=_least,
     of_column=_of_column,

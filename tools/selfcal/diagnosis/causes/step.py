@@ -206,6 +206,7 @@ CAUSE = Cause(
     slow=True,
     alike=_alike,
     pictures=shown("means", "evidence"),
+    once="a jump is an event of its recording",
     onset=True,
     least=_least,
     entry=_entry,

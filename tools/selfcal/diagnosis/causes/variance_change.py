@@ -112,6 +112,7 @@ CAUSE = Cause(
     most=3,
     stationary=True,
     pictures=shown("marked_level"),
+    once="a change of the noise is an event of its recording",
     onset=True,
     trained=_trained,
     least=_least,

@@ -1,0 +1,175 @@
+"""What a finding gains on a second recording: the bank's own evidence there, with the finding in the model and without.
+
+The evidence is sequential: each bank sample is predicted from earlier ones, over the posterior of the noise's
+parameters. Coefficients are those of the first recording. A size that belongs to one recording, such as a line's phase,
+is weighed anew under its prior. Each finding is left out of the model with all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.special import logsumexp
+
+from selfcal.diagnosis.cause import Extension
+from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.extend import regressor_key
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.statemodel import Array
+from selfcal.engines.library import Bank
+from selfcal.errors import UserError
+from selfcal.model import Model, Regressor
+from selfcal.readings import Readings, look
+from selfcal.recording import Recording, as_float
+from selfcal.regressors import columns_of, mask_of, offered
+from selfcal.tables import make_tables
+
+#: Pieces of the second recording whose scatter gives the uncertainty.
+PIECES = 12
+
+
+@dataclass(frozen=True)
+class Carried:
+    """One finding on the second recording: the contract's `gain_on`, or None with the `reason`."""
+
+    gain: dict[str, Any] | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class _Term:
+    """One finding as a part of the bank's model: columns with their coefficients, or a change of the model file's tree.
+    `anew`: the sizes of its columns are weighed anew."""
+
+    finding: Finding
+    columns: tuple[Regressor, ...]
+    coefficients: tuple[float, ...]
+    anew: bool
+
+
+def gains(
+    model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], second: Recording
+) -> dict[str, list[Carried]]:
+    """By axis one entry for each finding of `found`, by gain. `tree`: the extended model file's."""
+    return {name: _of_axis(model, tree, record, found, name, second) for name in found}
+
+
+def _of_axis(
+    model: Model,
+    tree: Mapping[str, Any],
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    name: str,
+    second: Recording,
+) -> list[Carried]:
+    findings = found[name].by_gain
+    if name not in second.columns:
+        return [Carried(None, f"{second.path} has no axis {name}")] * len(findings)
+    extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
+    terms: dict[int, _Term] = {}
+    results: dict[int, Carried] = {}
+    for k, finding in enumerate(findings):
+        term = _term(found[name], finding, extended)
+        if isinstance(term, str):
+            results[k] = Carried(None, term)
+        else:
+            terms[k] = term
+    try:
+        readings = look(second.along(name), name, model.group_of(name))
+        whole = _evidence(model, record, found, name, readings, [*terms.values()]) if terms else None
+        for k, term in terms.items():
+            try:
+                others = [one for one in terms.values() if one is not term]
+                without = _evidence(model, record, found, name, readings, others)
+                results[k] = Carried(_compared(without, whole))
+            except UserError as error:
+                results[k] = Carried(None, str(error))
+    except UserError as error:
+        return [results.get(k, Carried(None, str(error))) for k in range(len(findings))]
+    return [results[k] for k in range(len(findings))]
+
+
+def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> _Term | str:
+    """The finding as a part of the model, or why it is none that another recording can have."""
+    cause = CAUSES[finding.look.cause]
+    if cause.once:
+        return cause.once
+    known = {column.name for column in finding.before.regressors}
+    names = [column.name for column in finding.after.regressors if column.name not in known]
+    if names:
+        keys = dict.fromkeys(regressor_key(column) for column in names)
+        if not all(key in extended for key in keys):
+            return "the extended model has no room for its column"
+        at = {column.name: k for k, column in enumerate(one.state.regressors)}
+        if not all(column in at for column in names):
+            return "the final model does not have it"
+        c = tuple(float(one.state.best.c[1 + at[column]]) for column in names)
+        return _Term(finding, tuple(extended[key] for key in keys), c, cause.anew)
+    if cause.extend is not None and not cause.no_gain:
+        return _Term(finding, (), (), False)
+    return cause.no_gain or "the bank's model does not change by it"
+
+
+def _evidence(
+    model: Model,
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    name: str,
+    readings: Readings,
+    terms: Sequence[_Term],
+) -> Array:
+    """Bank samples and ln evidence [2, PIECES] after each piece of the second recording, with `terms` in the model."""
+    tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
+    for term in terms:
+        extend = CAUSES[term.finding.look.cause].extend
+        if extend is not None and not term.columns:
+            extend(Extension(tree, model, record, name, found, term.finding))
+    anew = tuple(column for term in terms if term.anew for column in term.columns)
+    own = Model.of_tree(tree, model.path)
+    own = replace(own, regressors=(*own.regressors, *anew))
+    regressors = offered(own, name)
+    recording = readings.recording
+    values = readings.working.copy()
+    for term in terms:
+        if term.columns and not term.anew:
+            about = np.array([column.reference for column in term.columns])
+            values -= (columns_of(term.columns, recording) - about) @ np.array(term.coefficients)
+    tables = make_tables(replace(own, regressors=regressors), recording.rate_hz, (name,))
+    bank = Bank(tables)
+    prior = {one.name: one.ln_probability for one in tables.hypotheses}
+    rows, columns = as_float(values)[:, None], as_float(columns_of(regressors, recording))
+    cuts = np.linspace(0, values.size, PIECES + 1).astype(int)
+    after = []
+    for first, last in pairwise(cuts):
+        piece = slice(first, last)
+        bank.push(rows[piece], recording.missing_before[piece], columns[piece] if regressors else None)
+        known = bank.report(0, mask_of(regressors, regressors))
+        after.append((known.n, float(logsumexp([prior[law] + ln for law, ln in known.log_evidence.items()]))))
+    evidence = np.array(after, np.float64).T
+    if not np.isfinite(evidence).all():
+        raise UserError("the priors of the model leave nothing of the second recording")
+    return evidence
+
+
+def _compared(without: Array, whole: Array | None) -> dict[str, Any]:
+    """The contract's `gain_on`. The first piece is all the priors', so the scatter is that of the others."""
+    assert whole is not None
+    if (without[0] != whole[0]).any():
+        raise UserError("the bank takes other samples with the finding than without")
+    n = whole[0]
+    steps = np.diff(whole[1] - without[1]) / np.maximum(np.diff(n), 1.0)
+    return {
+        "log_score_per_sample": {
+            "before": float(without[1, -1] / n[-1]),
+            "after": float(whole[1, -1] / n[-1]),
+            "sd": float(steps.std(ddof=1)) / math.sqrt(steps.size),
+            "samples": int(n[-1]),
+        }
+    }
