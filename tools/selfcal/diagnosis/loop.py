@@ -110,7 +110,7 @@ def _provisional(
     """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
     one = Diagnosed(state, state, record)
     with suppress(work.Spent):
-        _rounds(record, one, advance, causes, CERTAIN)
+        _rounds(record, one, advance, causes, CERTAIN, provisional=True)
     return one.state
 
 
@@ -194,6 +194,7 @@ def _rounds(
     advance: Callable[[str], None],
     causes: tuple[Looks, ...] = LOOKS,
     least: float = NET_LEAST,
+    provisional: bool = False,
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
     idle: set[Looks] = set()
@@ -213,7 +214,7 @@ def _rounds(
             return
         if len(one.findings) < BUSY:
             idle = set()
-        best = looks[0]
+        best = looks[0] if provisional else looks[0].measured()
         rivals = tuple(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )

@@ -226,6 +226,13 @@ class Look:
     when: tuple[float, float] | None = None
     shown_by: str = ""
     others: tuple[str, ...] = ()
+    measure: Callable[[], Mapping[str, Any]] | None = None
+
+    def measured(self) -> Look:
+        """The look with the intervals that `measure` has, where they take work that only a taken look is worth."""
+        if self.measure is None:
+            return self
+        return replace(self, estimate={**self.estimate, **self.measure()}, measure=None)
 
 
 def interval(value: float, sd: float, unit: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -80,13 +81,14 @@ class Matrices:
     driver: int = -1
 
 
-def flicker_rates(duration_s: float, dt: float) -> Array:
+@lru_cache(maxsize=64)
+def flicker_rates(duration_s: float, dt: float) -> tuple[float, ...]:
     """Correlation rates, 1/s, of the Gauss-Markov terms that together make 1/f noise over a record: a decade apart or a
     little less, from a third of a turn in the record to a sixth of the sampling rate. White noise makes up what lacks
     above; a faster term would only alias, and a sensor that averages has no such power."""
     low, high = math.log10(2.0 / duration_s), math.log10(1.0 / dt)
     count = max(2, min(8, 1 + math.ceil(high - low)))
-    return np.logspace(low, high, count)
+    return tuple(float(rate) for rate in np.logspace(low, high, count))
 
 
 def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matrices:
@@ -95,72 +97,55 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
     Flicker noise of coefficient B has the two-sided spectrum B^2 / (2 pi f), as in `simulate` and in IEEE 952. Terms of
     variance v whose rates are a factor g apart make v / (2 ln g f), so v = B^2 ln g / pi.
     """
-    value = dict(zip(terms.names, theta, strict=True))
-    phi: list[float] = []
-    q: list[float] = []
-    p0: list[float] = []
-    h: list[float] = []
-
-    def markov(variance: float, rate: float) -> None:
-        f = math.exp(-rate * dt)
-        phi.append(f)
-        q.append(-variance * math.expm1(-2.0 * rate * dt))
-        p0.append(variance)
-        h.append(1.0)
-
-    if terms.walk:
-        phi.append(1.0)
-        q.append(math.exp(2.0 * value["ln_rho"]))
-        p0.append(0.0)
-        h.append(1.0)
-    if terms.markov:
-        markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
-    if terms.flicker:
-        rates = flicker_rates(duration_s, dt)
-        apart = math.log(rates[1] / rates[0])
-        for rate in rates:
-            markov(math.exp(2.0 * value["ln_flicker"]) * apart / math.pi, float(rate))
-    R, driver = 1.0, -1
-    if terms.color == "ar":  # the white noise itself is a first-order process
-        f = math.tanh(value["color"])
-        driver = len(phi)
-        phi.append(f)
-        q.append(1.0 - f * f)
-        p0.append(1.0)
-        h.append(1.0)
-        R = 1e-9
-    F, Q, P0 = np.diag(phi), np.diag(q), np.diag(p0)
-    if terms.color == "ma":  # e_i + theta e_(i-1)
-        m = math.tanh(value["color"])
-        unit = 1.0 / (1.0 + m * m)
-        driver = len(F)
-        F, Q, P0 = (
-            _joined(F, [[0.0, 0.0], [1.0, 0.0]]),
-            _joined(Q, [[unit, 0.0], [0.0, 0.0]]),
-            _joined(P0, np.eye(2) * unit),
-        )
-        h += [1.0, m]
-        R = 1e-9
+    value = dict(zip(terms.names, map(float, theta), strict=True))
     bands = list(terms.bands)
     if terms.trial is not None:
         bands.append((terms.trial * math.exp(value["shift"]), math.exp(value["ln_width"]), value["ln_band"]))
+    rates = flicker_rates(duration_s, dt) if terms.flicker else ()
+    pairs = len(bands) + (terms.color == "ma")
+    single = terms.walk + terms.markov + len(rates) + (terms.color == "ar")
+    size = max(1, single + 2 * pairs)
+    F, Q, P0, h = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
+    R, driver, k = 1.0, -1, 0
+
+    def markov(variance: float, rate: float) -> None:
+        nonlocal k
+        F[k, k] = math.exp(-rate * dt)
+        Q[k, k] = -variance * math.expm1(-2.0 * rate * dt)
+        P0[k, k] = variance
+        h[k] = 1.0
+        k += 1
+
+    if terms.walk:
+        F[k, k] = h[k] = 1.0
+        Q[k, k] = math.exp(2.0 * value["ln_rho"])
+        k += 1
+    if terms.markov:
+        markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
+    if terms.flicker:
+        apart = math.log(rates[1] / rates[0])
+        for rate in rates:
+            markov(math.exp(2.0 * value["ln_flicker"]) * apart / math.pi, rate)
+    if terms.color == "ar":  # the white noise itself is a first-order process
+        f = math.tanh(value["color"])
+        F[k, k], Q[k, k], P0[k, k], h[k] = f, 1.0 - f * f, 1.0, 1.0
+        R, driver, k = 1e-9, k, k + 1
+    if terms.color == "ma":  # e_i + theta e_(i-1)
+        m = math.tanh(value["color"])
+        unit = 1.0 / (1.0 + m * m)
+        F[k + 1, k] = 1.0
+        Q[k, k] = P0[k, k] = P0[k + 1, k + 1] = unit
+        h[k], h[k + 1] = 1.0, m
+        R, driver, k = 1e-9, k, k + 2
     for frequency, width, ln_size in bands:
         variance = math.exp(2.0 * ln_size)
         turn = 2.0 * math.pi * frequency * dt
         f = math.exp(-2.0 * math.pi * width * dt)
-        F = _joined(F, f * np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]))
-        Q = _joined(Q, np.eye(2) * variance * (1.0 - f * f))
-        P0 = _joined(P0, np.eye(2) * variance)
-        h += [1.0, 0.0]
-    if not h:
-        F, Q, P0, h = np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), [0.0]
-    return Matrices(np.ascontiguousarray(F), np.ascontiguousarray(Q), np.array(h), np.ascontiguousarray(P0), R, driver)
-
-
-def _joined(a: Array, b: object) -> Array:
-    """Block diagonal of two square matrices."""
-    c = np.asarray(b, np.float64)
-    out = np.zeros((len(a) + len(c), len(a) + len(c)))
-    out[: len(a), : len(a)] = a
-    out[len(a) :, len(a) :] = c
-    return out
+        F[k, k] = F[k + 1, k + 1] = f * math.cos(turn)
+        F[k, k + 1] = f * math.sin(turn)
+        F[k + 1, k] = -F[k, k + 1]
+        Q[k, k] = Q[k + 1, k + 1] = variance * (1.0 - f * f)
+        P0[k, k] = P0[k + 1, k + 1] = variance
+        h[k] = 1.0
+        k += 2
+    return Matrices(F, Q, h, P0, R, driver)

@@ -7,6 +7,7 @@ are simulated from the fitted model with the recording's own length, gaps, latti
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -284,15 +285,33 @@ def _step_response(series: Series, fit: Fit) -> Array:
     return white[n:, 1] / fit.sigma
 
 
+def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tuple[Array, Array]]:
+    """Residual innovations, and readings, of `count` records of the fitted model, read out as the recording.
+
+    Without a lattice the innovations are white, and fitting the coefficients takes the columns' part out of them. That
+    is drawn as it is. The readings then matter as far as no two are equal."""
+    if state.lsb > 0.0:
+        for _ in range(count):
+            y = simulated(state, random)
+            yield whitened_of(state, y), y
+        return
+    sums, white, _ = run(state.series, state.best.terms, state.best.theta, innovations=True)
+    columns, inverse = np.nan_to_num(white[:, 1:]), sums[0].coefficients()[1]
+    there = np.isfinite(state.y)
+    for _ in range(count):
+        w = np.where(there, random.standard_normal(there.size), 0.0)
+        w -= columns @ (inverse @ (w @ columns))
+        w = np.where(there, w / math.sqrt(float(w @ w) / sums[0].n), np.nan)
+        yield w, w
+
+
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
     """Every statistic of the state against its band; the most striking first."""
     response = _step_response(state.series, state.best)
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
-    random = np.random.default_rng(seed)
     rows: dict[str, list[float]] = {name: [] for name in measured}
-    for _ in range(count):
-        y = simulated(state, random)
-        for name, value in all_statistics(whitened_of(state, y), y, state.lsb, response).items():
+    for w, y in _drawn(state, np.random.default_rng(seed), count):
+        for name, value in all_statistics(w, None if state.redrawn else y, state.lsb, response).items():
             if name in rows:
                 rows[name].append(value)
     found: list[Statistic] = []

@@ -162,9 +162,11 @@ def _line(state: State, record: Record) -> list[Look]:
             f += move * min(4.0, max(-4.0, 0.5 * (high - low) / bend))
             pair = columns(f)
     amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
-    if worth >= NET_LEAST:
+
+    def measure() -> dict[str, Any]:
         weight, means, sds = state.posterior(pair)
-        amplitude = mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)
+        return {"amplitude": mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)}
+
     name = f"line_{f:.6g}Hz"
     entry = {"kind": "periodic", "frequency_hz": f}
     added = (
@@ -178,6 +180,7 @@ def _line(state: State, record: Record) -> list[Look]:
             worth,
             {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude},
             {"regressors": (*state.regressors, *added)},
+            measure=measure,
         )
     ]
 

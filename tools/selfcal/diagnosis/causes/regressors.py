@@ -146,16 +146,18 @@ def _linear(
         worth = net(gain, 1, ln_looks)
     unit = coefficient_unit(state.unit, chosen.unit)
     estimate: dict[str, Any] = {key: interval(float(fit.c[-1]), float(fit.sd[-1]), unit)}
-    if worth >= NET_LEAST:
+    if cause == "cross_axis":
+        estimate["other"] = chosen.name.removeprefix("axis_")
+
+    def measure() -> dict[str, Any]:
         weight, means, sds = state.posterior(chosen.values)
         kept = 1.0
         if channel is not None:
             window = max(1, round(float(chosen.entry.get("window_s", 0.0)) / state.dt))
             kept = _kept(state, fit, chosen.values, channel, window)
-        estimate[key] = mixture(weight, means[:, 0] / kept, sds[:, 0] / kept, unit)
-    if cause == "cross_axis":
-        estimate["other"] = chosen.name.removeprefix("axis_")
-    return [Look(cause, gain, worth, estimate, {"regressors": (*state.regressors, chosen)})]
+        return {key: mixture(weight, means[:, 0] / kept, sds[:, 0] / kept, unit)}
+
+    return [Look(cause, gain, worth, estimate, {"regressors": (*state.regressors, chosen)}, measure=measure)]
 
 
 def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, str]] | None:

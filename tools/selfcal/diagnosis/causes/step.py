@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from selfcal.diagnosis.cause import Cause, Key, shown
 from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
 
 #: A place is looked at where the level before it leaves this share of a step's information, at least; and until what is
@@ -101,16 +102,13 @@ def looks(state: State, record: Record) -> list[Look]:
         return []
     time = float(record.time_s[place])
     column = Regressor(f"step_{time:.6g}s", "step", _column(n, place), "1", {"kind": "step", "time_s": time})
-    if value < NET_LEAST:
-        estimate: dict[str, Any] = {
-            "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt]), state.dt / math.sqrt(12.0), "s"),
-            "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
-        }
-    else:
-        estimate = posterior(state, record.time_s, place)
-    return [
-        Look("step", exact, value, estimate, {"regressors": (*state.regressors, column)}, when=(time, time)),
-    ]
+    estimate = {
+        "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt]), state.dt / math.sqrt(12.0), "s"),
+        "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
+    }
+    changes = {"regressors": (*state.regressors, column)}
+    measure = partial(posterior, state, record.time_s, place)
+    return [Look("step", exact, value, estimate, changes, when=(time, time), measure=measure)]
 
 
 def posterior(state: State, time_s: Array, place: int) -> dict[str, Any]:
