@@ -922,8 +922,10 @@ class Kind:
     by_effect: bool = False
     slow: bool = True
     axes: tuple[str, ...] = AXES
+    #: What it takes to reach its sizes.
     least_seconds: float = 0.0
     least_rate: float = 0.0
+    sizes: tuple[str, ...] = tuple(SIZES)
 
     @property
     def cause(self) -> str:
@@ -1218,7 +1220,7 @@ KINDS: dict[str, Kind] = {
         oscillating,
         lambda r, s, f: {"period": _log(r, 50.0, 0.12 * s), "damping": _uniform(r, 0.05, 0.25)},
     ),
-    "traps": Kind("flicker", (), traps, lambda r, s, f: {}, by_effect=True, least_seconds=3600.0),
+    "traps": Kind("flicker", (), traps, lambda r, s, f: {}, by_effect=True, least_seconds=3600.0, sizes=("near",)),
     "unseen_source": Kind(
         "shared",
         ("cross_axis",),

@@ -284,6 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for kind in wanted
         if kind == CLEAN or rate >= KINDS[kind].least_rate
         for size in (options.sizes if kind != CLEAN else ["plain"])
+        if kind == CLEAN or size in KINDS[kind].sizes
         for seed in (seeds if kind != CLEAN else clean)
     ]
     print(f"{len(work)} truths, answers in {out}", flush=True)
