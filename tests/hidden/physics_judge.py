@@ -78,16 +78,15 @@ def outcome(entry: dict[str, Any], truth: dict[str, Any]) -> Answer:
     if "error" in entry:
         return {"outcome": "refused", "error": entry["error"], "named": []}
     kind = KINDS[truth["kind"]]
-    findings = sorted(entry["findings"], key=lambda finding: -float(finding["evidence_gain_nats"] or 0.0))
-    named = [finding["cause"] for finding in findings]
-    names = [cause for cause in named if cause != "unexplained"]
+    findings = told(entry, truth["lattice"][truth["axis"]] is not None and "quantization" not in kind.names)
+    names = [finding["cause"] for finding in findings if finding["cause"] != "unexplained"]
     result: Answer = {
         "named": [_words(finding) for finding in findings],
         "extra": [cause for cause in names[1:] if cause not in kind.names],
-        "verdict": entry["verdict"],
     }
     if not findings:
-        return result | {"outcome": "adequate" if entry["verdict"] == "adequate" else "unexplained"}
+        seen = entry["verdict"] != "adequate" and not entry["findings"]
+        return result | {"outcome": "unexplained" if seen else "adequate"}
     first = findings[0]
     if first["cause"] == "unexplained":
         return result | {"outcome": "unexplained"}
@@ -100,6 +99,21 @@ def outcome(entry: dict[str, Any], truth: dict[str, Any]) -> Answer:
         "outcome": "right" if first["cause"] == kind.cause else "accepted",
         "form_right": None if kind.form is None or first["cause"] != kind.cause else form == kind.form,
     }
+
+
+def told(entry: dict[str, Any], on_lattice: bool) -> list[dict[str, Any]]:
+    """Findings, the most evidence first. `quantization` of a reading on a lattice is true, and no effect's name."""
+    findings = sorted(entry["findings"], key=lambda finding: -float(finding["evidence_gain_nats"] or 0.0))
+    return [finding for finding in findings if not (on_lattice and finding["cause"] == "quantization")]
+
+
+def _kept(entry: dict[str, Any]) -> dict[str, Any]:
+    """What of an entry is judged."""
+    if "error" in entry:
+        return {"error": entry["error"]}
+    keys = ("cause", "evidence_gain_nats", "estimate", "form", "found_in_round")
+    findings = [{key: finding[key] for key in keys if key in finding} for finding in entry["findings"]]
+    return {"verdict": entry["verdict"], "findings": findings}
 
 
 def _words(finding: dict[str, Any]) -> str:
@@ -116,14 +130,30 @@ def _write(path: Path, record: Record) -> None:
 def answer(task: Task, out: Path) -> Answer:
     """Draws a truth's two records, has the first diagnosed, and scores the written model on the second."""
     path = out / task.name
-    if path.exists():
-        stored: Answer = json.loads(path.read_text())
-        return stored
+    if not path.exists():
+        partial = path.with_suffix(f".{os.getpid()}")
+        partial.write_text(json.dumps(_run(task), default=float) + "\n")
+        partial.replace(path)
+    made: Answer = json.loads(path.read_text())
+    if task.kind != CLEAN:
+        return made | outcome(made["entries"][made["truth"]["axis"]], made["truth"])
+    lattice = made["truth"]["lattice"]
+    named = {
+        name: entry.get("error") or " ".join(map(_words, told(entry, lattice[name] is not None)))
+        for name, entry in made["entries"].items()
+        if "error" in entry or entry["verdict"] != "adequate"
+    }
+    return made | {"inadequate": {name: words or "nothing named" for name, words in named.items()}}
+
+
+def _run(task: Task) -> Answer:
+    """What `diagnose` and `identify` say of a truth's records."""
     from selfcal.verbs.diagnose import diagnose
     from selfcal.verbs.identify import identify
 
     first, second = pair(task.kind, task.seed, task.size, task.rate, task.law, task.seconds)
     start = time.process_time()
+    made: Answer = {"task": vars(task), "truth": first.truth}
     with tempfile.TemporaryDirectory() as folder:
         one, two, model = (Path(folder) / name for name in ("one.npz", "two.npz", "model.yaml"))
         _write(one, first)
@@ -132,27 +162,19 @@ def answer(task: Task, out: Path) -> Answer:
             entries = diagnose(one, axes=axes, write_model=model)["axes"]
         except Exception as error:  # a fault of the detector is an answer too
             entries = {name: {"error": f"{type(error).__name__}: {error}"} for name in axes}
-        made: Answer = {"task": vars(task), "truth": first.truth, "seconds": time.process_time() - start}
+        made |= {"seconds": time.process_time() - start, "entries": {n: _kept(e) for n, e in entries.items()}}
         if task.kind == CLEAN:
-            made["axes"] = {
-                name: entry.get("error") or [entry["verdict"], *map(_words, entry["findings"])]
-                for name, entry in entries.items()
-            }
-        else:
-            made |= outcome(entries[first.axis], first.truth)
-            try:
-                made["identify_adequate"] = identify(one, axes=axes)["axes"][first.axis].get("adequate")
-                if second is not None and KINDS[task.kind].slow:
-                    made["carried"] = {"there": second.truth["nats_here"], "gained": 0.0}
-                    if made["named"]:
-                        _write(two, second)
-                        base, own = (_evidence(identify(two, axes=axes, model=m), first.axis) for m in (None, model))
-                        made["carried"]["gained"] = own - base
-            except Exception as error:
-                made["identify_error"] = f"{type(error).__name__}: {error}"
-    partial = path.with_suffix(f".{os.getpid()}")
-    partial.write_text(json.dumps(made, default=float) + "\n")
-    partial.replace(path)
+            return made
+        try:
+            made["identify_adequate"] = identify(one, axes=axes)["axes"][first.axis].get("adequate")
+            if second is not None and KINDS[task.kind].slow:
+                made["carried"] = {"there": second.truth["nats_here"], "gained": 0.0}
+                if entries[first.axis].get("findings"):
+                    _write(two, second)
+                    base, own = (_evidence(identify(two, axes=axes, model=m), first.axis) for m in (None, model))
+                    made["carried"]["gained"] = own - base
+        except Exception as error:  # a model that `identify` refuses gains nothing
+            made["identify_error"] = f"{type(error).__name__}: {error}"
     return made
 
 
@@ -187,12 +209,13 @@ def goals(answers: Sequence[Answer]) -> list[Line]:
             known = [share for share in shares if share is not None]
             lines.append(Line("plain: kinds named in at least half", sum(s >= 0.5 for s in known), len(known), 1.0))
         missed = [each for each in own if each.get("identify_adequate") is False]
-        found = sum(each["outcome"] != "adequate" for each in missed)
-        lines.append(Line(f"{size}: identify not adequate, diagnose neither", found, len(missed), 1.0))
+        found = sum(each["entries"][each["truth"]["axis"]].get("verdict") != "adequate" for each in missed)
+        lines.append(Line(f"{size}: not adequate for identify, then for diagnose", found, len(missed), 1.0))
     lines += _carried([each for each in answers if each["task"]["size"] == "plain"])
-    axes = [axis for each in answers if each["task"]["kind"] == CLEAN for axis in each["axes"].values()]
-    if axes:
-        lines.append(Line("clean: inadequate axes", sum(a[0] != "adequate" for a in axes), len(axes), 0.0, MOST_CLEAN))
+    clean = [each for each in answers if each["task"]["kind"] == CLEAN]
+    if clean:
+        inadequate = sum(len(each["inadequate"]) for each in clean)
+        lines.append(Line("clean: inadequate axes", inadequate, len(AXES) * len(clean), 0.0, MOST_CLEAN))
     return lines
 
 
@@ -292,9 +315,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = goals(answers)
     print(table(answers), "", *lines, sep="\n")
     for each in answers:
-        if each["task"]["kind"] == CLEAN:
-            wrong = {name: axis for name, axis in each["axes"].items() if axis[0] != "adequate"}
-            print(*(f"clean {each['task']['seed']} {name}: {axis}" for name, axis in wrong.items()), sep="\n", end="")
+        for name, words in each.get("inadequate", {}).items():
+            print(f"clean, {each['task']['rate']:g} Hz, seed {each['task']['seed']}, {name}: {words}")
     seconds = [each["seconds"] for each in answers]
     if seconds:
         print(f"\nCPU of a diagnosis: median {np.median(seconds):.1f} s, longest {max(seconds):.0f} s")

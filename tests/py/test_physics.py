@@ -173,7 +173,7 @@ def test_outcomes() -> None:
         findings = [{"cause": cause, "evidence_gain_nats": nats, "estimate": more} for cause, nats, more in causes]
         return {"findings": findings, "verdict": verdict}
 
-    truth = {"kind": "late_leak", "others": ["gy"]}
+    truth = {"kind": "late_leak", "others": ["gy"], "axis": "gx", "lattice": {"gx": 0.4}}
     right = physics_judge.outcome(entry(("step", 9.0, {}), ("cross_axis", 20.0, {"other": "gy", "form": "lag"})), truth)
     assert (right["outcome"], right["form_right"], right["extra"]) == ("right", True, ["step"])
     assert physics_judge.outcome(entry(("cross_axis", 20.0, {"other": "gz"})), truth)["outcome"] == "wrong"
@@ -182,5 +182,9 @@ def test_outcomes() -> None:
     assert physics_judge.outcome(entry(), truth)["outcome"] == "unexplained"
     assert physics_judge.outcome(entry(("unexplained", 0.0, {})), truth)["outcome"] == "unexplained"
     assert physics_judge.outcome({"error": "no"}, truth)["outcome"] == "refused"
-    accepted = physics_judge.outcome(entry(("step", 30.0, {})), {"kind": "pulse", "others": []})
+    # Its lattice is there: to name it is neither wrong nor the effect's name.
+    assert physics_judge.outcome(entry(("quantization", 99.0, {})), truth)["outcome"] == "adequate"
+    fine = truth | {"lattice": {"gx": None}}
+    assert physics_judge.outcome(entry(("quantization", 99.0, {})), fine)["outcome"] == "wrong"
+    accepted = physics_judge.outcome(entry(("step", 30.0, {})), fine | {"kind": "pulse", "others": []})
     assert accepted["outcome"] == "accepted"
