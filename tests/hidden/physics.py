@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -524,24 +524,32 @@ def envelope(scene: Scene, p: Truth) -> Array:
     return np.asarray(1.0 / (1.0 + np.exp(-2.0 * smooth_noise(scene.random, scene.t, p["quiet"]))))
 
 
-def shake(scene: Scene, p: Truth) -> tuple[str, Array, Array]:
-    """Another axis vibrates: its name, the fine vibration put on it, and its power's envelope."""
+def shake(scene: Scene, p: Truth) -> tuple[str, Array]:
+    """Another axis vibrates: its name, and the envelope of the vibration's power."""
     other = "az" if scene.target[0] == "g" else scene.others()[p["which"] % 2]
     level = envelope(scene, p)
     sd = p["strength"] * float(scene.white[other].std())
     vibration = sd * level * scene.random.normal(size=len(scene.t))
     scene.white[other] = scene.white[other] + vibration
-    return other, vibration, level**2
+    return other, level**2
+
+
+#: Hz: vibration has this many independent samples a second at least, whose squares a fine sample averages.
+VIBRATION = 200.0
 
 
 def rectified(scene: Scene, p: Truth) -> Made:
-    """Vibration of another axis rectifies into a bias. The right model has that axis's variance, from differences."""
-    other, vibration, _ = shake(scene, p)
-    power = np.append(0.5 * np.diff(scene.values(other)) ** 2, 0.0)
-    local = means(power, scene.rate)
-    window = np.hanning(9 if scene.rate > 5.0 else 33)
-    local = np.convolve(local, window, "same") / np.convolve(np.ones(len(local)), window, "same")
-    return column(scene, p["sign"] * vibration**2, columns=local[:, None], others=(other,))
+    """Vibration of another axis rectifies into a bias. The right model has its variance, smoothed, from differences."""
+    other, envelope_power = shake(scene, p)
+    half = 0.5 * max(VIBRATION * scene.dt, 1.0)
+    rectifies = envelope_power * scene.random.gamma(half, 1.0 / half, len(scene.t))
+    power = means(np.append(0.5 * np.diff(scene.values(other)) ** 2, 0.0), scene.rate)
+    made = []
+    for seconds in (9, 29, 89):
+        window = np.hanning(seconds + 2)
+        local = np.convolve(power, window, "same") / np.convolve(np.ones(len(power)), window, "same")
+        made.append(column(scene, p["sign"] * rectifies, columns=local[:, None], price=2.0, others=(other,)))
+    return replace(made[0], gain=lambda amount: max(each.gain(amount) for each in made))
 
 
 def noise_scaled(scene: Scene, level: Array, others: tuple[str, ...] = ()) -> Made:
@@ -566,7 +574,7 @@ def noise_of_temperature(scene: Scene, p: Truth) -> Made:
 
 
 def noise_of_vibration(scene: Scene, p: Truth) -> Made:
-    other, _, power = shake(scene, p)
+    other, power = shake(scene, p)
     return noise_scaled(scene, np.sqrt(power), (other,))
 
 
@@ -964,7 +972,7 @@ def _motor(r: Random, s: float, f: float) -> Truth:
         "switched": bool(r.random() < 0.6),
         "quiet": _uniform(r, 0.06, 0.15) * s,
         "loud": _uniform(r, 0.06, 0.15) * s,
-        "strength": _uniform(r, 1.5, 3.0),
+        "strength": _uniform(r, 2.0, 4.0),
     }
 
 
@@ -1181,7 +1189,7 @@ KINDS: dict[str, Kind] = {
         lambda r, s, f: {"sign": _sign(r), "which": int(r.integers(2)), "creep": _uniform(r, 30.0, 120.0)},
         axes=GYROS,
     ),
-    "rectified": Kind("vibration:static", (), rectified, _motor),
+    "rectified": Kind("vibration:static", (), rectified, _motor, least_rate=10.0),
     # Noise
     "breathing": Kind(
         "variance_change", (), breathing, lambda r, s, f: {"tau": _uniform(r, 0.04, 0.12) * s}, slow=False
