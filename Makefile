@@ -5,6 +5,8 @@
 #   make test                   everything that is checked; ends with `N passed, N failed`
 #   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]
 #                               effects hidden in recordings: are they named?
+#   make hidden-physics [KINDS="turn_on tilt"] [SIZES=plain] [RECORDS=n] [SEED=n] [RATE=hz] [SECONDS=s] [OUT=dir]
+#                               effects from physics, by a generator that knows nothing of the detector
 #   make false-alarms [RECORDS=n] [SEED=n] [RATE=hz]
 #                               clean axes that diagnose calls inadequate, in the forms of people's logs
 #   make soak                   a record of 10^8 bank samples
@@ -43,7 +45,7 @@ export RECORDING
 include port/boards.mk port/arm.mk
 
 .DELETE_ON_ERROR:
-.PHONY: all help setup system python lock run posix quick test hidden false-alarms c-tests check clean
+.PHONY: all help setup system python lock run posix quick test hidden hidden-physics false-alarms c-tests check clean
 .PHONY: soak tolerances emulate calibration campaigns cases
 
 all: setup
@@ -159,6 +161,12 @@ PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdi
 hidden: setup
 	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) \
 	    $(SEED:%=--seed %) $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
+
+# Goes on where an earlier run of this commit ended.
+hidden-physics: setup
+	nice $(BIN)/python tests/hidden/physics_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
+	    $(if $(SIZES),--sizes $(SIZES)) $(SEED:%=--seed %) $(if $(RATE),--rate $(RATE)) $(SECONDS:%=--seconds %) \
+	    $(if $(OUT),--out $(OUT))
 
 false-alarms: setup
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
@@ -416,7 +424,8 @@ check-mypy: $(PACKAGE)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py
 	@cd tools && ../$(BIN)/mypy --no-error-summary \
-	    $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py)
+	    $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py \
+	    evidence.py physics.py physics_judge.py)
 	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml --untyped-calls-exclude=unicorn host_sim/parts
 
 clean:

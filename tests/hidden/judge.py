@@ -307,7 +307,7 @@ def held_out(answers: Sequence[Answer]) -> list[Gain]:
 # --------------------------------------------------------------------------------------------------------------- main
 
 
-def run(work: Sequence[Task], job: Callable[..., Answer], *given: Any, processes: int = 2) -> list[Answer]:
+def run(work: Sequence[Any], job: Callable[..., Answer], *given: Any, processes: int = 2) -> list[Answer]:
     """The answers in the order of the tasks, with a progress bar. Ctrl-C keeps what is there.
 
     What cannot be drawn (plain flicker of 20 min at 1 Hz) is left out and said.
