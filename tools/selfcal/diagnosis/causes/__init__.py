@@ -19,6 +19,7 @@ from selfcal.diagnosis.causes import (
     stuck,
     supply,
     temperature,
+    turn_on,
     unexplained,
     variance_change,
 )
@@ -32,6 +33,7 @@ CAUSES = MappingProxyType(
             cross_axis,
             ramp,
             step,
+            turn_on,
             periodic,
             flicker,
             colored_noise,
