@@ -36,7 +36,8 @@ static bool valid_source(const selfcal_source_t *source) {
     case SELFCAL_COLUMN_CHANNEL: return source->number >= 0.0F && isfinite(source->number);
     case SELFCAL_COLUMN_RATE:
     case SELFCAL_COLUMN_SINE:
-    case SELFCAL_COLUMN_COSINE: return source->number > 0.0F && isfinite(source->number);
+    case SELFCAL_COLUMN_COSINE:
+    case SELFCAL_COLUMN_TURN_ON: return source->number > 0.0F && isfinite(source->number);
     case SELFCAL_COLUMN_STEP: return source->number >= 0.0F && isfinite(source->number);
     default: return false;
     }
@@ -170,20 +171,20 @@ void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[]
     const bool first = !self->begun;
     const uint64_t stride = (uint64_t)missing + 1U;
     self->samples += first ? missing : stride;
+    const selfcal_real_t elapsed_s = (selfcal_real_t)self->samples * (selfcal_real_t)interval_of(model);
     for (uint8_t k = 0; k < model->regressors->count; k++) {
         const selfcal_source_t *source = &model->regressors->source[k];
         selfcal_trail_t *trail = &self->trail[k];
         const float raw = reading_of(source, model, sample, channels);
         switch (source->kind) {
-        case SELFCAL_COLUMN_TIME:
-            values[k] = (float)((selfcal_real_t)self->samples * (selfcal_real_t)interval_of(model));
-            break;
+        case SELFCAL_COLUMN_TIME: values[k] = (float)elapsed_s; break;
         case SELFCAL_COLUMN_CHANNEL:
             values[k] = has_window(source) && isfinite(raw) ? trailing_mean(trail, raw, first) : raw;
             break;
         case SELFCAL_COLUMN_RATE:
             values[k] = isfinite(raw) ? gained(trail, raw, first, stride) / source->number : raw;
             break;
+        case SELFCAL_COLUMN_TURN_ON: values[k] = (float)r_exp(-elapsed_s / (selfcal_real_t)source->number); break;
         case SELFCAL_COLUMN_STEP: values[k] = self->samples >= trail->step ? 1.0F : 0.0F; break;
         default: values[k] = wave(trail->step * self->samples, source->kind == SELFCAL_COLUMN_COSINE); break;
         }

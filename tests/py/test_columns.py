@@ -9,7 +9,7 @@ import pytest
 
 from selfcal import _library32
 
-TIME, CHANNEL, RATE, SINE, COSINE, STEP = range(6)
+TIME, CHANNEL, RATE, SINE, COSINE, STEP, TURN_ON = range(7)
 
 
 def form(
@@ -91,6 +91,8 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
     nothing = np.zeros(t.size)
     assert form((TIME, 0.0), nothing, missing) == pytest.approx(t, rel=2e-7)
     assert (form((STEP, 42.3), nothing, missing) == (t >= 42.3 - 1e-6)).all()
+    for tau in (0.7, 42.3, 5000.0):
+        assert np.abs(form((TURN_ON, tau), nothing, missing) - np.exp(-t / tau)).max() < 1e-6
     stretch = float(np.float32(0.1)) / 0.1
     turns = 2.0 * np.pi * np.mod(float(np.float32(0.5643)) * t * stretch, 1.0)
     assert np.abs(form((SINE, 0.5643), nothing, missing) - np.sin(turns)).max() < 2e-5
@@ -99,6 +101,6 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
 
 def test_a_source_that_cannot_be_is_refused() -> None:
     values = np.zeros(3)
-    for source in ((6, 1.0), (RATE, 0.0), (SINE, -1.0), (CHANNEL, float("nan"))):
+    for source in ((7, 1.0), (RATE, 0.0), (SINE, -1.0), (TURN_ON, 0.0), (CHANNEL, float("nan"))):
         with pytest.raises(ValueError, match="cannot be"):
             form(source, values)

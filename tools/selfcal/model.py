@@ -42,6 +42,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
+    "turn_on": ("time_constant_s",),
 }
 #: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
@@ -93,6 +94,7 @@ class Regressor:
     window_s: float = math.nan  # of a rate; of a column that is smoothed
     frequency_hz: float = math.nan
     time_s: float = math.nan
+    time_constant_s: float = math.nan
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -383,7 +385,7 @@ class _Reader:
         if not isinstance(kind, str) or kind not in REGRESSORS:
             raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
-        unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or self.unit(fields, where)
+        unit = {"time": "s", "periodic": "1", "step": "1", "turn_on": "1"}.get(kind) or self.unit(fields, where)
         priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
         if not priors:
             raise self.fail(f"{where}.sd", "must name at least one group")
@@ -392,7 +394,7 @@ class _Reader:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
         needed = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
-            for key in ("window_s", "frequency_hz", "time_s")
+            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s")
             if key in REGRESSORS[kind] and (kind != "column" or key in fields)
         }
         return Regressor(

@@ -18,8 +18,8 @@ from selfcal.recording import Recording, as_float
 from selfcal.result import HALF_90, AxisResult, of_mixture
 
 #: `selfcal_column_kind_t`: names in C, by number.
-COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP")
-_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP = range(len(COLUMN_KINDS))
+COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP", "TURN_ON")
+_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP, _TURN_ON = range(len(COLUMN_KINDS))
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -63,10 +63,11 @@ class Scored:
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module. Time counts from the first row, s; a step's is
-    that of the recording that the rows were cut from. A column with a `window_s` is the mean over that time up to each
-    row. A step is 1 from its time on. A rate is the channel's gain over the last `window_s`, in the first window its
-    gain since the first row, over `window_s`. Raises UserError for a column that is absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. Time counts from the first row, s; a step's and a
+    turn-on's are those of the recording that the rows were cut from. A column with a `window_s` is the mean over that
+    time up to each row. A step is 1 from its time on. A rate is the channel's gain over the last `window_s`, in the
+    first window its gain since the first row, over `window_s`. Raises UserError for a column that is absent or of
+    another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
@@ -78,12 +79,25 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     sources = [source for one in regressors for source in sources_of(one, channels)]
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
     formed = _library32.form(sources, 1.0 / recording.rate_hz, rows, missing)
-    return np.ascontiguousarray(formed, np.float64)
+    left = [_left(one, recording.start_s) for one in regressors for _ in one.columns]
+    return np.ascontiguousarray(formed * np.array(left), np.float64)
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
-    """The regressors for a clock that begins at `start_s` of the one that their times are of."""
-    return tuple(replace(one, time_s=one.time_s - start_s) if one.kind == "step" else one for one in regressors)
+    """The regressors for a clock that begins at `start_s` of the one that their times are of. A turn-on's amplitude is
+    the one that is left there."""
+
+    def moved(one: Regressor) -> Regressor:
+        if one.kind == "step":
+            return replace(one, time_s=one.time_s - start_s)
+        return replace(one, sd={group: sd * _left(one, start_s) for group, sd in one.sd.items()})
+
+    return tuple(moved(one) for one in regressors)
+
+
+def _left(one: Regressor, start_s: float) -> float:
+    """The part of a turn-on that is left at a time, s; 1 of all others."""
+    return math.exp(-start_s / one.time_constant_s) if one.kind == "turn_on" else 1.0
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
@@ -110,6 +124,8 @@ def sources_of(one: Regressor, channels: Sequence[tuple[str, str]]) -> list[tupl
         return [(_TIME, 0, 0.0)]
     if one.kind == "step":
         return [(_STEP, 0, one.time_s)]
+    if one.kind == "turn_on":
+        return [(_TURN_ON, 0, one.time_constant_s)]
     if one.kind == "periodic":
         return [(_SINE, 0, one.frequency_hz), (_COSINE, 0, one.frequency_hz)]
     if one.kind == "rate":

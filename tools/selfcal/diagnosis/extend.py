@@ -181,13 +181,13 @@ def regressor_key(column: str) -> str:
 
 
 def _effects(name: str, one: Diagnosed) -> list[str]:
-    """`--effect` texts that put what an axis has into a simulated record. The simulator has one effect of a kind on an
-    axis: the strongest."""
-    found = [*_of_columns(one), *_of_findings(one)]
-    strongest: dict[str, tuple[Cause, float, dict[str, Any]]] = {}
-    for cause, strength, pairs in found:
-        if cause.id not in strongest or strongest[cause.id][1] < strength:
-            strongest[cause.id] = (cause, strength, pairs)
+    """`--effect` texts that put what an axis has into a simulated record. The simulator itself has one effect of a
+    kind on an axis: the strongest. Those that a cause adds are all there."""
+    strongest: dict[object, tuple[Cause, float, dict[str, Any]]] = {}
+    for k, (cause, strength, pairs) in enumerate([*_of_columns(one), *_of_findings(one)]):
+        place = cause.id if cause.add is None else k
+        if place not in strongest or strongest[place][1] < strength:
+            strongest[place] = (cause, strength, pairs)
     texts = []
     for cause, _, pairs in strongest.values():
         where = {} if cause.common else {"axis": name}

@@ -116,6 +116,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
                 "column": one.column,
                 "frequency_hz": one.frequency_hz,
                 "time_s": one.time_s - recording.start_s,
+                "time_constant_s": one.time_constant_s,
             }
             for column, row in zip(one.columns, values.T, strict=True):
                 about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.reference

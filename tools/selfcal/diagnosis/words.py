@@ -25,6 +25,9 @@ LABELS = {
     "after_hz": "to",
     "frequency_hz": "frequency",
     "width_hz": "half width",
+    "time_constant_s": "time constant",
+    "amplitude_2": "second amplitude",
+    "time_constant_2_s": "time constant",
 }
 #: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
 #: coefficient so many times larger is no leak of that kind.

@@ -50,7 +50,7 @@ def simulate(
     applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
     asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
     for name, axis in asked:
-        if asked.count((name, axis)) > 1:
+        if asked.count((name, axis)) > 1 and CAUSES[name].add is None:
             raise UserError(f"--effect {name}: twice on {axis}, which has room for one effect of a kind")
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")

@@ -21,6 +21,7 @@ from selfcal.diagnosis.causes import (
     stuck,
     supply,
     temperature,
+    turn_on,
     unexplained,
     variance_change,
 )
@@ -34,6 +35,7 @@ CAUSES: Mapping[str, _Cause] = MappingProxyType(
             cross_axis,
             ramp,
             step,
+            turn_on,
             periodic,
             flicker,
             colored_noise,

@@ -1,0 +1,126 @@
+"""A bias that settles after power-on: named, its size and time constants held, and no clean record shows one.
+
+Truth: the numbers that each record was drawn with, sample by sample in numpy. N 0.04, a walk of K 3e-4 or a
+Gauss-Markov drift of 0.012 and 250 s.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from selfcal.diagnosis.causes import turn_on
+from selfcal.diagnosis.loop import diagnose_record
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, Look, State
+from selfcal.diagnosis.statemodel import Array
+
+from conftest import case_records
+
+N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
+LAWS = ("walk", "markov")
+
+
+def noise(random: np.random.Generator, law: str, n: int, rate: float) -> Array:
+    """[n]: white noise beside the drift."""
+    dt = 1.0 / rate
+    white = N / math.sqrt(dt) * random.standard_normal(n)
+    if law == "walk":
+        return white + K * math.sqrt(dt) * random.standard_normal(n).cumsum()
+    phi = math.exp(-dt / TIME_S)
+    kick = SIGMA_M * math.sqrt(1.0 - phi * phi) * random.standard_normal(n)
+    kick[0] = SIGMA_M * random.standard_normal()
+    return np.asarray(white + lfilter([1.0], [1.0, -phi], kick))
+
+
+def recorded(y: Array, rate: float) -> tuple[State, Record]:
+    level = float(np.median(y))
+    state = State("gx", "deg/s", y - level, 1.0 / rate, level, np.ones(y.size)).refit()
+    return state, Record(rate, {"gx": state}, {}, {}, np.isfinite(y), recorded_hz=rate)
+
+
+def looked(y: Array, rate: float) -> Look | None:
+    return next(iter(turn_on.looks(*recorded(y, rate))), None)
+
+
+def drawn(random: np.random.Generator, rate: float, seconds: float) -> tuple[Array, float, float]:
+    """A transient [n], its amplitude and time constant: plain ones, 40 nats and more in nearly all records."""
+    t = np.arange(round(seconds * rate)) / rate
+    tau = math.exp(random.uniform(math.log(20.0), math.log(300.0)))
+    amplitude = float(random.choice([-1.0, 1.0])) * random.uniform(0.35, 0.6)
+    return amplitude * np.exp(-t / tau), amplitude, tau
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("rate", [1.0, 10.0])
+def test_a_plain_turn_on_is_named_first_and_alone(law: str, rate: float) -> None:
+    """9 of 10 at 40 nats and more. No step is left of it."""
+    random = np.random.default_rng([421, round(rate), LAWS.index(law)])
+    right = total = 0
+    for _ in range(case_records(1, 40)):
+        shape, _, _ = drawn(random, rate, 3600.0)
+        _, record = recorded(noise(random, law, shape.size, rate) + shape, rate)
+        one = diagnose_record(record, ["gx"])["gx"]
+        total += 1
+        right += [finding.look.cause for finding in one.findings] == ["turn_on"]
+    print(f"turn_on, {law}, {rate:g} Hz: {right} of {total}")
+    assert binom.cdf(right, total, 0.9) > 1e-3
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_amplitude_and_time_constant_lie_in_their_intervals(law: str) -> None:
+    """90 %, neither tail of the binomial below 1 in 1000."""
+    random = np.random.default_rng([422, LAWS.index(law)])
+    held: dict[str, list[bool]] = {"amplitude": [], "time_constant_s": []}
+    for _ in range(case_records(8, 200)):
+        shape, amplitude, tau = drawn(random, 1.0, 3600.0)
+        look = looked(noise(random, law, shape.size, 1.0) + shape, 1.0)
+        assert look is not None
+        for key, truth in (("amplitude", amplitude), ("time_constant_s", tau)):
+            held[key].append(look.estimate[key]["q05"] <= truth <= look.estimate[key]["q95"])
+    for key, each in held.items():
+        print(f"{key}, {law}: {sum(each)} of {len(each)} in the 90 % interval")
+        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
+        assert binom.sf(sum(each) - 1, len(each), 0.9) > 1e-3, key
+
+
+def test_two_time_constants_are_one_finding() -> None:
+    """Each estimate within four of its standard deviations: 1 in 10 000 of a normal's."""
+    random = np.random.default_rng(423)
+    t = np.arange(3600.0)
+    truth = {"amplitude": 0.5, "time_constant_s": 20.0, "amplitude_2": -0.3, "time_constant_2_s": 300.0}
+    shape = 0.5 * np.exp(-t / 20.0) - 0.3 * np.exp(-t / 300.0)
+    look = looked(noise(random, "walk", t.size, 1.0) + shape, 1.0)
+    assert look is not None and set(look.estimate) == set(truth)
+    for key, value in truth.items():
+        assert abs(look.estimate[key]["mean"] - value) < 4.0 * look.estimate[key]["sd"], key
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
+def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
+    """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
+    random = np.random.default_rng([424, round(rate), round(seconds), LAWS.index(law)])
+    count = case_records(6, 200)
+    found = [looked(noise(random, law, round(seconds * rate), rate), rate) for _ in range(count)]
+    named = sum(look is not None and look.net >= NET_LEAST for look in found)
+    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    assert named <= (4 if count >= 200 else 1)
+
+
+def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:
+    """A stretch that begins later, and means of several readings, show the same amplitude."""
+    random = np.random.default_rng(425)
+    t = np.arange(36000) / 10.0
+    y = 0.8 * np.exp(-t / 100.0) + noise(random, "walk", t.size, 10.0)
+    later, record = recorded(y[300:], 10.0)
+    means, of_means = recorded(y.reshape(-1, 50).mean(axis=1), 0.2)
+    for state, its in ((later, replace(record, start_s=30.0)), (means, replace(of_means, recorded_hz=10.0))):
+        (look,) = turn_on.looks(state, its)
+        assert abs(look.estimate["amplitude"]["mean"] - 0.8) < 3.0 * look.estimate["amplitude"]["sd"]
+        assert look.estimate["amplitude"]["sd"] < 0.03
