@@ -108,6 +108,7 @@ class Cause:
     anew         its size belongs to one recording: another one weighs it anew under its prior.
     onset        scored from its on-line detection, `Look.when[0]`.
     trained      look, states before and after, record and split: the state after as the first `split` samples show it.
+    together     nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
     least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
     entry        the model file's entry of its column for the whole recording.
     from_zero    the simulator's effect begins at 0, its column is about the middle.
@@ -136,6 +137,7 @@ class Cause:
     anew: bool = False
     onset: bool = False
     trained: Callable[[Look, State, State, Record, int], State] | None = None
+    together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]] | None = None
     least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
     entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
     from_zero: bool = False

@@ -83,7 +83,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
     look = finding.look
     inner = finding.before.unit
     try:
-        held_out, reason = gain(look, finding.before, finding.after, record)
+        held_out, reason = gain(look, finding.before, finding.after, record, finding.partner)
     except Stopped:
         held_out, reason = None, "there was no time left to measure it"
     if held_out is not None:

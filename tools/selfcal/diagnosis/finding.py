@@ -11,7 +11,7 @@ from selfcal.diagnosis.statistics import Statistic
 
 @dataclass(frozen=True)
 class Finding:
-    """One named cause on one axis."""
+    """One named cause on one axis. `partner`: the other axis, of a cause that two share."""
 
     look: Look
     round: int
@@ -19,6 +19,7 @@ class Finding:
     after: State
     also_possible: tuple[str, ...] = ()
     shared_with: tuple[str, ...] = ()
+    partner: State | None = None
 
 
 @dataclass

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
-from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, envelope
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.fit import run
@@ -29,6 +29,8 @@ POINTS = 400
 TAUS_A_DECADE, BINS_A_DECADE = 8, 24
 #: Pairs of means that an Allan deviation rests on, at most about twice as many.
 PAIRS = 100_000
+#: Standard deviations within which 99 % of a normal deviate lie.
+TWO_SIDED_99 = 2.576
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
@@ -415,6 +417,28 @@ def _histogram_of_readings(
     )
 
 
+def _together(finding: Finding) -> Iterator[Figure]:
+    """How the noise of two axes goes together, by frequency."""
+    one, two = finding.before, finding.partner
+    if two is None:
+        return
+    hz, r, sd = shared.by_frequency(shared.pair_of(one.whitened, two.whitened, one.dt))
+    yield Figure(
+        "Correlation of two axes",
+        f"Correlation in phase of the residual innovations of {one.axis} and {two.axis}, by third of an octave.",
+        [
+            Panel(
+                "Measured",
+                "frequency, Hz",
+                "correlation",
+                [Curve("measured", hz, r, "dots")],
+                [Band("99 % of axes that share nothing", hz, -TWO_SIDED_99 * sd, TWO_SIDED_99 * sd)],
+                log_x=True,
+            )
+        ],
+    )
+
+
 def _missing(finding: Finding, record: Record) -> Figure:
     """Gaps in the stamps, and rows that the logger held."""
     edges, middle = _pieces(record, POINTS // 2)
@@ -538,6 +562,7 @@ _PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[Compare
     "histogram": lambda finding, record, factor, unit: [_histogram(finding.before, finding.after)],
     "lattice": lambda finding, record, factor, unit: [_lattice(finding, factor, unit)],
     "limit": lambda finding, record, factor, unit: [_limit(finding, factor, unit)],
+    "together": lambda finding, record, factor, unit: _together(finding),
     "missing": lambda finding, record, factor, unit: [_missing(finding, record)],
     "unexplained": lambda finding, record, factor, unit: [_unexplained(finding, record, factor, unit)],
 }

@@ -7,7 +7,7 @@ looked for anew in the first half. The place of a step or of a change is the who
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,20 +29,26 @@ PREDICTIONS = 300
 
 @dataclass(frozen=True)
 class Trained:
-    """A state whose model was fitted on its first samples alone: innovations' ln density of every later one, [n]."""
+    """A state whose model was fitted on its first samples alone: innovations' ln density of every later one, [n], and
+    residual innovations [n]."""
 
     ln_density: Array
+    residual: Array
     fit: Fit
     series: Series
 
 
-def gain(look: Look, before: State, after: State, record: Record) -> tuple[dict[str, Any] | None, str | None]:
-    """The contract's `gain` of one finding, or None with the reason."""
+def gain(
+    look: Look, before: State, after: State, record: Record, partner: State | None = None
+) -> tuple[dict[str, Any] | None, str | None]:
+    """The contract's `gain` of one finding, or None with the reason. `partner`: the axis that shares the cause."""
     cause = CAUSES[look.cause]
     if cause.no_gain:
         return None, cause.no_gain
     n = before.y.size
     split = n // 2
+    if cause.together is not None and partner is not None:
+        return _joint(cause.together, look, (before, partner), split)
     if cause.onset and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
@@ -70,6 +76,27 @@ def gain(look: Look, before: State, after: State, record: Record) -> tuple[dict[
     }, None
 
 
+def _joint(
+    together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]],
+    look: Look,
+    pair: tuple[State, State],
+    split: int,
+) -> tuple[dict[str, Any] | None, str | None]:
+    """After: the joint log score of two axes less the other one's own, which is the first one's given the other. The
+    bias is predicted alike."""
+    one, two = (_trained(state, split) for state in pair)
+    both = np.isfinite(one.ln_density) & np.isfinite(two.ln_density)
+    both[:split] = False
+    if both.sum() < 30:
+        return None, "too few samples are left to score"
+    more, sd = together(one.residual, two.residual, one.series.dt, split, look.estimate)
+    before = float(one.ln_density[both].mean())
+    return {
+        "log_score_per_sample": {"before": before, "after": before + more, "sd": sd, "samples": int(both.sum())},
+        "bias_rmse": {"unit": pair[0].unit, "horizon_s": {}},
+    }, None
+
+
 def _trained(state: State, split: int) -> Trained:
     series = state.series
     first = Series(series.y[:split], series.dt, series.r[:split], np.ascontiguousarray(series.columns[:, :split]))
@@ -78,7 +105,7 @@ def _trained(state: State, split: int) -> Trained:
     _, white, s = _pass(series, chosen)
     residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
     ln_density = -0.5 * (residual**2 + np.log(2.0 * math.pi * chosen.sigma**2 * s))
-    return Trained(np.where(np.isfinite(series.y), ln_density, np.nan), chosen, series)
+    return Trained(np.where(np.isfinite(series.y), ln_density, np.nan), residual, chosen, series)
 
 
 def _start(state: State, terms: Any) -> Array:

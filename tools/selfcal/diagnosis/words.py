@@ -19,6 +19,8 @@ def verdict(axis: Mapping[str, Any]) -> str:
 INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.
 LABELS = {
+    "other": "other axis",
+    "share": "share of the noise",
     "time_s": "at",
     "rate_hz": "at",
     "before_hz": "from",
@@ -62,6 +64,8 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             parts.append(f"{label} {_rounded(value['median'], half)}{spread}{unit}")
         elif key == "intervals":
             parts.append(_intervals(value))
+        elif key == "band_hz":
+            parts.append(f"between {value[0]:.3g} Hz and {value[1]:.3g} Hz")
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)

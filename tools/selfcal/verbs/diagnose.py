@@ -290,10 +290,8 @@ def _lines(finding: Mapping[str, Any]) -> list[str]:
             f"{horizon} s {row['before']:.3g} -> {row['after']:.3g}"
             for horizon, row in gain["bias_rmse"]["horizon_s"].items()
         )
-        lines.append(
-            f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample; "
-            f"bias error ahead, {gain['bias_rmse']['unit']}: {errors}"
-        )
+        lines.append(f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample")
+        lines[-1] += f"; bias error ahead, {gain['bias_rmse']['unit']}: {errors}" if errors else ""
     elif finding.get("gain_reason"):
         lines.append(f"  no held-out gain: {finding['gain_reason']}")
     lines += [f"  {line}" for line in words.carried(finding)]

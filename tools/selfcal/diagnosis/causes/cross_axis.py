@@ -38,10 +38,15 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         if ahead > 0.0:
             one = found[name]
             one.findings.remove(finding)
-            kept = tuple(column for column in one.state.regressors if column.name != f"axis_{other}")
-            one.state = one.state.refit(regressors=kept)
+            one.state = without(one.state, other)
             changed.append(name)
     return changed
+
+
+def without(state: State, other: str) -> State:
+    """The state without the column of another axis."""
+    kept = tuple(column for column in state.regressors if column.name != f"axis_{other}")
+    return state.refit(regressors=kept)
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
