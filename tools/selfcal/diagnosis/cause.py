@@ -108,6 +108,7 @@ class Cause:
     trained      look, states before and after, record and split: the state after as the first `split` samples show it.
     least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
     entry        the model file's entry of its column for the whole recording.
+    smoothed     its column is the mean of a channel: the model file states the trailing window that suits it.
     from_zero    the simulator's effect begins at 0, its column is about the middle.
     extend       writes what is no column into the model file.
     of_column    keys of `--effect` for its columns: the first one and the coefficients of all.
@@ -134,6 +135,7 @@ class Cause:
     trained: Callable[[Look, State, State, Record, int], State] | None = None
     least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
     entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
+    smoothed: bool = False
     from_zero: bool = False
     extend: Callable[[Extension], None] | None = None
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None

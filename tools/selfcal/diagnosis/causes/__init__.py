@@ -21,6 +21,7 @@ from selfcal.diagnosis.causes import (
     temperature,
     unexplained,
     variance_change,
+    vibration,
 )
 
 CAUSES = MappingProxyType(
@@ -30,6 +31,7 @@ CAUSES = MappingProxyType(
             temperature,
             supply,
             cross_axis,
+            vibration,
             ramp,
             step,
             periodic,

@@ -163,7 +163,7 @@ def _line(state: State, record: Record) -> list[Look]:
             pair = columns(f)
     amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
     if worth >= NET_LEAST:
-        weight, means, sds = state.posterior(pair)
+        weight, means, sds = (of[0] for of in state.posterior(pair))
         amplitude = mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)
     name = f"line_{f:.6g}Hz"
     entry = {"kind": "periodic", "frequency_hz": f}
