@@ -4,6 +4,7 @@ simulator form columns by this one function."""
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +28,13 @@ def formed(
     number: float = math.nan,
     about: float = 0.0,
     interval_s: float = 1.0,
-    missing: NDArray[np.uint64] | None = None,
+    missing: NDArray[np.integer[Any]] | None = None,
 ) -> Array:
     """[n]: the column that `values` [n] of a channel make. Sample i follows `missing[i]` absent ones.
 
-    `number`: the time constant of a lag, s; the window of a rate, s: the slope of the straight line that fits it best;
-    the whole width of a play. `about`: what powers are taken about. A lag, a rate and a play begin at rest, at the first
-    value. Between two samples the channel moves on a straight line.
+    `number`: the time constant of a lag, s; the window of a rate, s; the whole width of a play. A rate is the slope of
+    the straight line that fits its window best. `about`: what powers are taken about. A lag, a rate and a play begin at
+    rest, at the first value. Between two samples the channel moves on a straight line.
     """
     if form == "static" or values.size == 0:
         return values
@@ -46,7 +47,7 @@ def formed(
     return np.asarray((values - about) ** POWER[form])
 
 
-def variance_of(values: Array, missing: NDArray[np.uint64] | None = None) -> Array:
+def variance_of(values: Array, missing: NDArray[np.integer[Any]] | None = None) -> Array:
     """[n]: half the square of each difference: its mean is the variance of the noise, and no slow change is in it.
 
     Not a number where there is no sample before."""
@@ -57,7 +58,7 @@ def variance_of(values: Array, missing: NDArray[np.uint64] | None = None) -> Arr
     return half
 
 
-def _lagging(values: Array, gain: float, missing: NDArray[np.uint64] | None) -> Array:
+def _lagging(values: Array, gain: float, missing: NDArray[np.integer[Any]] | None) -> Array:
     """A first-order low pass: x += gain (value - x) at each sample."""
     out = np.empty(values.size)
     starts = [0] if missing is None else [0, *(np.flatnonzero(missing[1:] > 0) + 1).tolist()]
@@ -80,7 +81,7 @@ def _lagging(values: Array, gain: float, missing: NDArray[np.uint64] | None) -> 
     return out
 
 
-def _slopes(values: Array, window: int, missing: NDArray[np.uint64] | None) -> Array:
+def _slopes(values: Array, window: int, missing: NDArray[np.integer[Any]] | None) -> Array:
     """The slope, per sample, of the straight line that fits the last `window` values best. A gap as long as the window
     begins it anew."""
     out = np.empty(values.size)
@@ -106,5 +107,3 @@ def _played(values: Array, half: float) -> Array:
         at = min(max(at, value - half), value + half)
         out[i] = at
     return out
-
-

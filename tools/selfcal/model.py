@@ -417,7 +417,7 @@ class _Reader:
             raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
         unit = {"time": "s", "periodic": "1", "step": "1"}.get(kind) or self.unit(fields, where)
-        chosen = {
+        chosen: dict[str, Any] = {
             key: self.choice(fields.get(key, known[0]), f"{where}.{key}", known)
             for key, known in (("input", INPUTS), ("form", FORMS))
         }
@@ -430,7 +430,7 @@ class _Reader:
         probability = self.number(fields.get("probability", 0.5), f"{where}.probability")
         if probability >= 1.0:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
-        needed = {
+        needed: dict[str, Any] = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
             for key in ("window_s", "frequency_hz", "time_s", "lag_s", "width")
             if key in REGRESSORS[kind] and (kind != "column" or key in fields or key == NUMBER.get(chosen["form"]))

@@ -64,10 +64,11 @@ class Scored:
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module; forms that it lacks are made of its (forms.py). Time counts from the first row, s; a step's is
-    that of the recording that the rows were cut from. A column with a `window_s` is the mean over that time up to each
-    row. A step is 1 from its time on. A rate is the channel's gain over the last `window_s`, in the first window its
-    gain since the first row, over `window_s`. Raises UserError for a column that is absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. forms.py makes the forms that it lacks of its
+    means. Time counts from the first row, s; a step's is that of the recording that the rows were cut from. A column
+    with a `window_s` is the mean over that time up to each row. A step is 1 from its time on. A rate (the kind) is the
+    channel's gain over the last `window_s`, in the first window its gain since the first row, over `window_s`. Raises
+    UserError for a column that is absent or of another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))

@@ -45,11 +45,11 @@ def is_count(value: float) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """One key of `simulate --effect`: its value when it is not given, and which values it may have (`fits`, `limits` in
-    words). `field`: the member of the simulator's axis, or scene, that takes it; "" where `Cause.add` or the read-out
-    does."""
+    """One key of `simulate --effect`: its value when it is not given (None: then it is not there), and which values it
+    may have (`fits`, `limits` in words). `field`: the member of the simulator's axis, or scene, that takes it; "" where
+    `Cause.add` or the read-out does."""
 
-    default: Callable[[Setting], float]
+    default: Callable[[Setting], float] | None
     field: str = ""
     fits: Callable[[float], bool] = _any
     limits: str = "finite"

@@ -84,7 +84,11 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             key = _key(regressor.name)
             own = CAUSES[regressor.cause].entry(regressor.entry, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
-            if CAUSES[regressor.cause].smoothed and entry["kind"] == "column" and entry.get("form") not in ("lag", "rate"):
+            if (
+                CAUSES[regressor.cause].smoothed
+                and entry["kind"] == "column"
+                and entry.get("form") not in ("lag", "rate")
+            ):
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))

@@ -26,15 +26,10 @@ from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import coefficient_unit
 from selfcal.units import power
 
-#: Estimate keys of the columns of each form.
-KEYS = {
-    "static": ("coefficient",),
-    "lag": ("coefficient",),
-    "rate": ("rate",),
-    "square": ("coefficient", "square"),
-    "cube": ("coefficient", "square", "cube"),
-    "play": ("coefficient",),
-}
+#: The columns of each form: a power comes with all that are simpler.
+PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube")}
+#: Estimate key of a column's coefficient; of all others `coefficient`.
+KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
 #: file's window is as wide and trails: a module has no later values.
 SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
@@ -51,7 +46,7 @@ REFITTED = 3
 #: A drift of less: where a form has pulled the drift up, its score is too small there.
 STIFFER = 1.5
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
-LN_FORMS = {"static": 0.0, "lag": 2.5, "rate": 2.5, "square": 2.0, "cube": 2.0, "play": 3.0}
+LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "cube": 2.0, "play": 3.0}
 #: Numbers of a lag or a play that stand for its posterior.
 FINE = 15
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
@@ -145,14 +140,18 @@ def column_of(channel: Channel, state: State, form: str, number: float, width_s:
         name = channel.name if form == "static" else f"{channel.name}_{form}"
         unit = power(channel.of, POWER.get(form, 1)) + ("/s" if form == "rate" else "")
         stated = {"form": form} if form != "static" else {}
-        return Regressor(name, channel.cause, values, unit, {**entry, **smooth, **stated, **more})
+        own = {key: value for key, value in entry.items() if form != "rate" or key != "reference"}
+        return Regressor(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
 
-    parts = {"square": ("static", "square"), "cube": ("static", "square", "cube")}.get(form, (form,))
+    known = {form_of(one) for one in state.regressors}
+    parts = [part for part in PARTS.get(form, (form,)) if (channel.column, channel.input, part) not in known]
     return Option(
         form,
         number,
         tuple(
-            regressor(part, formed(about, part, number, 0.0, state.dt), **({NUMBER[part]: number} if part in NUMBER else {}))
+            regressor(
+                part, formed(about, part, number, 0.0, state.dt), **({NUMBER[part]: number} if part in NUMBER else {})
+            )
             for part in parts
         ),
         window,
@@ -330,7 +329,8 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
 def _estimate(state: State, channel: Channel, chosen: _Tried, tried: dict[str, _Tried]) -> dict[str, Any]:
     """Intervals of the coefficients and of the form's number."""
     option = chosen.option
-    form, keys = option.form, KEYS[option.form]
+    form = option.form
+    keys = [KEYS.get(form_of(one)[2], "coefficient") for one in option.regressors]
     units = [coefficient_unit(state.unit, one.unit) for one in option.regressors]
     named = {"form": form, "input": channel.input, **channel.extra}
     k = len(keys)
@@ -349,7 +349,11 @@ def _estimate(state: State, channel: Channel, chosen: _Tried, tried: dict[str, _
             for number in _around(state, channel, chosen)
         ]
     weight, means, sds = state.posterior(*(one.columns for one in alternatives))
-    kept = _kept(state, chosen.fit, option.columns[0], channel, option.window) if form == "static" and channel.noisy else 1.0
+    kept = (
+        _kept(state, chosen.fit, option.columns[0], channel, option.window)
+        if form == "static" and channel.noisy
+        else 1.0
+    )
     sizes = {
         key: mixture(weight.ravel(), means[..., j].ravel() / kept, sds[..., j].ravel() / kept, unit)
         for j, (key, unit) in enumerate(zip(keys, units, strict=True))
@@ -399,31 +403,35 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
     return {"coefficient": (size, unit)} if math.isfinite(size) else None
 
 
-#: Keys of `simulate --effect` beside the coefficient: 0 is a form that is not there.
+def _is_positive(value: float) -> bool:
+    return value > 0.0
+
+
+#: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
 EFFECT_KEYS = {
-    key: Key(lambda s: 0.0, fits=lambda v: v >= 0.0, limits="0 or above")
-    if key in ("lag_s", "width")
-    else Key(lambda s: 60.0, fits=lambda v: v > 0.0, limits="above 0")
-    if key == "window_s"
-    else Key(lambda s: 0.0)
-    for key in ("lag_s", "rate", "window_s", "square", "cube", "width")
+    **{key: Key(None, fits=_is_positive, limits="above 0") for key in ("lag_s", "width", "window_s")},
+    **{key: Key(None) for key in ("rate", "square", "cube")},
 }
+#: Window of a rate whose effect states none, s.
+RATE_WINDOW_S = 60.0
 
 
 def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
     """What the forms of a channel add to a reading beside its static coefficient, [n]; 0 at the first sample."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
-    sum_ = np.zeros(values.size)
-    for form, key in (("lag", "lag_s"), ("play", "width")):
-        if keys.get(key):
-            sum_ += float(keys["coefficient"]) * (formed(values, form, float(keys[key]), 0.0, interval_s) - values)
-    if keys.get("rate"):
-        sum_ += float(keys["rate"]) * formed(values, "rate", float(keys["window_s"]), 0.0, interval_s)
+    total = np.zeros(values.size)
+    for form in ("lag", "play"):
+        if NUMBER[form] in keys:
+            late = formed(values, form, float(keys[NUMBER[form]]), 0.0, interval_s)
+            total += float(keys["coefficient"]) * (late - values)
+    if "rate" in keys:
+        window_s = float(keys.get("window_s", RATE_WINDOW_S))
+        total += float(keys["rate"]) * formed(values, "rate", window_s, 0.0, interval_s)
     for form in POWER:
-        if keys.get(form):
+        if form in keys:
             column = formed(values, form, about=float(values.mean()))
-            sum_ += float(keys[form]) * (column - column[0])
-    return sum_
+            total += float(keys[form]) * (column - column[0])
+    return total
 
 
 def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:

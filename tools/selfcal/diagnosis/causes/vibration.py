@@ -10,13 +10,15 @@ import numpy as np
 
 from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
-from selfcal.diagnosis.forms import LN_SLOW, SMOOTHING_S, Channel
+from selfcal.diagnosis.forms import LN_SLOW, Channel
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import Look, Regressor, State
 from selfcal.diagnosis.statemodel import Array
 from selfcal.forms import variance_of
 from selfcal.recording import bridged
 
+#: Widths of the means of a variance, s.
+WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 #: Differences that a variance is taken from at least: one alone scatters by 1.7 times itself.
 LEAST = 8
 
@@ -24,7 +26,7 @@ LEAST = 8
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis whose variance is known."""
     others = {name: values for name, values in record.variances(state.axis).items() if np.ptp(values) > 0.0}
-    widths = tuple(width for width in SMOOTHING_S if width * record.recorded_hz >= LEAST) or SMOOTHING_S[-1:]
+    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= LEAST) or WIDTHS_S[-1:]
     return forms.look(
         state,
         [
@@ -54,7 +56,7 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     """The variance of 1 s of the other axis, about its mean."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
     variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(LEAST, round(1.0 / interval_s)))
-    about = variance - variance.mean()
+    about: Array = variance - variance.mean()
     return float(keys["coefficient"]) * about + forms.added(keys, channels, about)
 
 
