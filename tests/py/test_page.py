@@ -23,11 +23,12 @@ import numpy as np
 import pytest
 
 from selfcal.diagnosis import chart, integrity, pictures
-from selfcal.diagnosis.causes import colored_noise, periodic, regressors, step, variance_change
+from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, outside_of
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.page import page, write_page
 from selfcal.diagnosis.record import Missing, Record, of_recording
@@ -73,13 +74,13 @@ def only(looks: list[Look], cause: str) -> Look:
 
 def a_ramp(y: Array) -> Finding:
     record = record_of(y + 4.0 * np.linspace(-1.0, 1.0, N))
-    return found(record, only(regressors.looks(record.axes["gx"], record), "ramp"))
+    return found(record, only(ramp.looks(record.axes["gx"], record), "ramp"))
 
 
 def a_temperature(y: Array) -> Finding:
     temperature = 3.0 * np.sin(np.linspace(0.0, 14.0, N))
     record = record_of(y + 0.5 * temperature, temperature=25.0 + temperature)
-    return found(record, only(regressors.looks(record.axes["gx"], record), "temperature"))
+    return found(record, only(side_looks(record.axes["gx"], record, "temperature"), "temperature"))
 
 
 def a_step(y: Array) -> Finding:

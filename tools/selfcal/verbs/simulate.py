@@ -261,7 +261,13 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
                 record[key] = _intervals(given[key])
                 scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
                 continue
-            value = _number(name, key, entry, given[key]) if key in given else entry.default(setting)
+            if key not in given and entry.default is None:
+                continue
+            value = (
+                _number(name, key, entry, given[key])
+                if entry.default is None or key in given
+                else entry.default(setting)
+            )
             whole = entry.fits is is_count
             record[key] = int(value) if whole else value
             if entry.field:

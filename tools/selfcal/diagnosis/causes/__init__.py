@@ -25,6 +25,7 @@ from selfcal.diagnosis.causes import (
     turn_on,
     unexplained,
     variance_change,
+    vibration,
 )
 
 CAUSES: Mapping[str, _Cause] = MappingProxyType(
@@ -35,6 +36,7 @@ CAUSES: Mapping[str, _Cause] = MappingProxyType(
             supply,
             cross_axis,
             shared,
+            vibration,
             ramp,
             step,
             turn_on,

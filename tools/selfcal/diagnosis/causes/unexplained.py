@@ -8,5 +8,6 @@ CAUSE = Cause(
     "unexplained",
     "The readings differ from every model tried, and no known cause explains it.",
     "Record again: if the statistic stands out a second time, it is the sensor's own.",
+    most=1,
     no_gain="no model was extended",
 )
