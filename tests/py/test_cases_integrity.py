@@ -193,6 +193,67 @@ def test_clipped_readings_are_said_and_spoil_nothing(share: float, both: bool, r
     held.check()
 
 
+@pytest.mark.parametrize(
+    ("share", "rate", "q", "at", "K"),
+    [(0.02, 100.0, 0.05, 0.0, 0.0), (0.004, 50.0, 0.0, 0.0, 4e-3), (0.09, 20.0, 0.01, -7.5, 4e-3),
+     (0.15, 100.0, 0.0, 32.768, 0.0)],
+)  # fmt: skip
+def test_lost_words_are_named_and_spoil_nothing(share: float, rate: float, q: float, at: float, K: float) -> None:
+    """A share of the readings is one value, 8 times the noise from the bias or farther: the mask is those rows, and
+    N, K and the bias are those of the others. `diagnose` names them in means, and at the full rate."""
+    held = Held()
+    for seed in range(case_records(2, 120)):
+        random = np.random.default_rng([14, seed, round(1000 * share)])
+        y, bias = noise(random, round(400 * rate), rate, K)
+        far = 8.0 * 0.04 * math.sqrt(rate)
+        y, bias = (one + (at + math.copysign(far, bias[-1] - at) - bias[-1] if abs(bias[-1] - at) < far else 0.0)
+                   for one in (y, bias))  # fmt: skip
+        y = np.rint(y / q) * q if q else y
+        lost = random.uniform(size=y.size) < share
+        y[lost] = at
+        recording = a_recording(y, rate)
+        assert "outliers" in held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + q * q / 12.0 / rate), K)
+        found = look(recording, "gx", GYRO).recurring
+        assert found is not None and found.value == at
+        np.testing.assert_array_equal(found.mask, lost)
+        if seed == 0:
+            for decimate in (1.0, None) if rate < 50.0 or case_records(0, 1) else (1.0,):
+                one = diagnose_record(of_recording(recording, MODEL, decimate), ["gx"])["gx"]
+                assert [finding.look.cause for finding in one.findings] == ["outliers"]
+    held.check()
+
+
+#: What moves readings far off, and is no lost word: n, noise, random numbers -> what is added.
+FAR: dict[str, Callable[[int, np.random.Generator], Array]] = {
+    "nothing": lambda n, random: np.zeros(n),
+    "step": lambda n, random: 20.0 * (np.arange(n) > n // 2),
+    "motion": lambda n, random: 60.0 * np.sin(np.arange(n) / 9.0) * (np.abs(np.arange(n) - n // 3) < 300),
+    "line": lambda n, random: 30.0 * np.sin(0.082 * np.arange(n)),
+    "outliers": lambda n, random: np.where(random.uniform(size=n) < 0.02, 15.0 * random.normal(size=n), 0.0),
+    "tails": lambda n, random: random.standard_t(3, n),
+    "two levels": lambda n, random: 8.0 * (np.arange(n) // 1700 % 2),
+}
+
+
+@pytest.mark.parametrize("kind", FAR)
+def test_far_readings_are_not_taken_for_lost_words(kind: str) -> None:
+    """On fine and coarse lattices and without one, with few digits, clipped at the rails of the part in motion: at most
+    1 of 200 records."""
+    records, fired = case_records(6, 200), 0
+    for seed in range(records):
+        random = np.random.default_rng([15, seed])
+        n = int(random.choice([3000, 20_000, 60_000]))
+        drift = np.cumsum(random.choice([0.0, 1e-3, 1e-2]) * random.normal(size=n))
+        y = random.uniform(-30.0, 30.0) + random.normal(size=n) + drift + FAR[kind](n, random)
+        if kind in ("motion", "two levels"):
+            y = np.clip(y, *np.quantile(y, [0.002, 0.998]))
+        q = float(random.choice([0.0, 0.05, 0.3, 1.0, 2.0, 3.0]))
+        y = np.rint(y / q) * q if q else y
+        y = 0.37 * (np.array([float(f"{value:.4g}") for value in y]) if seed % 4 == 0 else y)
+        fired += look(a_recording(y, 100.0), "gx", GYRO).recurring is not None
+    assert fired <= records // 200
+
+
 def test_clipping_at_the_models_range_is_clipping_too() -> None:
     """A range that the model states: readings at it are clipped, and those beyond it are none."""
     y, bias = noise(np.random.default_rng(5), 40_000, 100.0)

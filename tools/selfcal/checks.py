@@ -66,6 +66,7 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
 
     `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
     recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
+    `outliers`, if far ones recur at one value: their share, and the value `at` which.
     `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the change of the
     sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
@@ -78,6 +79,9 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     if readings.clipped is not None:
         share = float(readings.clipped.mask.mean())
         checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}
+    if readings.recurring is not None:
+        share = float(readings.recurring.mask.mean())
+        checks["outliers"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.recurring.value * factor}
     if as_fed:
         if readings.stuck.any():
             checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}

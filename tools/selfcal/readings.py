@@ -36,6 +36,11 @@ RUNS_LEAST = 50
 LN_STUCK = math.log(1e-9)
 #: Samples on either side that make the level of one.
 AROUND = 32
+#: Far readings that are one value: how many at least, candidates that are looked at, neighbours on either side that
+#: make their level, how far off they are in the noise and how far their neighbours may be, and the evidence, nats.
+RECURS_LEAST, RECURS_LOOKED, RECURS_AROUND, RECURS_FAR, RECURS_NEAR, RECURS_NATS = 5, 6, 8, 5.0, 3.0, 16.0
+#: Steps that their noise is taken of, about, and readings of a candidate that are looked at first, at most.
+RECURS_STEPS, RECURS_SHOWN = 50_000, 500
 #: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
 CLIPPED_LEAST = -math.log(5e-4)
 #: A reading that bears less than this share of an unclipped one's information bears none.
@@ -74,10 +79,20 @@ class Clipped:
 
 
 @dataclass(frozen=True)
+class Recurring:
+    """Readings far from their level that are one `value`: the `mask` [n], and the evidence in nats. A bus that loses a
+    word makes them."""
+
+    value: float
+    mask: Mask
+    nats: float
+
+
+@dataclass(frozen=True)
 class Readings:
-    """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck`. `working` [n] are
-    those to average: clipped ones give their information to others (see `_unclipped`). In `drawn` [n] a clipped one is
-    drawn by chance beyond its limit. `kept_out` counts both kinds.
+    """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
+    `working` [n] are those to average: clipped ones give their information to others (see `_unclipped`). In `drawn` [n]
+    a clipped one is drawn by chance beyond its limit. `kept_out` counts all three kinds.
 
     `recording`: of the part's own readings, [n] rows. `held_hz`: the rate of the part, where the logger asked oftener.
     """
@@ -90,13 +105,14 @@ class Readings:
     stuck: Mask
     stuck_nats: float = 0.0
     clipped: Clipped | None = None
+    recurring: Recurring | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held_hz: float | None = None
     change: RateChange | None = None
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
         """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
-        found = {reason: count + self.kept_out.get(reason, 0) for reason, count in kept_out.items()}
+        found = {**self.kept_out, **{key: count + self.kept_out.get(key, 0) for key, count in kept_out.items()}}
         return {**found, "not_finite": found["not_finite"] - int((~np.isfinite(self.working)).sum())}
 
     @property
@@ -131,8 +147,11 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     inside = np.abs(values) <= (group.range * (1.0 + 1e-6) if group.range > 0.0 else math.inf)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none)
-    lattice = lattice_of(values[inside], recording.rate_hz)
     sound = values if inside.all() else np.where(inside, values, np.nan)
+    recurring = _recurring(sound, recording.rate_hz)
+    if recurring is not None:
+        values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
+    lattice = lattice_of(sound[np.isfinite(sound)], recording.rate_hz)
     stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
         values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
@@ -142,7 +161,9 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         working, drawn = _unclipped(sound, clipped, lattice)
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": lost, "stuck": int(stuck.sum())}
-    return Readings(recording, values, working, drawn, lattice, stuck, nats, clipped, counts)
+    if recurring is not None:
+        counts["outliers"] = int(recurring.mask.sum())
+    return Readings(recording, values, working, drawn, lattice, stuck, nats, clipped, recurring, counts)
 
 
 def _stretches(mask: Mask) -> list[tuple[int, int]]:
@@ -354,6 +375,65 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
         return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
     nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
     return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
+
+
+# --------------------------------------------------------------------------------------------------- recurring readings
+
+
+def _recurring(values: Array, rate_hz: float) -> Recurring | None:
+    """Readings [n] of one value, each far from the level of its neighbours, where that lattice of theirs has no reason
+    to come to this value so often.
+
+    A value counts where its neighbours rest: in motion a part comes to its limits. The evidence is that of its count
+    over the count of a cell about it (Poisson).
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows]
+    if y.size < 8 * RECURS_AROUND:
+        return None
+    steps = np.abs(np.diff(y))
+    # Lost words are in fewer than two fifths of the steps; on a lattice coarser than the noise most steps are none.
+    some = steps[:: max(1, steps.size // RECURS_STEPS)]
+    sigma = max(float(np.median(some)) / 0.6745, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
+    jump = steps > (RECURS_FAR - 1.0) * sigma
+    if not sigma > 0.0 or np.count_nonzero(jump) < RECURS_LEAST:
+        return None
+    jumps = np.unique(np.concatenate([np.flatnonzero(jump), np.flatnonzero(jump) + 1]))
+    unique, counts = np.unique(y[jumps], return_counts=True)
+    beside = np.delete(np.arange(-RECURS_AROUND, RECURS_AROUND + 1), RECURS_AROUND)
+    best: Recurring | None = None
+    for place in np.argsort(-counts, kind="stable")[:RECURS_LOOKED]:
+        value = float(unique[place])
+        if counts[place] < RECURS_LEAST:
+            break
+        some = jumps[y[jumps] == value][:RECURS_SHOWN]
+        about = y[np.clip(some[:, None] + beside, 0, y.size - 1)]
+        if not np.median(np.abs(value - np.median(about, axis=1))) > RECURS_FAR * sigma:
+            continue  # of the noise, as most are
+        own = y == value
+        others = np.flatnonzero(~own)
+        at = np.flatnonzero(own)
+        if others.size < 2 * at.size:
+            continue
+        # The same number of other readings on either side.
+        first = np.clip(np.searchsorted(others, at) - RECURS_AROUND, 0, others.size - 2 * RECURS_AROUND)
+        around = y[others[first[:, None] + np.arange(2 * RECURS_AROUND)]]
+        level = np.median(around, axis=1)
+        near = np.quantile(np.abs(around - level[:, None]), 0.75, axis=1) < RECURS_NEAR * sigma
+        far = np.abs(value - level) > RECURS_FAR * sigma
+        count = int((near & far).sum())
+        if count < RECURS_LEAST or 2 * count < at.size:
+            continue
+        lattice = lattice_of(y[others], rate_hz)
+        width = max(2.0 * sigma, 4.0 * lattice.step if lattice is not None else 0.0)
+        cells = 2.0 * width / lattice.step if lattice is not None else 20.0
+        expected = (np.count_nonzero(np.abs(y[others] - value) < width) + 1.0) / cells
+        nats = count * math.log(count / expected) - count + expected - math.log(unique.size)
+        if count > expected and nats > RECURS_NATS and (best is None or nats > best.nats):
+            mask = np.zeros(values.size, bool)
+            mask[rows[at[far]]] = True
+            best = Recurring(value, mask, min(1e6, float(nats)))
+    return best
 
 
 # ----------------------------------------------------------------------------------------------------- clipped readings

@@ -119,6 +119,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {bias['unit']} apart"
                 meaning = "noise is below that, N includes the rounding, the bias may stick"
                 failed.append(f"not adequate: {name}: lattice: {step}: {meaning}")
+            elif not outcome["passed"] and check == "outliers":
+                share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
+                failed.append(f"not adequate: {name}: outliers: {share}, far from the rest: lost words of the bus?")
             elif not outcome["passed"] and not check.startswith("allan_"):
                 failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
         off = [

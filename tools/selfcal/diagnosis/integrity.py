@@ -127,6 +127,21 @@ def held_samples(record: Record, axis: str) -> Look | None:
     return Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
 
 
+def recurring(record: Record, axis: str) -> Look | None:
+    """Far readings that are one value."""
+    readings = record.readings.get(axis)
+    if readings is None or readings.recurring is None:
+        return None
+    mask, nats = readings.recurring.mask, readings.recurring.nats
+    times = readings.recording.time_s[mask]
+    share = float(mask.mean())
+    estimate = {
+        "fraction": interval(share, math.sqrt(share / mask.size), "1"),
+        "time_s": interval(float(times[0]), 0.0, "s"),
+    }
+    return Look("outliers", nats, nats, estimate, {}, when=(float(times[0]), float(times[-1])))
+
+
 def stuck(record: Record, axis: str) -> Look | None:
     """Stretches of equal readings that are no chance."""
     readings = record.readings.get(axis)

@@ -152,7 +152,7 @@ def _integrity(
         if changed is not None:
             others = tuple(other for other in found if other != name)
             one.findings.append(Finding(changed, 0, one.state, one.state, shared_with=others))
-        for found_at in (integrity.held_samples(record, name), integrity.stuck(record, name)):
+        for found_at in (look(record, name) for look in (integrity.held_samples, integrity.stuck, integrity.recurring)):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
         parts = [each[name] for each in (handled, moved) if name in each]

@@ -45,6 +45,8 @@ def gain(
     cause = CAUSES[look.cause]
     if cause.no_gain:
         return None, cause.no_gain
+    if before is after:
+        return None, "the readings are left out before and after: the model of the noise is the same"
     n = before.y.size
     split = n // 2
     if cause.together is not None and partner is not None:

@@ -125,8 +125,9 @@ def identify(
             for name, cause in suspicions(recording, loaded_model, doubtful).items():
                 document["axes"][name]["suspicion"] = cause
             for name in doubtful:
-                if "saturation" in document["axes"][name]["checks"]:
-                    document["axes"][name]["suspicion"] = "saturation"
+                for cause in ("outliers", "saturation"):  # shown by the readings themselves
+                    if cause in document["axes"][name]["checks"]:
+                        document["axes"][name]["suspicion"] = cause
             if model is None:
                 progress.update(task, description="more laws")
                 _weigh_more_laws(document, recording, doubtful)
