@@ -32,8 +32,8 @@ SLOWEST = 0.99
 class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `missing` samples of the
-    recording, at its own rate `recorded_hz`. `start_s`: where
-    in the recording the grid begins, s; every time here counts from it."""
+    recording, at its own rate `recorded_hz`. `moving` [n]: the raw readings of an axis show that the sensor moved.
+    `start_s`: where in the recording the grid begins, s; every time here counts from it."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -46,6 +46,7 @@ class Record:
     change: RateChange | None = None
     unclipped: Mapping[str, Array] = field(default_factory=dict)
     start_s: float = 0.0
+    moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
 
     @property
     def time_s(self) -> Array:
@@ -83,13 +84,17 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             "take a lower --decimate"
         )
 
+    def cell_of(clock: Clock) -> Rows:
+        """The cell of the grid that each sample of a clock falls in."""
+        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
+        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
+        found: Rows = np.floor((clock.place + shift + 1e-6) / (clock.rate_hz * dt)).astype(np.int64)
+        return found
+
     def on_grid(clock: Clock, values: Array) -> tuple[Array, Array]:
         """Means [n] of the values of a clock, NaN where half of a cell's samples are missing; samples of a cell over
         those that are there [n]."""
-        expected = clock.rate_hz * dt
-        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
-        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
-        index = np.floor((clock.place + shift + 1e-6) / expected).astype(np.int64)
+        expected, index = clock.rate_hz * dt, cell_of(clock)
         kept = (index >= 0) & (index < n) & np.isfinite(values)
         used = np.bincount(index[kept], minlength=n)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -116,6 +121,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     states: dict[str, State] = {}
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
+    moving = np.zeros(n, bool)
     for name in known:
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
@@ -144,6 +150,10 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if np.isfinite(y).sum() < LEAST:
             continue
         read[name] = one
+        if one.moving.any():
+            # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
+            cells = cell_of(clock)[spread(one.moving.astype(np.float64)) > 0.0]
+            moving[cells[(cells >= 0) & (cells < n)]] = True
         found = one.lattice
         level = float(np.nanmedian(y))
         if each == 1 and one.clipped is not None:
@@ -181,6 +191,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         change,
         unclipped,
         recording.start_s,
+        moving,
     )
 
 
