@@ -67,6 +67,7 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
     recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if far ones recur at one value: their share, and the value `at` which.
+    `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
     `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the change of the
     sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
@@ -82,6 +83,10 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     if readings.recurring is not None:
         share = float(readings.recurring.mask.mean())
         checks["outliers"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.recurring.value * factor}
+    if readings.moved is not None:
+        share, start_s = float(readings.moving.mean()), readings.recording.start_s
+        times = [[a + start_s, b + start_s] for a, b in readings.moved.intervals]
+        checks["motion"] = {"value": share, "limit": 0.0, "passed": False, "intervals": times}
     if as_fed:
         if readings.stuck.any():
             checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}

@@ -1,4 +1,4 @@
-"""What the readings of a recording show by themselves: a change of rate, held, stuck and clipped ones.
+"""What the readings of a recording show by themselves: a change of rate, motion, held, stuck and clipped ones.
 
 None of it needs a fit. `identify` and `diagnose` look at it once, at the recording's own rate, whatever they average.
 """
@@ -17,6 +17,7 @@ from scipy.special import log_ndtr, ndtr, ndtri_exp
 
 from selfcal.lattice import Lattice, lattice_of
 from selfcal.model import Group
+from selfcal.motion import Moved, loud
 from selfcal.recording import Column, Recording
 from selfcal.sampling import rate_change
 
@@ -30,6 +31,8 @@ CLOCK_LEAST = 1e-3
 SLOPES, SLOPES_LEAST = 10, 8.0
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 0.5, 3e-3
+#: Longest gap that motion is looked for across, s.
+GAP_MOST_S = 240.0
 #: Runs of equal readings that show held ones at least.
 RUNS_LEAST = 50
 #: ln of the probability, a record, of a run of equal readings that is no chance.
@@ -91,8 +94,9 @@ class Recurring:
 @dataclass(frozen=True)
 class Readings:
     """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
-    `working` [n] are those to average: clipped ones give their information to others (see `_unclipped`). In `drawn` [n]
-    a clipped one is drawn by chance beyond its limit. `kept_out` counts all three kinds.
+    `working` [n] are those to average: NaN where the sensor is `moving` [n], and clipped ones give their information to
+    others (see `_unclipped`). In `drawn` [n] a clipped one is drawn by chance beyond its limit. `kept_out` counts the
+    stuck, the recurring and the clipped ones.
 
     `recording`: of the part's own readings, [n] rows. `held_hz`: the rate of the part, where the logger asked oftener.
     """
@@ -103,9 +107,11 @@ class Readings:
     drawn: Array
     lattice: Lattice | None
     stuck: Mask
+    moving: Mask
     stuck_nats: float = 0.0
     clipped: Clipped | None = None
     recurring: Recurring | None = None
+    moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held_hz: float | None = None
     change: RateChange | None = None
@@ -127,9 +133,7 @@ class Readings:
     @property
     def intervals(self) -> list[list[float]]:
         """Start and end of every stuck stretch, s."""
-        time = self.recording.time_s
-        step = 1.0 / self.recording.rate_hz
-        return [[float(time[a]), float(time[b - 1]) + step] for a, b in _stretches(self.stuck)]
+        return [list(interval) for interval in _intervals(self.recording, self.stuck)]
 
 
 def look(recording: Recording, axis: str, group: Group) -> Readings:
@@ -146,7 +150,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     # Readings beyond the part's range are none: the engines leave them out.
     inside = np.abs(values) <= (group.range * (1.0 + 1e-6) if group.range > 0.0 else math.inf)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
-        return Readings(recording, values, values, values, None, none)
+        return Readings(recording, values, values, values, None, none, none)
     sound = values if inside.all() else np.where(inside, values, np.nan)
     recurring = _recurring(sound, recording.rate_hz)
     if recurring is not None:
@@ -156,20 +160,51 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if stuck.any():
         values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
     clipped = _clipped(sound, lattice)
+    whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
+    moving, moved = _moving(recording, whole, lattice)
+    if moving.any():
+        sound = np.where(moving, np.nan, sound)
+        clipped = _clipped(sound, lattice)
     working = drawn = values
     if clipped is not None:
         working, drawn = _unclipped(sound, clipped, lattice)
+    if moving.any():
+        working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": lost, "stuck": int(stuck.sum())}
     if recurring is not None:
         counts["outliers"] = int(recurring.mask.sum())
-    return Readings(recording, values, working, drawn, lattice, stuck, nats, clipped, recurring, counts)
+    return Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
 
 
 def _stretches(mask: Mask) -> list[tuple[int, int]]:
     """First row and the row after the last of every stretch of a mask [n]."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
+    """Start and end of every stretch of a mask [n], s."""
+    time, step = recording.time_s, 1.0 / recording.rate_hz
+    return [(float(time[a]), float(time[b - 1]) + step) for a, b in _stretches(mask)]
+
+
+def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
+    """Rows [n] in which values [n], NaN where they are none, show that the sensor moved, and its motion. A gap is no
+    longer than those that matter."""
+    rate = recording.rate_hz
+    place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
+    place -= place[0]
+    even = np.full(int(place[-1]) + 1, np.nan)
+    even[place] = values
+    mask = np.zeros(even.size, bool)
+    found = loud(even, rate, lattice.step if lattice is not None else 0.0)
+    if found is None:
+        return mask[place], None
+    for begin_s, end_s in found.intervals:
+        mask[round(begin_s * rate) : round(end_s * rate)] = True
+    mask = mask[place]
+    return mask, replace(found, intervals=tuple(_intervals(recording, mask)))
 
 
 # ------------------------------------------------------------------------------------------------------ change of rate

@@ -194,6 +194,16 @@ class Recording:
             )
         return self.with_rows(kept)
 
+    def without(self, moved: Sequence[Sequence[float]]) -> Recording:
+        """The recording without stretches of motion, each from and before a time, seconds of the recording."""
+        if not moved:
+            return self
+        time, half = self.start_s + self.time_s, 0.5 / self.rate_hz
+        kept = np.ones(self.samples, bool)
+        for begin_s, end_s in moved:
+            kept &= (time < begin_s - half) | (time > end_s - half)
+        return self.with_rows(kept, moving=True)
+
     def in_unit(self, name: str, unit: str) -> NDArray[np.float64]:
         """float64[n]: a column in `unit`. Raises UserError if it is absent or of another kind."""
         if name not in self.columns:

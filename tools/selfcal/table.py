@@ -20,6 +20,8 @@ from selfcal.laws import RATIOS
 TABLE_WIDTH = 140
 #: Laws of smaller probability are not spoken of where the grid does not bear them.
 TOLD_OF = 0.01
+#: Stretches of motion that are listed at most.
+TIMES_MOST = 4
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
@@ -122,6 +124,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             elif not outcome["passed"] and check == "outliers":
                 share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
                 failed.append(f"not adequate: {name}: outliers: {share}, far from the rest: lost words of the bus?")
+            elif not outcome["passed"] and check == "motion":
+                times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
+                more = len(outcome["intervals"]) - TIMES_MOST
+                times += f" and {more} more" if more > 0 else ""
+                failed.append(f"not adequate: {name}: motion, left out: {times}")
             elif not outcome["passed"] and not check.startswith("allan_"):
                 failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
         off = [

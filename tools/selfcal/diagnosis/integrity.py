@@ -12,10 +12,10 @@ from scipy.special import ndtr
 from scipy.stats import poisson
 
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
-from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
 from selfcal.diagnosis.statemodel import Array, Mask
+from selfcal.motion import Moved
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
@@ -222,7 +222,8 @@ def motion(record: Record, wild: Mapping[str, float]) -> tuple[dict[str, Moved],
         if _louder(power, joined, kind) < KIND_LEAST or _louder(power, joined, np.arange(len(names)) == k) < 0.0:
             continue
         shown = [(a, b) for a, b in joined if _shares(power[:, a:b], k)] or joined
-        found[name] = Moved(tuple(shown), sum(_burst(power[k, a:b]) for a, b in joined), whole)
+        times = tuple((a / rate, b / rate) for a, b in shown)
+        found[name] = Moved(times, sum(_burst(power[k, a:b]) for a, b in joined), whole)
     if len(found) < 2:
         return {}, mask
     for a, b in joined:

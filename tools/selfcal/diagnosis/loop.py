@@ -11,12 +11,12 @@ from dataclasses import replace
 from selfcal.diagnosis import integrity, score, work
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
-from selfcal.diagnosis.causes.motion import Moved
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import combined, judged
 from selfcal.ending import Stopped
+from selfcal.motion import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(dict.fromkeys(cause.looks for cause in CAUSES.values() if cause.looks is not None))
@@ -51,8 +51,10 @@ def diagnose_record(
     are `unfinished`. So is an axis whose work is spent (work.py), with what was found until then."""
     found = {} if found is None else found
     advance("fit")
-    handled, mask = motion.handled(record.axes, record.rate_hz)
-    quiet = {name: integrity.masked(state, mask) if handled else state for name, state in record.axes.items()}
+    handled = {name: one.moved for name, one in record.readings.items() if one.moved is not None}
+    quiet = dict(record.axes)
+    if handled:
+        quiet = {name: integrity.masked(state, record.moving) for name, state in quiet.items()}
     states = dict(zip(quiet, work.each(lambda state: state.refit(), quiet.values()), strict=True))
     shown = [name for name in handled if name in axes]
     spoilt = dict(zip(shown, work.each(lambda name: record.axes[name].refit(), shown), strict=True))
@@ -156,7 +158,7 @@ def _integrity(
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
         parts = [each[name] for each in (handled, moved) if name in each]
-        look = motion.look_of(parts, record.rate_hz) if parts else None
+        look = motion.look_of(parts) if parts else None
         if look is not None and (name in handled or not _harms(look, one.state, states[name], record)):
             shared = tuple(other for other in {**handled, **moved} if other != name)
             one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))

@@ -44,7 +44,8 @@ class Record:
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `present` [n]: where the grid
     has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
     the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it.
-    `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded."""
+    `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded. `moving` [n]: the raw readings
+    of an axis show that the sensor moved."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -58,6 +59,7 @@ class Record:
     unclipped: Mapping[str, Array] = field(default_factory=dict)
     start_s: float = 0.0
     roughness: Mapping[str, Array] = field(default_factory=dict)
+    moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
 
     @property
     def time_s(self) -> Array:
@@ -110,13 +112,17 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             "take a lower --decimate"
         )
 
+    def cell_of(clock: Clock) -> Rows:
+        """The cell of the grid that each sample of a clock falls in."""
+        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
+        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
+        found: Rows = np.floor((clock.place + shift + 1e-6) / (clock.rate_hz * dt)).astype(np.int64)
+        return found
+
     def on_grid(clock: Clock, values: Array) -> tuple[Array, Array]:
         """Means [n] of the values of a clock, NaN where half of a cell's samples are missing; samples of a cell over
         those that are there [n]."""
-        expected = clock.rate_hz * dt
-        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
-        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
-        index = np.floor((clock.place + shift + 1e-6) / expected).astype(np.int64)
+        expected, index = clock.rate_hz * dt, cell_of(clock)
         kept = (index >= 0) & (index < n) & np.isfinite(values)
         used = np.bincount(index[kept], minlength=n)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -159,6 +165,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
     roughness: dict[str, Array] = {}
+    moving = np.zeros(n, bool)
     for name in known:
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
@@ -190,6 +197,10 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         lost = missing(recording.clock_of(name))
         if lost is not None:
             gone[name] = lost
+        if one.moving.any():
+            # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
+            cells = cell_of(clock)[spread(one.moving.astype(np.float64)) > 0.0]
+            moving[cells[(cells >= 0) & (cells < n)]] = True
         found = one.lattice
         level = float(np.nanmedian(y))
         alone = recording.along(name)
@@ -232,6 +243,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         unclipped,
         recording.start_s,
         roughness,
+        moving,
     )
 
 

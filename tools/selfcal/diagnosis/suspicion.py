@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from selfcal.diagnosis.fit import ROUGH_FTOL
+from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.state import NET_LEAST
@@ -28,7 +29,8 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
     for name in axes:
         if name not in record.axes or record.axes[name].below_lattice:
             continue
-        state = record.axes[name].refit(ftol=ROUGH_FTOL)
+        state = record.axes[name]
+        state = (masked(state, record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
         best = max((look for cause in LOOKS for look in cause(state, record)), key=lambda look: look.net, default=None)
         if best is not None and best.net >= NET_LEAST:
             found[name] = best.cause

@@ -221,12 +221,14 @@ def _why_not(recording: Recording, model: Model, record: Record, name: str) -> s
 
 
 def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model, ending: Held) -> None:
-    """What the extended model knows of each axis, as `identify` tells it; null where the sensor moved, where the record
-    bears no report, and after a signal."""
-    for name, axis in document["axes"].items():
-        if "error" not in axis:
-            moved = any(finding["cause"] == "motion" for finding in axis["findings"])
-            axis["posterior"] = None if moved or ending.asked else _posterior(recording, name, model)
+    """What the extended model knows of each axis at rest, as `identify` tells it; null where the record bears no
+    report, and after a signal."""
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    findings = [finding for axis in axes.values() for finding in axis["findings"]]
+    moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
+    rest = recording.without(moved)
+    for name, axis in axes.items():
+        axis["posterior"] = None if ending.asked else _posterior(rest, name, model)
 
 
 def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] | None:

@@ -125,7 +125,7 @@ def identify(
             for name, cause in suspicions(recording, loaded_model, doubtful).items():
                 document["axes"][name]["suspicion"] = cause
             for name in doubtful:
-                for cause in ("outliers", "saturation"):  # shown by the readings themselves
+                for cause in ("outliers", "saturation", "motion"):  # shown by the readings themselves
                     if cause in document["axes"][name]["checks"]:
                         document["axes"][name]["suspicion"] = cause
             if model is None:
@@ -271,7 +271,7 @@ def identify_axis(
                 )
             )
             advance()
-    kept = kept_out_of(blocks, recording)
+    kept = kept_out_of(blocks, recording, int(readings.moving.sum()))
     if not regressors:
         judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit)
         curve = curve_of_samples(samples) if draw else None
@@ -287,9 +287,9 @@ def identify_axis(
     return Identified(unit, group.unit, scored.result, judged, kept, scored, curve)
 
 
-def kept_out_of(blocks: Blocks, recording: Recording) -> dict[str, int]:
-    """Samples that were not used, by reason."""
-    moving = {"moving": recording.moving} if recording.moving else {}
+def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:
+    """Samples that were not used, by reason; `moved` of them for motion that the readings show."""
+    moving = {"moving": recording.moving + moved} if recording.moving + moved else {}
     return {**blocks.kept_out, "missing": recording.lost, **moving}
 
 
