@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-from selfcal.diagnosis.fit import Series, fit, ln_likelihood
+from selfcal.diagnosis.fit import Series, finish, fit, ln_likelihood, slopes
 from selfcal.diagnosis.fit import run as run_filter
 from selfcal.diagnosis.statemodel import Terms, matrices
 from selfcal.errors import UserError
@@ -105,6 +106,51 @@ def test_a_column_of_zeros_has_no_coefficient() -> None:
     )
     assert beside[0] == pytest.approx([*without[0], 0.0], rel=1e-9)
     assert beside[2] == pytest.approx(without[2])
+
+
+SLOPED = [
+    (Terms(walk=True), [-4.0]),
+    (Terms(markov=True), [-2.0, -3.0]),
+    (Terms(walk=True, flicker=True, color="ma"), [-4.0, -2.0, 0.3]),
+    (Terms(markov=True, color="ar"), [-1.0, -3.0, -0.2]),
+    (Terms(walk=True, markov=True, bands=((0.1, 0.01, -0.5),), trial=0.2), [-4.0, -2.0, -3.0, -1.0, -3.0, 0.02]),
+]
+
+
+def uneven(n: int, random: np.random.Generator) -> Series:
+    """A record with a drift, a gap, louder noise from its middle on, and a second column."""
+    y = random.standard_normal(n) + 0.03 * random.standard_normal(n).cumsum()
+    y[n // 5 : n // 5 + 40] = np.nan
+    r = np.where(np.arange(n) < n // 2, 1.0, 2.0)
+    return Series(y, 0.5, r, np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)]))
+
+
+@pytest.mark.parametrize(("terms", "at"), SLOPED)
+def test_slopes_are_those_of_the_likelihood(terms: Terms, at: list[float]) -> None:
+    """Truth: central differences of ln likelihood over 1e-3, which are off by a share of 1e-6 of its third derivative.
+
+    ln likelihood has errors of 1e-6 where the filter keeps its gain: 1e-3 in these differences."""
+    series, theta = uneven(3000, np.random.default_rng(5)), np.array(at)
+    slope, information = slopes(series, finish(series, terms, theta))
+    moves = 1e-3 * np.eye(theta.size)
+    around = [[finish(series, terms, theta + sign * move).ln_likelihood for sign in (1.0, -1.0)] for move in moves]
+    assert slope == pytest.approx([(ahead - back) / 2e-3 for ahead, back in around], rel=1e-4, abs=2e-2)
+    assert (np.linalg.eigvalsh(information) > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("terms", "at"), SLOPED[:4])
+def test_no_likelier_parameters_than_the_fitted_ones(terms: Terms, at: list[float], seed: int) -> None:
+    """Truth: the simplex method of scipy, from the fit and from elsewhere. A fit may be 0.05 nats below."""
+    series = uneven(1500, np.random.default_rng(seed))
+    found = fit(series, terms, np.array(at))
+    limits = terms.limits(series.dt)
+
+    def cost(theta: np.ndarray) -> float:
+        return -finish(series, terms, np.clip(theta, *np.transpose(limits))).ln_likelihood
+
+    best = min(minimize(cost, start, method="Nelder-Mead", bounds=limits).fun for start in (found.theta, np.array(at)))
+    assert found.ln_likelihood > -best - 0.05
 
 
 def test_a_fit_finds_the_parameters() -> None:

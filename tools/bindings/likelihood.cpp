@@ -15,6 +15,7 @@
 #include <cstring>
 #include <memory>
 #include <stdexcept>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -24,10 +25,12 @@ namespace {
 
 using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Matrix = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Cube = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, double>;
 
 constexpr int states_max = 24;
 constexpr int columns_max = 40;
+constexpr std::size_t parameters_max = 8;
 // The covariance counts as settled after this many samples in a row that change s by less than `settled` of itself.
 constexpr int settled_samples = 8;
 constexpr double settled = 1e-12;
@@ -49,16 +52,87 @@ constexpr std::size_t piece_most = 128, piece_least = 8;
 // States up to which the groups' chains are interleaved.
 constexpr int beside = 4;
 
+// A number and its derivatives by up to V * width parameters.
+template <int V> struct Dual {
+    static constexpr int vectors = V;
+    double value;
+    Lanes slopes[V];
+
+    Dual(double v = 0.0) : value(v), slopes{} {}
+
+    Dual &operator+=(const Dual &b) {
+        value += b.value;
+        for (int k = 0; k < V; k++)
+            slopes[k] += b.slopes[k];
+        return *this;
+    }
+    Dual &operator-=(const Dual &b) {
+        value -= b.value;
+        for (int k = 0; k < V; k++)
+            slopes[k] -= b.slopes[k];
+        return *this;
+    }
+    Dual &operator*=(const Dual &b) {
+        for (int k = 0; k < V; k++)
+            slopes[k] = value * b.slopes[k] + b.value * slopes[k];
+        value *= b.value;
+        return *this;
+    }
+    friend Dual operator+(Dual a, const Dual &b) { return a += b; }
+    friend Dual operator-(Dual a, const Dual &b) { return a -= b; }
+    friend Dual operator*(Dual a, const Dual &b) { return a *= b; }
+    friend Dual operator/(const Dual &a, const Dual &b) {
+        const double inverse = 1.0 / b.value;
+        return a * b.through(inverse, -inverse * inverse);
+    }
+
+    // A function of the number, by its value and its derivative there.
+    Dual through(double v, double slope) const {
+        Dual d(v);
+        for (int k = 0; k < V; k++)
+            d.slopes[k] = slope * slopes[k];
+        return d;
+    }
+    double slope(std::size_t j) const { return slopes[j / width][j % width]; }
+    bool bent() const {
+        for (std::size_t j = 0; j < V * width; j++)
+            if (slope(j) != 0.0)
+                return true;
+        return false;
+    }
+};
+
+double value_of(double a) { return a; }
+template <int V> double value_of(const Dual<V> &a) { return a.value; }
+double root(double a) { return std::sqrt(a); }
+template <int V> Dual<V> root(const Dual<V> &a) { return a.through(std::sqrt(a.value), 0.5 / std::sqrt(a.value)); }
+double ln(double a) { return std::log(a); }
+template <int V> Dual<V> ln(const Dual<V> &a) { return a.through(std::log(a.value), 1.0 / a.value); }
+
+// The matrices of a model, and their derivatives by each of `count` parameters, one after the other.
+struct Matrices {
+    const double *F, *Q, *h, *P0, *R;
+};
+
 struct Input {
     const double *y, *z, *r; // z: [p, n]
     std::size_t n;
     int columns; // 1 + p
-    const double *F, *Q, *h, *P0;
-    double R;
+    Matrices m, by;
+    std::size_t states, count;
     int driver;
     const std::size_t *marks;
     std::size_t mark_count;
 };
+
+void take(double &to, const double *values, const double *, std::size_t i, std::size_t, std::size_t) { to = values[i]; }
+
+template <int V>
+void take(Dual<V> &to, const double *values, const double *by, std::size_t i, std::size_t size, std::size_t count) {
+    to = values[i];
+    for (std::size_t j = 0; j < count; j++)
+        to.slopes[j / width][j % width] = by[j * size + i];
+}
 
 struct Sums {
     double *G;       // [marks, columns, columns]
@@ -69,10 +143,39 @@ struct Sums {
     double *s;       // [n] or null: variance of each innovation
 };
 
-template <int D> using Square = double[D][D];
+template <class T, int D> using Square = T[D][D];
+
+// The model as the filter has it: T double, or Dual for its derivatives too. Where the filter has more states than the
+// model the first ones are 0.
+template <class T, int D> struct Model {
+    Square<T, D> F = {}, Q = {}, P0 = {};
+    T h[D] = {}, R;
+    int driver;
+
+    explicit Model(const Input &in) {
+        const std::size_t d = in.states, none = D - d;
+        driver = in.driver < 0 ? -1 : in.driver + static_cast<int>(none);
+        for (std::size_t a = 0; a < d; a++) {
+            take(h[none + a], in.m.h, in.by.h, a, d, in.count);
+            for (std::size_t b = 0; b < d; b++) {
+                take(F[none + a][none + b], in.m.F, in.by.F, a * d + b, d * d, in.count);
+                take(Q[none + a][none + b], in.m.Q, in.by.Q, a * d + b, d * d, in.count);
+                take(P0[none + a][none + b], in.m.P0, in.by.P0, a * d + b, d * d, in.count);
+            }
+        }
+        take(R, in.m.R, in.by.R, 0, 1, in.count);
+    }
+};
+
+// to := from
+template <class T, int D> void copy(const Square<T, D> &from, Square<T, D> &to) {
+    for (int a = 0; a < D; a++)
+        for (int b = 0; b < D; b++)
+            to[a][b] = from[a][b];
+}
 
 // m := a b
-template <int D> void product(const Square<D> &a, const Square<D> &b, Square<D> &m) {
+template <class T, int D> void product(const Square<T, D> &a, const Square<T, D> &b, Square<T, D> &m) {
     for (int i = 0; i < D; i++) {
         for (int j = 0; j < D; j++)
             m[i][j] = 0.0;
@@ -83,15 +186,15 @@ template <int D> void product(const Square<D> &a, const Square<D> &b, Square<D> 
 }
 
 // x := (1 + b c)^-1 x, by elimination with pivots.
-template <int D> void solve(const Square<D> &b, const Square<D> &c, Square<D> &x) {
-    Square<D> m;
-    product<D>(b, c, m);
+template <class T, int D> void solve(const Square<T, D> &b, const Square<T, D> &c, Square<T, D> &x) {
+    Square<T, D> m;
+    product<T, D>(b, c, m);
     for (int i = 0; i < D; i++)
         m[i][i] += 1.0;
     for (int k = 0; k < D; k++) {
         int pivot = k;
         for (int i = k + 1; i < D; i++)
-            if (std::fabs(m[i][k]) > std::fabs(m[pivot][k]))
+            if (std::fabs(value_of(m[i][k])) > std::fabs(value_of(m[pivot][k])))
                 pivot = i;
         for (int j = 0; j < D; j++) {
             std::swap(m[k][j], m[pivot][j]);
@@ -100,7 +203,7 @@ template <int D> void solve(const Square<D> &b, const Square<D> &c, Square<D> &x
         for (int i = 0; i < D; i++) {
             if (i == k)
                 continue;
-            const double f = m[i][k] / m[k][k];
+            const T f = m[i][k] / m[k][k];
             for (int j = k; j < D; j++)
                 m[i][j] -= f * m[k][j];
             for (int j = 0; j < D; j++)
@@ -109,16 +212,17 @@ template <int D> void solve(const Square<D> &b, const Square<D> &c, Square<D> &x
     }
     for (int i = 0; i < D; i++)
         for (int j = 0; j < D; j++)
-            x[i][j] /= m[i][i];
+            x[i][j] = x[i][j] / m[i][i];
 }
 
 // m := b + a x a'
-template <int D> void congruent(const Square<D> &a, const Square<D> &x, const Square<D> &b, Square<D> &m) {
-    Square<D> ax;
-    product<D>(a, x, ax);
+template <class T, int D>
+void congruent(const Square<T, D> &a, const Square<T, D> &x, const Square<T, D> &b, Square<T, D> &m) {
+    Square<T, D> ax;
+    product<T, D>(a, x, ax);
     for (int i = 0; i < D; i++)
         for (int j = 0; j <= i; j++) {
-            double sum = 0.0;
+            T sum = 0.0;
             for (int k = 0; k < D; k++)
                 sum += ax[i][k] * a[j][k];
             m[i][j] = m[j][i] = b[i][j] + sum;
@@ -127,89 +231,114 @@ template <int D> void congruent(const Square<D> &a, const Square<D> &x, const Sq
 
 // The Riccati map of 2^doublings samples with one noise: P := B + A P (1 + C P)^-1 A' (doubling: Anderson & Moore 1979,
 // section 6.7).
-template <int D> struct Jump {
-    Square<D> A, B, C;
+template <class T, int D> struct Jump {
+    Square<T, D> A, B, C;
     double r = -1.0;
 
-    void prepare(const Input &in, double noise, int doublings) {
+    void prepare(const Model<T, D> &m, double noise, int doublings) {
         r = noise;
+        copy<T, D>(m.F, A);
+        copy<T, D>(m.Q, B);
         for (int a = 0; a < D; a++)
-            for (int b = 0; b < D; b++) {
-                A[a][b] = in.F[a * D + b];
-                B[a][b] = in.Q[a * D + b];
-                C[a][b] = in.h[a] * in.h[b] / (in.R * r);
-            }
-        if (in.driver >= 0)
-            B[in.driver][in.driver] *= r;
+            for (int b = 0; b < D; b++)
+                C[a][b] = m.h[a] * m.h[b] / (m.R * r);
+        if (m.driver >= 0)
+            B[m.driver][m.driver] = B[m.driver][m.driver] * r;
         for (int k = 0; k < doublings; k++) {
-            Square<D> X, Y, AT, CX, next;
-            std::memcpy(X, A, sizeof X); // (1 + B C)^-1 A
-            std::memcpy(Y, B, sizeof Y); // (1 + B C)^-1 B
-            solve<D>(B, C, X);
-            solve<D>(B, C, Y);
+            Square<T, D> X, Y, AT, CX, next;
+            copy<T, D>(A, X); // (1 + B C)^-1 A
+            copy<T, D>(B, Y); // (1 + B C)^-1 B
+            solve<T, D>(B, C, X);
+            solve<T, D>(B, C, Y);
             for (int a = 0; a < D; a++)
                 for (int b = 0; b < D; b++)
                     AT[a][b] = A[b][a];
-            congruent<D>(A, Y, B, next);
-            std::memcpy(B, next, sizeof B);
-            product<D>(C, X, CX);
-            product<D>(AT, CX, next);
+            congruent<T, D>(A, Y, B, next);
+            copy<T, D>(next, B);
+            product<T, D>(C, X, CX);
+            product<T, D>(AT, CX, next);
             for (int a = 0; a < D; a++)
                 for (int b = 0; b < D; b++)
                     C[a][b] += 0.5 * (next[a][b] + next[b][a]);
-            product<D>(A, X, next);
-            std::memcpy(A, next, sizeof A);
+            product<T, D>(A, X, next);
+            copy<T, D>(next, A);
         }
     }
 
-    void over(Square<D> &P) const {
-        Square<D> Y, next;
-        std::memcpy(Y, P, sizeof Y);
-        solve<D>(P, C, Y);
-        congruent<D>(A, Y, B, next);
-        std::memcpy(P, next, sizeof P);
+    void over(Square<T, D> &P) const {
+        Square<T, D> Y, next;
+        copy<T, D>(P, Y);
+        solve<T, D>(P, C, Y);
+        congruent<T, D>(A, Y, B, next);
+        copy<T, D>(next, P);
     }
 };
 
 // The filter's numbers from sample `start` on, until the next ones: F K (0 where the reading is missing), 1 / sqrt(s).
-template <int D> struct Gain {
+template <class T, int D> struct Gain {
     std::size_t start;
-    double FK[D], scale;
+    T FK[D], scale;
+};
+
+// Sums of the products of a number's derivatives.
+template <class T> struct Outer {
+    void add(const T &, double) {}
+};
+
+template <int V> struct Outer<Dual<V>> {
+    Lanes sum[V * width][V] = {};
+
+    void add(const Dual<V> &a, double weight) {
+        for (int j = 0; j < V * width; j++)
+            for (int k = 0; k < V; k++)
+                sum[j][k] += weight * a.slope(static_cast<std::size_t>(j)) * a.slopes[k];
+    }
+
+    void add(const Outer &more, double weight) {
+        for (int j = 0; j < V * width; j++)
+            for (int k = 0; k < V; k++)
+                sum[j][k] += weight * more.sum[j][k];
+    }
 };
 
 // F is block diagonal, and a step costs of the order of D. PLAIN: F is diagonal. Else the last states are pairs, as far
 // as there are blocks of two.
-template <int D, bool PLAIN> struct Filter {
+template <class T, int D, bool PLAIN> struct Filter {
     const Input &in;
     const Sums &out;
-    std::vector<Gain<D>> *const gains; // null: nobody asks for them
-    double h[D] = {}, below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
-    double P[D][D], FK[D] = {};
-    double s = 0.0, s_before = -1.0, r = -1.0, scale = 0.0, ln_now = 0.0;
+    std::vector<Gain<T, D>> *const gains; // null: nobody asks for them
+    const Model<T, D> m;
+    T below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
+    bool tied[D] = {};                          // whether the state is one of a pair
+    Square<T, D> P;
+    T FK[D] = {}, s = 0.0, scale = 0.0, ln_now = 0.0;
+    double s_before = -1.0, r = -1.0;
     int quiet = 0, slowly[stretch_count] = {};
     double since = 1.0;                 // samples since s_before
     std::size_t held = 0;               // the gain stays until this sample
     std::size_t even_from = 0, even_to; // samples known to be alike
-    Jump<D> jumps[stretch_count];
-    double x[columns_max][D] = {};
+    Jump<T, D> jumps[stretch_count];
+    static constexpr bool plain_numbers = std::is_same_v<T, double>;
+    static constexpr int most = plain_numbers ? columns_max : 1; // columns
+    T x[most][D] = {};
     std::size_t joined = 0; // samples of a piece that `left` and `over` are for; 0: for another gain
     double left[piece_most][D], over[D][D];
     Lanes nu[columns_max][piece_most][groups];
-    double G[columns_max][columns_max] = {}, ln_s = 0.0;
+    T G[most][most] = {}, ln_s = 0.0;
     std::size_t counted = 0;
+    Outer<T> innovations, spread; // of the derivatives of the innovations, over s, and of ln s
 
-    Filter(const Input &input, const Sums &output, std::vector<Gain<D>> *kept = nullptr)
-        : in(input), out(output), gains(kept), even_to(0) {
+    Filter(const Input &input, const Sums &output, std::vector<Gain<T, D>> *kept = nullptr)
+        : in(input), out(output), gains(kept), m(input), even_to(0) {
         for (int i = 0; i < D; i++) {
-            h[i] = in.h[i];
-            on[i] = in.F[i * D + i];
-            below[i] = i > 0 ? in.F[i * D + i - 1] : 0.0;
-            above[i] = i < D - 1 ? in.F[i * D + i + 1] : 0.0;
-            for (int j = 0; j < D; j++)
-                P[i][j] = in.P0[i * D + j];
+            on[i] = m.F[i][i];
+            below[i] = i > 0 ? m.F[i][i - 1] : 0.0;
+            above[i] = i < D - 1 ? m.F[i][i + 1] : 0.0;
+            tied[i] = value_of(below[i]) != 0.0 || value_of(above[i]) != 0.0;
         }
-        if (in.driver >= 0 && in.n > 0)
-            P[in.driver][in.driver] *= in.r[0];
+        copy<T, D>(m.P0, P);
+        if (m.driver >= 0 && in.n > 0)
+            P[m.driver][m.driver] = P[m.driver][m.driver] * in.r[0];
     }
 
     const double *column(int k) const { return k == 0 ? in.y : in.z + static_cast<std::size_t>(k - 1) * in.n; }
@@ -220,15 +349,15 @@ template <int D, bool PLAIN> struct Filter {
     // Covariance, gain and s of sample i; the covariance goes on to the next one.
     void covariance(std::size_t i) {
         const bool present = std::isfinite(in.y[i]);
-        double Ph[D], K[D], A[D][D], FA[D][D];
-        s = in.R * in.r[i];
+        T Ph[D], K[D], A[D][D], FA[D][D];
+        s = m.R * in.r[i];
         for (int a = 0; a < D; a++) {
             Ph[a] = 0.0;
             for (int b = 0; b < D; b++)
-                Ph[a] += P[b][a] * in.h[b];
-            s += in.h[a] * Ph[a];
+                Ph[a] += P[b][a] * m.h[b];
+            s += m.h[a] * Ph[a];
         }
-        const double inverse = present ? 1.0 / s : 0.0;
+        const T inverse = present ? T(1.0) / s : T(0.0);
         for (int a = 0; a < D; a++)
             K[a] = Ph[a] * inverse;
         for (int a = 0; a < D; a++)
@@ -236,26 +365,33 @@ template <int D, bool PLAIN> struct Filter {
                 A[a][b] = P[a][b] - K[a] * Ph[b];
         for (int a = 0; a < D; a++) {
             const int before = a > 0 ? a - 1 : 0, after = a < D - 1 ? a + 1 : a;
-            FK[a] = below[a] * K[before] + on[a] * K[a] + above[a] * K[after];
+            FK[a] = on[a] * K[a];
             for (int b = 0; b < D; b++)
-                FA[a][b] = below[a] * A[before][b] + on[a] * A[a][b] + above[a] * A[after][b];
+                FA[a][b] = on[a] * A[a][b];
+            if (!tied[a])
+                continue;
+            FK[a] += below[a] * K[before] + above[a] * K[after];
+            for (int b = 0; b < D; b++)
+                FA[a][b] += below[a] * A[before][b] + above[a] * A[after][b];
         }
         for (int a = 0; a < D; a++)
             for (int b = a; b < D; b++) {
                 const int before = b > 0 ? b - 1 : 0, after = b < D - 1 ? b + 1 : b;
-                P[a][b] = P[b][a] =
-                    in.Q[a * D + b] + FA[a][before] * below[b] + FA[a][b] * on[b] + FA[a][after] * above[b];
+                T next = m.Q[a][b] + FA[a][b] * on[b];
+                if (tied[b])
+                    next += FA[a][before] * below[b] + FA[a][after] * above[b];
+                P[a][b] = P[b][a] = next;
             }
-        if (in.driver >= 0)
-            P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[i] - 1.0);
-        scale = 1.0 / std::sqrt(s);
-        ln_now = std::log(s);
-        const double change = alike(i) ? std::fabs(s - s_before) : 2.0 * s;
-        quiet = change <= settled * since * s ? quiet + 1 : 0;
+        if (m.driver >= 0)
+            P[m.driver][m.driver] += m.Q[m.driver][m.driver] * (in.r[i] - 1.0);
+        scale = T(1.0) / root(s);
+        ln_now = ln(s);
+        const double s_now = value_of(s), change = alike(i) ? std::fabs(s_now - s_before) : 2.0 * s_now;
+        quiet = change <= settled * since * s_now ? quiet + 1 : 0;
         for (int k = 0; k < stretch_count; k++)
-            slowly[k] = change <= stretches[k].slow * since * s ? slowly[k] + 1 : 0;
+            slowly[k] = change <= stretches[k].slow * since * s_now ? slowly[k] + 1 : 0;
         since = 1.0;
-        s_before = present ? s : -1.0;
+        s_before = present ? s_now : -1.0;
         r = in.r[i];
         joined = 0;
     }
@@ -278,12 +414,12 @@ template <int D, bool PLAIN> struct Filter {
             const std::size_t length = std::size_t{1} << stretches[k].doublings;
             if (slowly[k] < settled_samples || stop - i < length || even(i, i + length) < i + length)
                 continue;
-            Square<D> before;
-            std::memcpy(before, P, sizeof before);
+            Square<T, D> before;
+            copy<T, D>(P, before);
             covariance(i);
             if (jumps[k].r != r)
-                jumps[k].prepare(in, r, stretches[k].doublings);
-            std::memcpy(P, before, sizeof P);
+                jumps[k].prepare(m, r, stretches[k].doublings);
+            copy<T, D>(before, P);
             jumps[k].over(P);
             since = static_cast<double>(length);
             held = i + length;
@@ -294,56 +430,143 @@ template <int D, bool PLAIN> struct Filter {
     }
 
     void keep(std::size_t i) {
-        Gain<D> now{i, {}, scale};
+        Gain<T, D> now{i, {}, scale};
         std::memcpy(now.FK, FK, sizeof FK);
         gains->push_back(now);
     }
 
     // X := F X + FK e
-    template <class T> void step(T (&X)[D], const T &e) const {
+    template <class U> void step(U (&X)[D], const U &e) const {
         constexpr int paired = PLAIN ? D : D % 2; // the first state in a pair
 #pragma GCC unroll 24
         for (int a = 0; a < paired; a++)
             X[a] = on[a] * X[a] + FK[a] * e;
 #pragma GCC unroll 24
         for (int a = paired; a + 1 < D; a += 2) {
-            const T first = X[a];
+            const U first = X[a];
             X[a] = on[a] * first + above[a] * X[a + 1] + FK[a] * e;
             X[a + 1] = below[a + 1] * first + on[a + 1] * X[a + 1] + FK[a + 1] * e;
         }
     }
 
     // e := value - h X
-    template <class T> void innovation(const T &value, const T (&X)[D], T &e) const {
-        T sum[4] = {value};
+    template <class U> void innovation(const U &value, const U (&X)[D], U &e) const {
+        U sum[4] = {value};
 #pragma GCC unroll 24
         for (int a = 0; a < D; a++)
-            sum[a % 4] -= h[a] * X[a];
+            sum[a % 4] -= m.h[a] * X[a];
         e = (sum[0] + sum[1]) + (sum[2] + sum[3]);
     }
 
     // No denormals: they cost a hundred times as much.
-    static double plain(double value) { return std::fabs(value) < 1e-250 ? 0.0 : value; }
+    template <class U> static U plain(const U &number) {
+        return std::fabs(value_of(number)) < 1e-250 ? U(0.0) : number;
+    }
 
     // One sample. A missing reading is 0 and moves nothing, since its gain is 0.
     void one(std::size_t i) {
         const bool present = std::isfinite(in.y[i]);
-        double e[columns_max];
+        T e[most];
         for (int k = 0; k < in.columns; k++) {
-            const double value = k == 0 && !present ? 0.0 : column(k)[i];
+            const T value = k == 0 && !present ? 0.0 : column(k)[i];
             innovation(value, x[k], e[k]);
             step(x[k], e[k]);
             for (int a = 0; a < D; a++)
                 x[k][a] = plain(x[k][a]);
-            e[k] *= scale;
+            e[k] = e[k] * scale;
         }
         if (out.white != nullptr)
             for (int k = 0; k < in.columns; k++)
-                out.white[i * in.columns + k] = present ? e[k] : std::nan("");
+                out.white[i * in.columns + k] = present ? value_of(e[k]) : std::nan("");
         if (present)
             for (int a = 0; a < in.columns; a++)
                 for (int b = 0; b <= a; b++)
                     G[a][b] += e[a] * e[b];
+    }
+
+    // The readings from `from` to `to`, of one column, all with one gain: as `one`, with values and slopes apart.
+    void alone(std::size_t from, std::size_t to) {
+        constexpr int V = T::vectors;
+        double v[D];
+        Lanes X[D][V];
+        bool bent[D]; // whether a parameter moves what F and h do with the state
+        for (int a = 0; a < D; a++) {
+            const int after = a < D - 1 ? a + 1 : a;
+            bent[a] = on[a].bent() || above[a].bent() || below[after].bent() || m.h[a].bent();
+            v[a] = x[0][a].value;
+            for (int k = 0; k < V; k++)
+                X[a][k] = x[0][a].slopes[k];
+        }
+        T sum = 0.0;
+        Outer<T> products;
+        for (std::size_t i = from; i < to; i++) {
+            double value[4] = {in.y[i]};
+            Lanes slope[4][V] = {}, moved[D][V];
+#pragma GCC unroll 4
+            for (int a = 0; a < D; a++) {
+                value[a % 4] -= m.h[a].value * v[a];
+                for (int k = 0; k < V; k++)
+                    slope[a % 4][k] -= m.h[a].value * X[a][k];
+            }
+#pragma GCC unroll 4
+            for (int a = 0; a < D; a++)
+                for (int k = 0; k < V; k++)
+                    moved[a][k] = on[a].value * X[a][k];
+            if constexpr (!PLAIN) {
+#pragma GCC unroll 4
+                for (int a = D % 2; a + 1 < D; a += 2)
+                    for (int k = 0; k < V; k++) {
+                        moved[a][k] += above[a].value * X[a + 1][k];
+                        moved[a + 1][k] += below[a + 1].value * X[a][k];
+                    }
+            }
+#pragma GCC unroll 4
+            for (int a = 0; a < D; a++)
+                if (bent[a])
+                    for (int k = 0; k < V; k++) {
+                        slope[a % 4][k] -= v[a] * m.h[a].slopes[k];
+                        moved[a][k] += v[a] * on[a].slopes[k];
+                        if (!PLAIN && a > 0)
+                            moved[a - 1][k] += v[a] * above[a - 1].slopes[k];
+                        if (!PLAIN && a < D - 1)
+                            moved[a + 1][k] += v[a] * below[a + 1].slopes[k];
+                    }
+            const double e = (value[0] + value[1]) + (value[2] + value[3]);
+            Lanes E[V];
+            for (int k = 0; k < V; k++)
+                E[k] = (slope[0][k] + slope[1][k]) + (slope[2][k] + slope[3][k]);
+#pragma GCC unroll 4
+            for (int a = 0; a < D; a++)
+                for (int k = 0; k < V; k++)
+                    X[a][k] = moved[a][k] + FK[a].value * E[k] + e * FK[a].slopes[k];
+            if constexpr (PLAIN) {
+#pragma GCC unroll 4
+                for (int a = 0; a < D; a++)
+                    v[a] = on[a].value * v[a] + FK[a].value * e;
+            } else {
+                if (D % 2 != 0)
+                    v[0] = on[0].value * v[0] + FK[0].value * e;
+#pragma GCC unroll 4
+                for (int a = D % 2; a + 1 < D; a += 2) {
+                    const double first = v[a];
+                    v[a] = on[a].value * first + above[a].value * v[a + 1] + FK[a].value * e;
+                    v[a + 1] = below[a + 1].value * first + on[a + 1].value * v[a + 1] + FK[a + 1].value * e;
+                }
+            }
+            sum.value += e * e;
+            for (int k = 0; k < V; k++)
+                sum.slopes[k] += 2.0 * e * E[k];
+            for (int j = 0; j < V * width; j++)
+                for (int k = 0; k < V; k++)
+                    products.sum[j][k] += E[j / width][j % width] * E[k];
+        }
+        for (int a = 0; a < D; a++) {
+            x[0][a].value = v[a];
+            for (int k = 0; k < V; k++)
+                x[0][a].slopes[k] = X[a][k];
+        }
+        G[0][0] += sum * (scale * scale);
+        innovations.add(products, scale.value * scale.value);
     }
 
     // How a state at the start of a piece of `length` samples acts on it, with M = F - FK h: left[i] = -h M^i on nu of
@@ -351,11 +574,11 @@ template <int D, bool PLAIN> struct Filter {
     void join(std::size_t length) {
         joined = length;
         double row[D];
-        Square<D> power, next;
+        Square<double, D> power, next;
         for (int a = 0; a < D; a++) {
-            row[a] = -h[a] * scale;
+            row[a] = -m.h[a] * scale;
             for (int b = 0; b < D; b++) {
-                power[a][b] = in.F[a * D + b] - FK[a] * h[b];
+                power[a][b] = m.F[a][b] - FK[a] * m.h[b];
                 over[a][b] = a == b ? 1.0 : 0.0;
             }
         }
@@ -367,18 +590,18 @@ template <int D, bool PLAIN> struct Filter {
             }
             for (int a = 0; a < D; a++) {
                 const double here = row[a], after = a < D - 1 ? below[a + 1] * row[a + 1] : 0.0;
-                row[a] = plain(on[a] * here + (a > 0 ? above[a - 1] : 0.0) * last + after - along * h[a]);
+                row[a] = plain(on[a] * here + (a > 0 ? above[a - 1] : 0.0) * last + after - along * m.h[a]);
                 last = here;
             }
         }
         for (std::size_t bits = length; bits != 0; bits >>= 1) {
             if ((bits & 1) != 0) {
-                product<D>(power, over, next);
-                std::memcpy(over, next, sizeof over);
+                product<double, D>(power, over, next);
+                copy<double, D>(next, over);
             }
             if (bits > 1) {
-                product<D>(power, power, next);
-                std::memcpy(power, next, sizeof power);
+                product<double, D>(power, power, next);
+                copy<double, D>(next, power);
             }
         }
     }
@@ -447,11 +670,15 @@ template <int D, bool PLAIN> struct Filter {
 
     // The samples from `from` to `to`, all with one gain.
     void advance(std::size_t from, std::size_t to) {
-        while (to - from >= lanes * piece_least) {
-            const std::size_t length = std::min(piece_most, (to - from) / lanes);
-            many(from, length);
-            from += lanes * length;
-        }
+        if constexpr (!plain_numbers) {
+            if (std::isfinite(in.y[from]))
+                return alone(from, to);
+        } else
+            while (to - from >= lanes * piece_least) {
+                const std::size_t length = std::min(piece_most, (to - from) / lanes);
+                many(from, length);
+                from += lanes * length;
+            }
         for (; from < to; from++)
             one(from);
     }
@@ -459,11 +686,11 @@ template <int D, bool PLAIN> struct Filter {
     void leave(std::size_t mark) const {
         for (int a = 0; a < in.columns; a++)
             for (int b = 0; b < in.columns; b++)
-                out.G[(mark * in.columns + a) * in.columns + b] = a >= b ? G[a][b] : G[b][a];
+                out.G[(mark * in.columns + a) * in.columns + b] = value_of(a >= b ? G[a][b] : G[b][a]);
         for (int k = 0; k < in.columns; k++)
             for (int a = 0; a < D; a++)
-                out.x[(mark * in.columns + k) * D + a] = x[k][a];
-        out.D[mark] = ln_s;
+                out.x[(mark * in.columns + k) * D + a] = value_of(x[k][a]);
+        out.D[mark] = value_of(ln_s);
         out.counted[mark] = static_cast<double>(counted);
     }
 
@@ -483,14 +710,16 @@ template <int D, bool PLAIN> struct Filter {
                 if (gains != nullptr)
                     keep(i);
             }
-            if (in.driver >= 0 && held < in.n)
-                P[in.driver][in.driver] += in.Q[in.driver * D + in.driver] * (in.r[held] - in.r[i]);
+            if (m.driver >= 0 && held < in.n)
+                P[m.driver][m.driver] += m.Q[m.driver][m.driver] * (in.r[held] - in.r[i]);
             advance(i, held);
             if (out.s != nullptr)
                 for (std::size_t j = i; j < held; j++)
-                    out.s[j] = s;
+                    out.s[j] = value_of(s);
             if (present) {
-                ln_s += ln_now * static_cast<double>(held - i);
+                const double samples = static_cast<double>(held - i);
+                ln_s += ln_now * samples;
+                spread.add(ln_now, samples);
                 counted += held - i;
             }
             i = held;
@@ -501,11 +730,44 @@ template <int D, bool PLAIN> struct Filter {
 // The filter of `states` states.
 template <int D> void filter(std::size_t states, bool diagonal, const Input &in, const Sums &out) {
     if (states == D && diagonal)
-        std::make_unique<Filter<D, true>>(in, out)->run();
+        std::make_unique<Filter<double, D, true>>(in, out)->run();
     else if (states == D)
-        std::make_unique<Filter<D, false>>(in, out)->run();
+        std::make_unique<Filter<double, D, false>>(in, out)->run();
     else if constexpr (D < states_max)
         filter<D + 1>(states, diagonal, in, out);
+}
+
+// Derivatives, by each parameter, of the sums over one column; and the sums of products that their information is.
+struct Slopes {
+    double *G, *D;             // [count]
+    double *innovations, *spread; // [count, count]
+};
+
+template <int V, int D, bool PLAIN> void passed(const Input &in, const Sums &out, const Slopes &slopes) {
+    const auto filter = std::make_unique<Filter<Dual<V>, D, PLAIN>>(in, out);
+    filter->run();
+    for (std::size_t j = 0; j < in.count; j++) {
+        slopes.G[j] = filter->G[0][0].slope(j);
+        slopes.D[j] = filter->ln_s.slope(j);
+        for (std::size_t k = 0; k < in.count; k++) {
+            slopes.innovations[j * in.count + k] = filter->innovations.sum[j][k / width][k % width];
+            slopes.spread[j * in.count + k] = filter->spread.sum[j][k / width][k % width];
+        }
+    }
+}
+
+// Of many states, every second number is compiled.
+template <int V, int D>
+void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
+    if (in.states > D) {
+        if constexpr (D < states_max)
+            differentiated<V, D < 4 ? D + 1 : D + 2>(diagonal, in, out, slopes);
+    } else if constexpr (V == 1) {
+        if (diagonal)
+            return passed<V, D, true>(in, out, slopes);
+        passed<V, D, false>(in, out, slopes);
+    } else
+        passed<V, D, false>(in, out, slopes);
 }
 
 // A shift of the level that begins at sample k and stays, at every k, by one pass backwards over the filter's gains
@@ -520,87 +782,86 @@ struct Shifts {
 
 template <int D> struct Backward {
     static constexpr int E = D + 1;
-    const Filter<D, false> &filter;
-    double h[E], below[E], on[E], above[E], N[E][E] = {}, R[columns_max][E] = {};
-    bool steady = false; // N stays as long as the gain does
+    const Filter<double, D, false> &filter;
+    double h[E], N[E][E] = {}, R[E][columns_max] = {};
+    double left[E + 1] = {}, on[E], right[E + 1] = {}; // F' x at a: left[a] x[a - 1] + on[a] x[a] + right[a] x[a + 1]
+    bool steady = false;                               // N stays as long as the gain does
 
-    explicit Backward(const Filter<D, false> &passed) : filter(passed) {
+    explicit Backward(const Filter<double, D, false> &passed) : filter(passed) {
         for (int a = 0; a < E; a++) {
-            h[a] = a < D ? filter.h[a] : 1.0;
-            below[a] = a < D ? filter.below[a] : 0.0;
+            h[a] = a < D ? filter.m.h[a] : 1.0;
             on[a] = a < D ? filter.on[a] : 1.0;
-            above[a] = a < D ? filter.above[a] : 0.0;
+            left[a] = a > 0 && a < D ? filter.above[a - 1] : 0.0;
+            right[a] = a < D - 1 ? filter.below[a + 1] : 0.0;
         }
     }
 
-    // x := F' x
-    void transposed(double (&x)[E]) const {
-        double left = 0.0;
+    // N := h h' / s + L' N L, with L = F - g h': F' N F - u h' - h u' + (g' N g + 1 / s) h h', where u = F' N g.
+    // `Ng` and `gNg` of the N before.
+    void information(const double (&Ng)[E], double gNg, double energy) {
+        double W[E][E + 2] = {}, u[E], change = 0.0, most = 0.0;
         for (int a = 0; a < E; a++) {
-            const double here = x[a], right = a < D ? below[a + 1] * x[a + 1] : 0.0;
-            x[a] = (a > 0 ? above[a - 1] * left : 0.0) + on[a] * here + right;
-            left = here;
+            const int before = a > 0 ? a - 1 : 0, after = a < E - 1 ? a + 1 : a;
+            u[a] = left[a] * Ng[before] + on[a] * Ng[a] + right[a] * Ng[after];
+            for (int b = 0; b < E; b++)
+                W[a][b + 1] = left[a] * N[before][b] + on[a] * N[a][b] + right[a] * N[after][b];
         }
-    }
-
-    // N := h h' / s + L' N L
-    void information(const double (&g)[E], double energy) {
-        double M[E][E], change = 0.0, most = 0.0;
         for (int a = 0; a < E; a++) {
-            double Ng = 0.0;
+            const double all = (gNg + energy) * h[a] - u[a], own = h[a], here = N[a][a], last = N[a][D];
             for (int b = 0; b < E; b++)
-                Ng += N[a][b] * g[b];
-            std::memcpy(M[a], N[a], sizeof M[a]);
-            transposed(M[a]);
-            for (int b = 0; b < E; b++)
-                M[a][b] -= Ng * h[b];
-        }
-        for (int b = 0; b < E; b++) {
-            double column[E], gM = 0.0;
-            for (int a = 0; a < E; a++) {
-                column[a] = M[a][b];
-                gM += g[a] * M[a][b];
-            }
-            transposed(column);
-            for (int a = 0; a <= b; a++) {
-                const double next = column[a] + h[a] * (energy * h[b] - gM);
-                change = std::max(change, std::fabs(next - N[a][b]));
-                most = std::max(most, std::fabs(next));
-                N[a][b] = N[b][a] = next;
-            }
+                N[a][b] = left[b] * W[a][b] + on[b] * W[a][b + 1] + right[b] * W[a][b + 2] + all * h[b] - own * u[b];
+            change = std::max({change, std::fabs(N[a][a] - here), std::fabs(N[a][D] - last)});
+            most = std::max(most, N[a][a]);
         }
         steady = change <= 1e-15 * most;
     }
 
-    void run(const std::vector<Gain<D>> &gains, const Shifts &out) {
+    // One sample further back for the products with every column: R := F' R - h (g' R - white / sqrt(s)).
+    void products(const double (&g)[E], const double *white, double scale) {
+        const int columns = filter.in.columns;
+        double gR[columns_max], was[E][columns_max];
+        for (int c = 0; c < columns; c++)
+            gR[c] = scale == 0.0 ? 0.0 : -scale * white[c];
+        for (int a = 0; a < E; a++)
+            for (int c = 0; c < columns; c++) {
+                gR[c] += g[a] * R[a][c];
+                was[a][c] = R[a][c];
+            }
+        for (int a = 0; a < E; a++) {
+            const int before = a > 0 ? a - 1 : 0, after = a < E - 1 ? a + 1 : a;
+            for (int c = 0; c < columns; c++) {
+                const double next = left[a] * was[before][c] + on[a] * was[a][c] + right[a] * was[after][c] -
+                                    gR[c] * h[a];
+                R[a][c] = std::fabs(next) < 1e-250 ? 0.0 : next;
+            }
+        }
+    }
+
+    void run(const std::vector<Gain<double, D>> &gains, const Shifts &out) {
         const Input &in = filter.in;
         std::size_t end = in.n;
         for (std::size_t k = gains.size(); k-- > 0; end = gains[k].start) {
-            double g[E] = {};
+            double g[E] = {}, Ng[E] = {}, gNg = 0.0;
             std::memcpy(g, gains[k].FK, sizeof gains[k].FK);
             steady = false;
             for (std::size_t i = end; i-- > gains[k].start;) {
                 const bool present = std::isfinite(in.y[i]);
                 const double scale = present ? gains[k].scale : 0.0;
-                double single = scale * scale; // by the gain's effect on later readings
-                for (int a = 0; a < D; a++)
-                    for (int b = 0; b < D; b++)
-                        single += g[a] * N[a][b] * g[b];
-                if (!steady)
-                    information(g, scale * scale);
-                for (int c = 0; c < in.columns; c++) {
-                    double gR = present ? -scale * filter.out.white[i * in.columns + c] : 0.0;
-                    for (int a = 0; a < D; a++)
-                        gR += g[a] * R[c][a];
-                    transposed(R[c]);
+                if (!steady) {
+                    gNg = 0.0;
                     for (int a = 0; a < E; a++) {
-                        R[c][a] -= gR * h[a];
-                        R[c][a] = std::fabs(R[c][a]) < 1e-250 ? 0.0 : R[c][a];
+                        Ng[a] = 0.0;
+                        for (int b = 0; b < E; b++)
+                            Ng[a] += N[a][b] * g[b];
+                        gNg += g[a] * Ng[a];
                     }
-                    out.B[i * in.columns + c] = R[c][D];
+                    information(Ng, gNg, scale * scale);
                 }
+                products(g, filter.out.white + i * in.columns, scale);
+                for (int c = 0; c < in.columns; c++)
+                    out.B[i * in.columns + c] = R[D][c];
                 out.A[i] = N[D][D];
-                out.impulse[i] = present ? single : 0.0;
+                out.impulse[i] = present ? scale * scale + gNg : 0.0; // by the gain's effect on later readings
             }
         }
     }
@@ -608,8 +869,8 @@ template <int D> struct Backward {
 
 template <int D> void shifted(std::size_t states, const Input &in, const Sums &out, const Shifts &shifts) {
     if (states == D) {
-        std::vector<Gain<D>> gains;
-        const auto filter = std::make_unique<Filter<D, false>>(in, out, &gains);
+        std::vector<Gain<double, D>> gains;
+        const auto filter = std::make_unique<Filter<double, D, false>>(in, out, &gains);
         filter->run();
         Backward<D>(*filter).run(gains, shifts);
     } else if constexpr (D < states_max)
@@ -664,8 +925,8 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
     Out x = array(out.x, {m, std::size_t(c), d});
     Out white = array(innovations ? out.white : fresh(0), {innovations ? n : 0, std::size_t(c)});
     Out s = array(innovations ? out.s : fresh(0), {innovations ? n : 0});
-    const Input in{y.data(), z.data(),  r.data(), n, c,           F.data(), Q.data(),
-                   h.data(), P0.data(), R,        driver, marks.data(), m};
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
+    const Input in{y.data(), z.data(), r.data(), n, c, model, {}, d, 0, driver, marks.data(), m};
     {
         nb::gil_scoped_release released;
         filter<1>(d, diagonal, in, out);
@@ -683,13 +944,47 @@ nb::tuple shifts(const Vector &y, const Matrix &z, const Vector &r, const Matrix
     Out impulse = array(fresh(n), {n});
     const Sums out{G.data(), D.data(), counted.data(), x.data(), white.data(), nullptr};
     const Shifts made{A.data(), B.data(), impulse.data()};
-    const Input in{y.data(), z.data(),  r.data(), n, static_cast<int>(c), F.data(), Q.data(),
-                   h.data(), P0.data(), R,        driver, &end, 1};
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
+    const Input in{y.data(), z.data(), r.data(), n, static_cast<int>(c), model, {}, d, 0, driver, &end, 1};
     {
         nb::gil_scoped_release released;
         shifted<1>(d, in, out, made);
     }
     return nb::make_tuple(G, D[0], A, B, impulse);
+}
+
+// Sums over y alone, a record less its columns, with their derivatives by each parameter. `F_by` and so on are the
+// matrices' derivatives.
+nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h, const Matrix &P0,
+                 double R, const Cube &F_by, const Cube &Q_by, const Matrix &h_by, const Cube &P0_by,
+                 const Vector &R_by, int driver) {
+    const std::size_t n = y.shape(0), d = h.shape(0), count = h_by.shape(0);
+    const Matrix none(nullptr, {0, n});
+    const bool diagonal = check(y, none, r, F, Q, h, P0, driver);
+    if (count < 1 || count > parameters_max)
+        throw std::invalid_argument("1 to 8 parameters");
+    for (const Cube &by : {F_by, Q_by, P0_by})
+        if (by.shape(0) != count || by.shape(1) != d || by.shape(2) != d)
+            throw std::invalid_argument("shapes of the derivatives do not fit");
+    if (h_by.shape(1) != d || R_by.shape(0) != count)
+        throw std::invalid_argument("shapes of the derivatives do not fit");
+    std::vector<double> x(states_max);
+    double G = 0.0, D = 0.0, counted = 0.0;
+    const Sums out{&G, &D, &counted, x.data(), nullptr, nullptr};
+    const Slopes by{fresh(count), fresh(count), fresh(count * count), fresh(count * count)};
+    Out G_by = array(by.G, {count}), D_by = array(by.D, {count});
+    Out innovations = array(by.innovations, {count, count}), spread = array(by.spread, {count, count});
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
+    const Matrices model_by{F_by.data(), Q_by.data(), h_by.data(), P0_by.data(), R_by.data()};
+    const Input in{y.data(), nullptr, r.data(), n, 1, model, model_by, d, count, driver, &n, 1};
+    {
+        nb::gil_scoped_release released;
+        if (count <= width)
+            differentiated<1, 1>(diagonal, in, out, by);
+        else
+            differentiated<2, 1>(diagonal, in, out, by);
+    }
+    return nb::make_tuple(G, D, counted, G_by, D_by, innovations, spread);
 }
 
 } // namespace
@@ -698,6 +993,8 @@ NB_MODULE(_likelihood, m) {
     using namespace nb::literals;
     m.def("run", &run, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a, "marks"_a, "innovations"_a);
     m.def("shifts", &shifts, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a);
+    m.def("slopes", &slopes, "y"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "F_by"_a, "Q_by"_a, "h_by"_a, "P0_by"_a,
+          "R_by"_a, "driver"_a);
     m.attr("STATES_MAX") = states_max;
     m.attr("COLUMNS_MAX") = columns_max;
 }

@@ -39,3 +39,26 @@ def shifts(
     R: float,
     driver: int,
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
+def slopes(
+    y: NDArray[np.float64],
+    r: NDArray[np.float64],
+    F: NDArray[np.float64],
+    Q: NDArray[np.float64],
+    h: NDArray[np.float64],
+    P0: NDArray[np.float64],
+    R: float,
+    F_by: NDArray[np.float64],
+    Q_by: NDArray[np.float64],
+    h_by: NDArray[np.float64],
+    P0_by: NDArray[np.float64],
+    R_by: NDArray[np.float64],
+    driver: int,
+) -> tuple[
+    float,
+    float,
+    float,
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]: ...

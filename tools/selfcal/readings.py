@@ -279,11 +279,11 @@ def _regridded(recording: Recording, time: Array, row: int, before_s: float, aft
     missing = np.diff(whole, prepend=-1) - 1
     missing[0] = 0
     rate = float(f"{2.0 / (blocks[0] * before_s + blocks[1] * after_s):.10g}")
-    moved = _moving(recording, np.searchsorted(index, whole), missing, time.size / first)
+    moved = _with_moving(recording, np.searchsorted(index, whole), missing, time.size / first)
     return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
 
 
-def _moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
+def _with_moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
     """The samples left out for motion of a recording of fewer rows: these `rows` [m] of it, each of `ratio` of its own,
     and `missing` [m] before each."""
     if recording.moving_before is None:
@@ -328,7 +328,7 @@ def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, flo
         for name, one in recording.columns.items()
     }
     rate = recording.rate_hz / ratio
-    moved = _moving(recording, rows, missing, ratio)
+    moved = _with_moving(recording, rows, missing, ratio)
     return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved), rate
 
 

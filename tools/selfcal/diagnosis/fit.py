@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from scipy.optimize import minimize
 
 from selfcal import _likelihood
 from selfcal.diagnosis import work
-from selfcal.diagnosis.statemodel import Array, Terms, matrices
+from selfcal.diagnosis.statemodel import Array, Mask, Terms, matrices
 
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
@@ -22,8 +21,22 @@ ROUGH_FTOL = 0.3
 NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 #: Longer records know their parameters well enough: the best ones stand for all.
 NODES_MOST = 100_000
-#: A slope is taken over this much of a parameter's standard deviation.
-NEAR = 0.1
+#: The slopes of a model's matrices are taken over this much of each parameter: exact to 1e-8.
+NEAR = 1e-4
+#: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
+STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
+#: A step that promises less than this share of `ftol` is not taken. Its curvature is taken as other than expected by
+#: this factor at most.
+SETTLED, BENT_MOST = 0.2, 20.0
+#: A size of less information than this may as well be nothing: its standard deviation is a factor of two.
+WEAK = 2.0
+#: Drifts that are nothing below a size, and where they are then looked for.
+LARGER = (
+    (("ln_rho",), -7.0, ((-7.0,), (-5.5,))),
+    (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
+)
+#: Parameters that are logarithms of sizes.
+SIZES = ("ln_rho", "ln_markov", "ln_flicker", "ln_band")
 
 
 @dataclass(frozen=True)
@@ -82,8 +95,8 @@ class Sums:
 @dataclass(frozen=True)
 class Fit:
     """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
-    standard deviations `sd`, and `ln_likelihood` at its maximum. `spread` [k, k], where it was asked for: a root of the
-    covariance of `theta`."""
+    standard deviations `sd`, and `ln_likelihood` at its maximum. `spread` [k, k], of a fit: a root of the covariance of
+    `theta`."""
 
     terms: Terms
     theta: Array
@@ -140,99 +153,192 @@ def ln_likelihood(sums: Sums) -> float:
     return -0.5 * (sums.n * (math.log(2.0 * math.pi * rss / sums.n) + 1.0) + sums.D)
 
 
-def _cost(series: Series, terms: Terms) -> tuple[Callable[[Array], float], Array]:
-    """-ln likelihood as a function of theta, steep beyond the limits [k, 2]; and those."""
-    limits = np.array(terms.limits(series.dt)).reshape(-1, 2)
+def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
+    """Slope [k] of ln likelihood by the parameters of a fit, and their information [k, k].
 
-    def cost(theta: Array) -> float:
-        outside = np.maximum(limits[:, 0] - theta, 0.0) + np.maximum(theta - limits[:, 1], 0.0)
-        inside = np.clip(theta, limits[:, 0], limits[:, 1])
-        return -ln_likelihood(run(series, terms, inside)[0][0]) + float((outside**2).sum()) * 1e3
-
-    return cost, limits
+    One pass over the record less its columns: their coefficients are the best ones, and a small change of theta moves
+    the likelihood by none of theirs. sigma is free in the information."""
+    work.count(series.y.size, at.theta.size)
+    terms, theta = at.terms, at.theta
+    m = matrices(terms, theta, series.dt, series.duration_s)
+    near = [
+        [matrices(terms, theta + sign * move, series.dt, series.duration_s) for sign in (1.0, -1.0)]
+        for move in NEAR * np.eye(theta.size)
+    ]
+    F_by, Q_by, h_by, P0_by, R_by = (
+        np.ascontiguousarray([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
+        for name in ("F", "Q", "h", "P0", "R")
+    )
+    whole = series.y - at.c @ series.columns
+    rss, _, n, rss_by, D_by, innovations, spread = _likelihood.slopes(
+        whole, series.r, m.F, m.Q, m.h, m.P0, m.R, F_by, Q_by, h_by, P0_by, R_by, m.driver
+    )
+    rss = max(rss, 1e-300)
+    information = n / rss * innovations + 0.5 * (spread - np.outer(D_by, D_by) / n)
+    return -0.5 * (n * rss_by / rss + D_by), information
 
 
 def refit(series: Series, known: Fit) -> Fit:
-    """The same model on much the same record: Newton steps with the curvature of the fit that is known.
-
-    Each step takes one pass a parameter and one more. Where they do not settle the simplex method takes over."""
-    cost, limits = _cost(series, known.terms)
-    theta, here = known.theta, cost(known.theta)
-    for _ in range(8):
-        slope = np.array([(cost(theta + NEAR * root) - here) / NEAR - 0.5 * NEAR for root in known.spread.T])
-        length = float(np.linalg.norm(slope))
-        if 0.5 * length**2 < series.ftol:
-            return finish(series, known.terms, np.clip(theta, limits[:, 0], limits[:, 1]))
-        ahead = np.clip(theta - known.spread @ slope * min(1.0, 3.0 / length), limits[:, 0], limits[:, 1])
-        if np.allclose(ahead, theta, rtol=0.0, atol=1e-6):  # at a limit, and the slope points beyond it
-            return finish(series, known.terms, theta)
-        there = cost(ahead)
-        if there >= here:
-            break
-        theta, here = ahead, there
-    return fit(series, known.terms, theta, step=0.25)
+    """The same model on much the same record, from where it was."""
+    return _climbed(series, finish(series, known.terms, known.theta))
 
 
-def _spread(series: Series, found: Fit) -> Array:
-    """A root of the covariance of theta, by second differences; 4 at most for what the record hardly knows.
+def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
+    """Best `theta` from `start`, or from the best of a few starts.
 
-    Its columns point inwards where theta is at a limit."""
-    cost, limits = _cost(series, found.terms)
-    k = found.theta.size
-    h = 0.2 * np.where(limits[:, 1] - limits[:, 0] < 1.0, 0.05, 1.0)
-    centre = np.clip(found.theta, limits[:, 0] + h, limits[:, 1] - h)
-    middle = cost(centre)
-    moves = np.diag(h)
-    ahead = [cost(centre + move) for move in moves]
-    back = [cost(centre - move) for move in moves]
-    H = np.empty((k, k))
-    for i in range(k):
-        H[i, i] = (ahead[i] - 2.0 * middle + back[i]) / h[i] ** 2
-        for j in range(i):
-            both = cost(centre + moves[i] + moves[j])
-            H[i, j] = H[j, i] = (both - ahead[i] - ahead[j] + middle) / (h[i] * h[j])
-    if not np.isfinite(H).all():
-        return 4.0 * np.eye(k)
-    values, vectors = np.linalg.eigh(H)
-    spread: Array = vectors / np.sqrt(np.maximum(values, 1.0 / 16.0))
-    room = (centre - found.theta) @ spread
-    spread *= np.where(room < 0.0, -1.0, 1.0)
-    return spread
+    Where a drift has gone to nothing, a larger one is looked for once more: a likelihood may have a second top there,
+    and a Gauss-Markov drift may have gone there with the wrong rate."""
+    low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
+    starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
+    found = _climbed(series, best([finish(series, terms, np.clip(one, low, high)) for one in starts]))
+    promised: list[tuple[float, Fit]] = []
+    for place in _larger(terms, found.theta):
+        at = finish(series, terms, place)
+        slope, information = slopes(series, at)
+        k = int(np.flatnonzero(place != found.theta)[0])
+        if slope[k] > 0.0:
+            promised.append((at.ln_likelihood + 0.5 * float(slope[k] ** 2 / information[k, k]), at))
+    if not promised:
+        return found
+    return best([found, _climbed(series, max(promised, key=lambda one: one[0])[1])])
 
 
-def fit(series: Series, terms: Terms, start: Array | None = None, step: float = 0.7) -> Fit:
-    """Best `theta` by the simplex method from `start`, or from the best of a few starts."""
-    cost, limits = _cost(series, terms)
+def _larger(terms: Terms, theta: Array) -> list[Array]:
+    """Places with more of each drift that is nothing at `theta`."""
+    places = []
+    for names, below, values in LARGER:
+        if names[0] in terms.names and theta[terms.names.index(names[0])] < below:
+            for value in values:
+                place = theta.copy()
+                for name, number in zip(names, value, strict=True):
+                    place[terms.names.index(name)] = number
+                places.append(place)
+    return places
+
+
+def _climbed(series: Series, here: Fit) -> Fit:
+    """The top of the likelihood from a fit on, by Fisher's scoring.
+
+    A size that has gone to nothing has little slope and less information. Their ratio still shows whether it should
+    grow, so that no step ends on the flat. A size that the record hardly knows is also tried at nothing."""
+    terms = here.terms
     if not terms.names:
-        return finish(series, terms, np.empty(0))
-    starts = [start] if start is not None else _starts(terms, limits)
-    theta = min(starts, key=cost) if len(starts) > 1 else starts[0]
-    theta = np.clip(theta, limits[:, 0], limits[:, 1])
-    simplex = np.vstack([theta, *(theta + _step(theta, limits, k, step) for k in range(theta.size))])
-    found = minimize(
-        cost,
-        theta,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": simplex,
-            "fatol": series.ftol,
-            "xatol": 0.5 * math.sqrt(series.ftol),
-            "maxfev": 60 * theta.size + 40,
-        },
-    )
-    return finish(series, terms, np.clip(found.x, limits[:, 0], limits[:, 1]))
+        return here
+    low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
+    size = np.array([name in SIZES for name in terms.names])
+    reach = FARTHEST
+    before: tuple[Array, Array] | None = None
+    for _ in range(STEPS):
+        slope, information = slopes(series, here)
+        here = replace(here, spread=_spread(information))
+        if not (np.isfinite(slope).all() and np.isfinite(information).all()):
+            return here
+        weak = size & (np.diag(information) < WEAK)
+        falling = weak & (slope < -2.0 * SETTLED * series.ftol) & (here.theta > low)
+        information = _bent(size, information, before, slope)
+        while True:
+            move, gain = _move(size, slope, information, low - here.theta, high - here.theta, reach)
+            if gain >= SETTLED * series.ftol:
+                there = finish(series, terms, here.theta + move)
+            elif falling.any():
+                move, gain = np.where(falling, low - here.theta, 0.0), 0.0
+                falling[:] = False
+                there = finish(series, terms, here.theta + move)
+            else:
+                return here
+            more = there.ln_likelihood - here.ln_likelihood
+            if more > 0.0:
+                break
+            reach *= SHORTER
+        before, here = (move, slope), replace(there, spread=here.spread)
+        # A small gain that came as promised, by a step that nothing has shortened, was the last one.
+        whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
+        if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
+            break
+        reach = min(FARTHEST, reach / SHORTER)
+    return here
 
 
-def curved(series: Series, found: Fit) -> Fit:
-    """The fit with its spread, for `refit`."""
-    return replace(found, spread=_spread(series, found)) if found.terms.names else found
+def _bent(size: Mask, information: Array, before: tuple[Array, Array] | None, slope: Array) -> Array:
+    """The information with the curvature that the last step has shown along itself: a model that is wrong has another.
+
+    `size`: whether each parameter is one. `before`: that step, and the slope at its start."""
+    if before is None:
+        return information
+    move, was = before
+    fallen = size & (move < 0.0)
+    step = np.where(fallen, -0.5 * np.expm1(-2.0 * np.where(fallen, move, 0.0)), move)
+    along = information @ step
+    expected, shown = float(step @ along), float(step @ (np.where(fallen, np.exp(2.0 * move), 1.0) * was - slope))
+    if not 0.0 < shown < math.inf or expected <= 0.0:
+        return information
+    share = min(max(shown / expected, 1.0 / BENT_MOST), BENT_MOST)
+    bent: Array = information + (share - 1.0) / expected * np.outer(along, along)
+    return bent
+
+
+def _move(size: Mask, slope: Array, information: Array, low: Array, high: Array, reach: float) -> tuple[Array, float]:
+    """A step [k] of theta between `low` and `high`, no parameter by more than `reach`, and the gain that it promises.
+
+    A size that falls takes its step as a variance: ln likelihood is nearly a parabola of that down to nothing. One that
+    grows takes a step of more than 1 so: from nothing its logarithm has to go far."""
+    down, up = np.where(size, 0.5 * reach, reach), np.where(size, 4.0 * reach, reach)
+    bounds = np.array([np.maximum(low, -down), np.minimum(high, up)])
+    bend = size & (np.array([[True], [False]]) | (bounds > 1.0))
+    beyond = np.array([[0.0], [1.0]])
+    bounds = np.where(bend, beyond + 0.5 * np.expm1(2.0 * (bounds - beyond)), bounds)
+    step, gain = _highest(slope, information, bounds)
+    start = np.where(step > 0.0, 1.0, 0.0)
+    bend = size & ((step < 0.0) | (step > 1.0))
+    move = np.where(bend, start + 0.5 * np.log1p(2.0 * np.where(bend, step - start, 0.0)), step)
+    return np.clip(move, low, high), gain
+
+
+def _highest(slope: Array, information: Array, bounds: Array) -> tuple[Array, float]:
+    """Where slope x - x information x / 2 is highest between `bounds` [2, k], which hold 0, and how high."""
+    k = slope.size
+    x = np.zeros(k)
+    held = np.zeros(k, bool)
+    curvature = information + 1e-12 * np.diag(np.diag(information)) + 1e-300 * np.eye(k)
+    for _ in range(8 * k):
+        free = ~held
+        if free.any():
+            ahead = x.copy()
+            left = slope[free] - curvature[np.ix_(free, held)] @ x[held]
+            ahead[free] = np.linalg.lstsq(curvature[np.ix_(free, free)], left, rcond=1e-14)[0]
+            way = ahead - x
+            bound = np.where(way > 0.0, bounds[1], bounds[0])
+            share = np.where(way != 0.0, (bound - x) / np.where(way != 0.0, way, 1.0), np.inf)
+            first = int(np.argmin(share))
+            if share[first] < 1.0:
+                x += max(0.0, share[first]) * way
+                x[first] = bound[first]
+                held[first] = True
+                continue
+            x = ahead
+        pull = slope - curvature @ x
+        inwards = np.where(x <= bounds[0], pull, -pull) * held
+        freed = int(np.argmax(inwards))
+        if inwards[freed] <= 1e-9 * float(np.abs(slope).max()):
+            break
+        held[freed] = False
+    return x, float(slope @ x - 0.5 * x @ curvature @ x)
+
+
+def _spread(information: Array) -> Array:
+    """A root of the covariance of theta; 4 at most for what the record hardly knows."""
+    if not np.isfinite(information).all():
+        return 4.0 * np.eye(len(information))
+    values, vectors = np.linalg.eigh(information)
+    spread: Array = vectors / np.sqrt(np.maximum(values, 1.0 / 16.0))
+    return spread
 
 
 def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for."""
     if not found.terms.names or series.n > NODES_MOST or series.ftol > FTOL:
         return [(found.theta, 0.0)]
-    spread = curved(series, found).spread
+    spread = found.spread
     limits = np.array(found.terms.limits(found.dt)).reshape(-1, 2)
     k = found.theta.size
     volume = float(np.linalg.slogdet(spread)[1] - np.log(limits[:, 1] - limits[:, 0]).sum())
@@ -253,19 +359,12 @@ def finish(series: Series, terms: Terms, theta: Array) -> Fit:
     return Fit(terms, theta, sigma, c, sd, ln_likelihood(sums), sums.n, series.dt, series.duration_s)
 
 
-def _step(theta: Array, limits: Array, k: int, step: float) -> Array:
-    move = np.zeros(theta.size)
-    size = step * (0.05 if limits[k, 1] - limits[k, 0] < 1.0 else 1.0)
-    move[k] = size if theta[k] + size <= limits[k, 1] else -size
-    return move
-
-
 _GUESSES: dict[str, tuple[float, ...]] = {
-    "ln_rho": (-6.0, -4.0, -2.0),
-    "ln_markov": (-3.0, -1.5, 0.0),
-    "ln_alpha": (-7.0, -5.0, -3.0),
-    "ln_flicker": (-3.0, -1.5),
-    "color": (0.3, -0.3),
+    "ln_rho": (-4.0, -8.0),
+    "ln_markov": (-1.5,),
+    "ln_alpha": (-6.0, -4.0, -2.0),
+    "ln_flicker": (-2.0, -6.0),
+    "color": (0.2, -0.2),
 }
 
 

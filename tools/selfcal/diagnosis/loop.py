@@ -27,6 +27,8 @@ CERTAIN = 25.0
 HARM_SD = 2.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
+#: Looks of a cause at an axis of a record, by the record's states: these stay alive with it.
+Seen = dict[tuple[Looks, tuple[int, ...]], tuple[list[Look], Record]]
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
@@ -66,7 +68,8 @@ def diagnose_record(
     for name in axes:
         if name not in left_out:
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
-    record = _integrity(record, found, handled, advance, works)
+    seen: dict[str, Seen] = {name: {} for name in states}
+    record = _integrity(record, found, handled, advance, works, seen)
 
     def walk(name: str) -> None:
         one, spent = found[name], ""
@@ -74,7 +77,7 @@ def diagnose_record(
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    _rounds(record, one, advance)
+                    _rounds(record, one, advance, seen=seen[name])
             except work.Spent:
                 spent = SPENT
             _end(one, advance)
@@ -108,11 +111,12 @@ def _provisional(
     record: Record,
     advance: Callable[[str], None],
     causes: tuple[Looks, ...] = STATIONARY,
+    seen: Seen | None = None,
 ) -> State:
     """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
     one = Diagnosed(state, state, record)
     with suppress(work.Spent):
-        _rounds(record, one, advance, causes, CERTAIN, provisional=True)
+        _rounds(record, one, advance, causes, CERTAIN, seen, provisional=True)
     return one.state
 
 
@@ -128,8 +132,10 @@ def _integrity(
     handled: Mapping[str, Moved],
     advance: Callable[[str], None],
     works: Mapping[str, work.Work],
+    seen: Mapping[str, Seen],
 ) -> Record:
-    """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
+    """What needs no model beyond the first. `handled`: motion that is left out of the record already. `seen`: takes the
+    looks that the rounds need not repeat."""
     gone, held = integrity.missing(record)
     if held.any():
         masked = {name: integrity.masked(state, held).refit() for name, state in record.axes.items()}
@@ -138,7 +144,7 @@ def _integrity(
 
     def quieted(name: str) -> State:
         with work.within(works[name]):
-            return _provisional(states[name], record, advance)
+            return _provisional(states[name], record, advance, seen=seen[name])
 
     quiet = dict(zip(states, work.each(quieted, states), strict=True))
     wild = {name: _wild(state, record) for name, state in quiet.items()}
@@ -196,6 +202,7 @@ def _rounds(
     advance: Callable[[str], None],
     causes: tuple[Looks, ...] = LOOKS,
     least: float = NET_LEAST,
+    seen: Seen | None = None,
     provisional: bool = False,
 ) -> None:
     first = 1 + max((finding.round for finding in one.findings), default=0)
@@ -205,9 +212,9 @@ def _rounds(
             return
         advance(f"{one.state.axis}: round {number}")
         waiting = [cause for cause in causes if cause in idle]
-        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least)
+        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least, seen)
         if waiting and (not looks or looks[0].net < least):
-            more, unworthy = _looked(one, record, waiting, least)
+            more, unworthy = _looked(one, record, waiting, least, seen)
             looks, idle = _by_worth([*looks, *more]), idle | unworthy
         else:
             idle |= set(waiting)
@@ -229,13 +236,20 @@ def _looked(
     record: Record,
     causes: Sequence[Looks],
     least: float,
+    seen: Seen | None,
 ) -> tuple[list[Look], set[Looks]]:
-    """The looks of `causes`, the most worth first, and the causes of which none is worth `least`."""
+    """The looks of `causes`, the most worth first, and the causes of which none is worth `least`.
+
+    A state that is the record's own has been looked at for motion: those looks are `seen`."""
     named = Counter(finding.look.cause for finding in one.findings)
     found: list[Look] = []
     idle: set[Looks] = set()
+    axes = tuple(map(id, record.axes.values()))
+    known = seen if seen is not None and record.axes.get(one.state.axis) is one.state else {}
     for cause in causes:
-        looks = [look for look in cause(one.state, record) if named[look.cause] < (CAUSES[look.cause].most or ROUNDS)]
+        if (cause, axes) not in known:
+            known[cause, axes] = cause(one.state, record), record
+        looks = [look for look in known[cause, axes][0] if named[look.cause] < (CAUSES[look.cause].most or ROUNDS)]
         found += looks
         if all(look.net < least for look in looks):
             idle.add(cause)

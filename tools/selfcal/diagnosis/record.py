@@ -44,8 +44,8 @@ class Record:
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `present` [n]: where the grid
     has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
     the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it.
-    `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded. `moving` [n]: the raw readings
-    of an axis show that the sensor moved."""
+    `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded. `moving` [n]: the raw
+    readings of an axis show that the sensor moved."""
 
     rate_hz: float
     axes: Mapping[str, State]

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from selfcal.diagnosis.fit import FTOL, Fit, Series, Sums, best, curved, fit, ln_likelihood, moved, nodes, refit, run
+from selfcal.diagnosis.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
 from selfcal.errors import UserError
 from selfcal.result import HALF_90, of_mixture
@@ -97,7 +97,7 @@ class State:
         """The state with `changes`, fitted. UserError where no model has a likelihood."""
         state = replace(self, **changes)
         series = state.series
-        fits = tuple(curved(series, _fit_from(series, terms, self.fits)) for terms in state.bases())
+        fits = tuple(_fit_from(series, terms, self.fits) for terms in state.bases())
         if not math.isfinite(best(fits).ln_likelihood):
             raise UserError(
                 f"{self.axis}: no noise model fits these readings: leave out the time in which the sensor did not rest"
@@ -174,7 +174,7 @@ class State:
     def rich(self) -> Fit:
         """A drift of two terms."""
         terms = replace(self.extras, walk=True, markov=True)
-        return curved(self.series, fit(self.series, terms, moved(self.best, terms)))
+        return fit(self.series, terms, moved(self.best, terms))
 
     def rich_gain(self, more: Array) -> float:
         """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column. 1/f noise
@@ -210,7 +210,7 @@ def gain_for(worth: Callable[[float], float]) -> float:
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     same = [one for one in known if one.terms == terms]
     if same:
-        return refit(series, same[0]) if same[0].spread.size else fit(series, terms, same[0].theta, step=0.25)
+        return refit(series, same[0])
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
     if near:
         return fit(series, terms, moved(near[0], terms))

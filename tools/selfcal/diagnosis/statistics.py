@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.signal import fftconvolve
 from scipy.stats import norm, pearson3, skew
 from scipy.stats import t as student
 
@@ -51,10 +51,10 @@ class Statistic:
     p: float
 
 
-def all_statistics(w: Array, y: Array | None, lsb: float, response: Array | None = None) -> dict[str, float]:
+def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | None = None) -> dict[str, float]:
     """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read.
 
-    `response` [n]: of the residuals to a unit step of the bias; without it no jumps are looked for."""
+    Without the `response` to a step of the bias no jumps are looked for."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
@@ -162,23 +162,44 @@ def _uneven(x: Array, size: int) -> float:
     return (float((cells**2).mean()) - 2.0) * math.sqrt(cells.size / 20.0)
 
 
-def _jumps(x: Array, response: Array) -> float | None:
+@dataclass(frozen=True)
+class Response:
+    """How residuals answer a unit step of the bias, over places of `block` samples each: `count` of them, and the times
+    that the drift `forgets` among them. `spectrum`: of the answer, padded to `padded` places. `size` [count]: root of
+    the information of a step at each place."""
+
+    block: int
+    count: int
+    forgets: float
+    padded: int
+    spectrum: NDArray[np.complex128]
+    size: Array
+
+
+def response_of(answer: Array) -> Response:
+    """`answer` [n]: residuals to a unit step at the first sample."""
+    block = max(1, answer.size // JUMP_PLACES)
+    count = answer.size // block
+    g = answer[: count * block].reshape(count, block).sum(axis=1)
+    forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
+    padded = 2 * next_fast_len(count)
+    # A step near the end is known by few samples.
+    return Response(block, count, forgets, padded, np.conj(rfft(g, padded)), np.sqrt(np.cumsum(g**2)[::-1]))
+
+
+def _jumps(x: Array, response: Response) -> float | None:
     """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
 
     None where the drift forgets too seldom for a kurtosis."""
-    block = max(1, x.size // JUMP_PLACES)
-    count = x.size // block
-    x, g = (v[: count * block].reshape(count, block).sum(axis=1) for v in (x, response))
-    forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
-    if forgets < TURNS_LEAST:
+    count, block = response.count, response.block
+    if response.forgets < TURNS_LEAST:
         return None
-    scores = fftconvolve(x, g[::-1], mode="full")[count - 1 :]
-    # A step near the end is known by few samples.
-    scores /= np.sqrt(np.cumsum(g**2)[::-1])
+    x = x[: count * block].reshape(count, block).sum(axis=1)
+    scores = irfft(rfft(x, response.padded) * response.spectrum, response.padded)[:count] / response.size
     scores = scores[: max(50, count - count // 20)]
     scores -= scores.mean()
     squared = scores**2
-    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(forgets / 24.0)
+    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(response.forgets / 24.0)
 
 
 def _power(x: Array, count: int) -> Array:
@@ -307,7 +328,7 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
 
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
     """Every statistic of the state against its band; the most striking first."""
-    response = _step_response(state.series, state.best)
+    response = response_of(_step_response(state.series, state.best))
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
     rows: dict[str, list[float]] = {name: [] for name in measured}
     for w, y in _drawn(state, np.random.default_rng(seed), count):

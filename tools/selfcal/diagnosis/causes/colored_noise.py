@@ -32,7 +32,7 @@ def looks(state: State, record: Record) -> list[Look]:
             terms = replace(drift, color=color)
             start = moved(next(one for one in state.fits if one.terms == drift), terms)
             start[terms.names.index("color")] = math.atanh(min(0.9, max(-0.9, float(lags[0]))))
-            fits.append(fit(state.series, terms, start, step=0.25))
+            fits.append(fit(state.series, terms, start))
         chosen = best(fits)
         gain = chosen.ln_likelihood - state.best.ln_likelihood
         m = math.tanh(chosen.value("color"))

@@ -71,7 +71,7 @@ def _band(state: State, record: Record) -> list[Look]:
     start = moved(state.best, terms)
     start[terms.names.index("ln_band")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
     start[terms.names.index("ln_width")] = math.log(max(1.1e-4, 0.3 * width_hz))
-    chosen = fit(state.series, terms, start, step=0.5)
+    chosen = fit(state.series, terms, start)
     gain_of_fit = chosen.ln_likelihood - state.best.ln_likelihood
     worth = net(gain_of_fit, 3, ln_places)
     centre = f * math.exp(chosen.value("shift"))
