@@ -111,7 +111,7 @@ class Drawn:
         """As a part reads them: with noise of their own, on a lattice."""
         random, n = self.random, self.t.size
         read = (self.temperature + 0.05 * random.standard_normal(n), self.supply + 1e-3 * random.standard_normal(n))
-        return tuple(lsb * np.rint(values / lsb) for values, lsb in zip(read, (0.14, 2.42e-3), strict=True))  # type: ignore[return-value]
+        return 0.14 * np.rint(read[0] / 0.14), 2.42e-3 * np.rint(read[1] / 2.42e-3)
 
     def write(self, path: Path) -> Path:
         units = {name: "deg/s" if name[0] == "g" else "m/s^2" for name in AXES}
