@@ -15,6 +15,7 @@ import yaml
 
 from selfcal import units
 from selfcal.errors import UserError, short, shown
+from selfcal.forms import FORMS, INPUTS, NUMBER, POWER
 from selfcal.laws import FACTORS, MOST_TERMS, NAMED, PARAMETERS, PLACES, RATIO_LIMITS, RATIOS, Law, Term
 from selfcal.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 
@@ -38,7 +39,7 @@ LN_LIMIT = 46.0
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
-    "column": ("column", "unit", "reference", "window_s"),
+    "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width"),
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
@@ -81,7 +82,8 @@ class Regressor:
 
     `sd`: by group, the standard deviation of the coefficient's normal prior about 0, in the group's unit per `unit`; a
     group that is not there does not have this regressor. `reference`: the value at which x0 alone is the bias.
-    `probability`: prior one that the regressor is in use.
+    `probability`: prior one that the regressor is in use. `form` and its numbers: forms.py. `unit` is the column's,
+    `channel_unit` that of the channel it is formed from.
     """
 
     name: str
@@ -95,6 +97,32 @@ class Regressor:
     frequency_hz: float = math.nan
     time_s: float = math.nan
     time_constant_s: float = math.nan
+    channel_unit: str = ""
+    input: str = "value"
+    form: str = "static"
+    lag_s: float = math.nan
+    width: float = math.nan
+
+    @property
+    def number(self) -> float:
+        """The number of its form."""
+        return float(getattr(self, NUMBER[self.form])) if self.form in NUMBER else math.nan
+
+    @property
+    def on_module(self) -> bool:
+        """Whether `selfcal_form()` makes its columns."""
+        return self.form == "static" and self.input == "value"
+
+    @property
+    def offset(self) -> float:
+        """Value of the column at which x0 alone is the bias: powers are taken about the reference already, and a rate
+        has none."""
+        return 0.0 if self.form in POWER or self.form == "rate" else self.reference
+
+    @property
+    def mean_s(self) -> float:
+        """Window of the channel's mean, s; 0 for none. A rate has its window for itself."""
+        return 0.0 if math.isnan(self.window_s) or self.form == "rate" else self.window_s
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -308,6 +336,11 @@ class _Reader:
             raise self.fail(where, f"must be a whole number from {low} to {high}, not {shown(value)}")
         return value
 
+    def choice(self, value: Any, where: str, known: tuple[str, ...]) -> str:
+        if value not in known:
+            raise self.fail(where, f"unknown {shown(value)} ({', '.join(known)})")
+        return str(value)
+
     def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
         value = self.entry(tree, key, where)
         text = str(value)  # `unit: 1` is a number to YAML
@@ -386,25 +419,35 @@ class _Reader:
             raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
         unit = {"time": "s", "periodic": "1", "step": "1", "turn_on": "1"}.get(kind) or self.unit(fields, where)
+        chosen: dict[str, Any] = {
+            key: self.choice(fields.get(key, known[0]), f"{where}.{key}", known)
+            for key, known in (("input", INPUTS), ("form", FORMS))
+        }
+        for form, key in NUMBER.items():
+            if key != "window_s" and key in fields and chosen["form"] != form:
+                raise self.fail(f"{where}.{key}", f"goes with form: {form} alone")
         priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
         if not priors:
             raise self.fail(f"{where}.sd", "must name at least one group")
         probability = self.number(fields.get("probability", 0.5), f"{where}.probability")
         if probability >= 1.0:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
-        needed = {
+        needed: dict[str, Any] = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
-            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s")
-            if key in REGRESSORS[kind] and (kind != "column" or key in fields)
+            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s", "lag_s", "width")
+            if key in REGRESSORS[kind] and (kind != "column" or key in fields or key == NUMBER.get(chosen["form"]))
         }
+        power = POWER.get(chosen["form"], 1) * (2 if chosen["input"] == "variance" else 1)
         return Regressor(
             name=self.text(fields, "name", where),
             kind=kind,
-            unit=f"{unit}/s" if kind == "rate" else unit,
+            unit=units.power(unit, power) + ("/s" if "rate" in (kind, chosen["form"]) else ""),
+            channel_unit=unit,
             sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
             probability=probability,
             reference=self.number(fields.get("reference", 0.0), f"{where}.reference", low=-math.inf, strict=False),
             column=self.text(fields, "column", where) if "column" in REGRESSORS[kind] else "",
+            **chosen,
             **needed,
         )
 

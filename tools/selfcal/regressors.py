@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.errors import UserError
+from selfcal.forms import formed, variance_of
 from selfcal.model import Model, Regressor
-from selfcal.recording import Recording, as_float
+from selfcal.recording import Recording, as_float, bridged
 from selfcal.result import HALF_90, AxisResult, of_mixture
 
 #: `selfcal_column_kind_t`: names in C, by number.
@@ -67,20 +68,36 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     turn-on's are those of the recording that the rows were cut from. A column with a `window_s` is the mean over that
     time up to each row. A step is 1 from its time on. A rate is the channel's gain over the last `window_s`, in the
     first window its gain since the first row, over `window_s`. Raises UserError for a column that is absent or of
-    another kind.
+    another kind. forms.py makes the forms that the library lacks, of its means.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
     check_channels(regressors, recording)
     channels = channels_of(regressors)
     regressors = from_time(regressors, recording.start_s)
-    values = [as_float(recording.in_unit(name, unit)) for name, unit in channels]
-    rows = np.ascontiguousarray(np.column_stack(values) if values else np.empty((recording.samples, 0), np.float32))
-    sources = [source for one in regressors for source in sources_of(one, channels)]
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
-    formed = _library32.form(sources, 1.0 / recording.rate_hz, rows, missing)
+    values = [
+        _varying(recording.in_unit(name, unit), missing) if by == "variance" else recording.in_unit(name, unit)
+        for name, unit, by in channels
+    ]
+    rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
+    sources = [source for one in regressors for source in sources_of(one, channels)]
+    interval_s = 1.0 / recording.rate_hz
+    made = _library32.form(sources, interval_s, np.ascontiguousarray(rows, np.float32), missing)
     left = [_left(one, recording.start_s) for one in regressors for _ in one.columns]
-    return np.ascontiguousarray(formed * np.array(left), np.float64)
+    columns = np.ascontiguousarray(made * np.array(left), np.float64)
+    place = 0
+    for one in regressors:
+        if one.form != "static":
+            column = formed(columns[:, place], one.form, one.number, one.reference, interval_s, missing)
+            columns[:, place] = as_float(column)
+        place += len(one.columns)
+    return columns
+
+
+def _varying(values: NDArray[np.float64], missing: NDArray[np.uint64]) -> NDArray[np.float64]:
+    """The variance of a channel at each sample; where there is none yet, the one before or the first."""
+    return bridged(variance_of(values, missing))
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
@@ -102,7 +119,7 @@ def _left(one: Regressor, start_s: float) -> float:
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
     """Raise UserError for a channel of the regressors that the recording has not."""
-    for name, _ in channels_of(regressors):
+    for name, *_ in channels_of(regressors):
         if name not in recording.columns:
             needs = next(one.name for one in regressors if one.column == name)
             raise UserError(
@@ -111,14 +128,16 @@ def check_channels(regressors: Sequence[Regressor], recording: Recording) -> Non
             )
 
 
-def channels_of(regressors: Sequence[Regressor]) -> list[tuple[str, str]]:
-    """Name and unit of every recorded channel that the regressors take, each once."""
-    named = ((one.column, one.unit.removesuffix("/s")) for one in regressors if one.kind == "rate")
-    plain = ((one.column, one.unit) for one in regressors if one.kind == "column")
-    return list(dict.fromkeys((*plain, *named)))
+def channels_of(regressors: Sequence[Regressor]) -> list[tuple[str, str, str]]:
+    """Name, unit and input of every recorded channel that the regressors take, each once."""
+    return list(dict.fromkeys(_channel(one) for kind in ("column", "rate") for one in regressors if one.kind == kind))
 
 
-def sources_of(one: Regressor, channels: Sequence[tuple[str, str]]) -> list[tuple[int, int, float]]:
+def _channel(one: Regressor) -> tuple[str, str, str]:
+    return one.column, one.channel_unit, one.input
+
+
+def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[tuple[int, int, float]]:
     """Kind, channel and number of each of its columns: `selfcal_source_t`."""
     if one.kind == "time":
         return [(_TIME, 0, 0.0)]
@@ -129,8 +148,8 @@ def sources_of(one: Regressor, channels: Sequence[tuple[str, str]]) -> list[tupl
     if one.kind == "periodic":
         return [(_SINE, 0, one.frequency_hz), (_COSINE, 0, one.frequency_hz)]
     if one.kind == "rate":
-        return [(_RATE, channels.index((one.column, one.unit.removesuffix("/s"))), one.window_s)]
-    return [(_CHANNEL, channels.index((one.column, one.unit)), 0.0 if math.isnan(one.window_s) else one.window_s)]
+        return [(_RATE, channels.index(_channel(one)), one.window_s)]
+    return [(_CHANNEL, channels.index(_channel(one)), one.mean_s)]
 
 
 def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
@@ -138,8 +157,8 @@ def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float6
     if window <= 1:
         return values
     rows = np.ascontiguousarray(values[:, None], np.float32)
-    formed = _library32.form([(_CHANNEL, 0, float(window))], 1.0, rows, np.zeros(values.size, np.uint64))
-    return np.asarray(formed[:, 0], np.float64)
+    made = _library32.form([(_CHANNEL, 0, float(window))], 1.0, rows, np.zeros(values.size, np.uint64))
+    return np.asarray(made[:, 0], np.float64)
 
 
 def offered(model: Model, axis: str) -> Choice:

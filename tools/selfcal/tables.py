@@ -277,7 +277,7 @@ def make_tables(
             RegressorTable(
                 column,
                 one.unit,
-                one.reference,
+                one.offset,
                 tuple(_coefficient_sd(model, one, name) for name in names),
                 _source(one, place),
                 len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
@@ -301,7 +301,7 @@ def _source(regressor: Regressor, place: int) -> tuple[int, float, str, str]:
     """Of a column by its place in the regressor."""
     channels = channels_of((regressor,))
     kind, _, number = sources_of(regressor, channels)[place]
-    return kind, number, *(channels[0] if channels else ("", ""))
+    return kind, number, *(channels[0][:2] if channels else ("", ""))
 
 
 def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:

@@ -183,6 +183,19 @@ def per_second(unit: str) -> str:
     return f"{unit[: match.start()]}/s^{int(match[1] or 1) + 1}"
 
 
+def power(unit: str, exponent: int) -> str:
+    """`unit` to a power: `m/s^2` squared is `m^2/s^4`."""
+    factors = []
+    for sign, part in re.findall(r"(\A|[*/])([^*/]*)", unit):
+        match = _FACTOR.match(part)
+        if match is None or exponent == 1 or part == "1":
+            factors.append(sign + part)
+            continue
+        raised = exponent * (Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1))
+        factors.append(sign + str(match["root"] or match["atom"]) + ("" if raised == 1 else f"^{raised}"))
+    return "".join(factors)
+
+
 def parameter_unit(parameter: str, unit: str) -> str:
     """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios) of an axis that reads in `unit`."""
     match parameter:

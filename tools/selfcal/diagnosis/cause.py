@@ -45,11 +45,11 @@ def is_count(value: float) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """One key of `simulate --effect`: its value when it is not given, and which values it may have (`fits`, `limits` in
-    words). `field`: the member of the simulator's axis, or scene, that takes it; "" where `Cause.add` or the read-out
-    does."""
+    """One key of `simulate --effect`: its value when it is not given (None: then it is not there), and which values it
+    may have (`fits`, `limits` in words). `field`: the member of the simulator's axis, or scene, that takes it; "" where
+    `Cause.add` or the read-out does."""
 
-    default: Callable[[Setting], float]
+    default: Callable[[Setting], float] | None
     field: str = ""
     fits: Callable[[float], bool] = _any
     limits: str = "finite"
@@ -111,6 +111,7 @@ class Cause:
     together     nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
     least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
     entry        the model file's entry of its column for the whole recording.
+    smoothed     its column is the mean of a channel: the model file states the trailing window that suits it.
     from_zero    the simulator's effect begins at 0, its column is about the middle.
     extend       writes what is no column into the model file.
     of_column    keys of `--effect` for its columns: the first one and the coefficients of all.
@@ -140,6 +141,7 @@ class Cause:
     together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]] | None = None
     least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
     entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
+    smoothed: bool = False
     from_zero: bool = False
     extend: Callable[[Extension], None] | None = None
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
@@ -149,6 +151,11 @@ class Cause:
     common: bool = False
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+    @property
+    def several(self) -> bool:
+        """Whether the simulator makes several of its effects on an axis: it has no member that holds one."""
+        return self.add is not None and not any(key.field for key in self.keys.values())
 
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:

@@ -18,6 +18,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.ending import Stopped
 from selfcal.errors import UserError, remark
+from selfcal.forms import NUMBER, formed
 from selfcal.laws import averaged
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.regressors import trailing_mean
@@ -76,6 +77,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
     stated = {column for one in model.regressors for column in one.columns}
     entries: dict[str, dict[str, Any]] = {}
     strength: dict[str, float] = {}
+    smoothed: set[str] = set()
     for name, one in found.items():
         group = model.group_of(name).name
         for k, regressor in enumerate(one.state.regressors):
@@ -84,6 +86,12 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             key = regressor_key(regressor.name)
             own = CAUSES[regressor.cause].entry(regressor.entry, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
+            if (
+                CAUSES[regressor.cause].smoothed
+                and entry["kind"] == "column"
+                and entry.get("form") not in ("lag", "rate")
+            ):
+                smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))
             strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
@@ -93,17 +101,17 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
         entry = entries[key]
         columns = _columns_of(entry)
         if used + columns <= MOST_COLUMNS:
-            if key in record.channels:
+            if key in smoothed:
                 _smooth(entry, key, found)
             kept.append(entry)
             used += columns
     return kept
 
 
-def _smooth(entry: dict[str, Any], channel: str, found: Mapping[str, Diagnosed]) -> None:
+def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
     """The window whose trailing mean explains the axes best. A centred mean, which the diagnosis takes, needs values
     that a module does not have yet; a trailing one lags, so a shorter window suits it."""
-    explained = [one for one in found.values() if any(column.name == channel for column in one.state.regressors)]
+    explained = [one for one in found.values() if any(column.name == name for column in one.state.regressors)]
     record = max((one.record for one in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
     for width in WINDOWS_S:
@@ -111,9 +119,7 @@ def _smooth(entry: dict[str, Any], channel: str, found: Mapping[str, Diagnosed])
         if window > record.present.size // 10:
             break
         try:
-            gains[width if window > 1 else 0.0] = sum(
-                _with_values(one, channel, width, float(entry["reference"])) for one in explained
-            )
+            gains[width if window > 1 else 0.0] = sum(_with_values(one, name, width, entry) for one in explained)
         except Stopped:  # the shortest, which suits any
             break
     best = max(gains, key=lambda width: gains[width], default=0.0)
@@ -122,12 +128,15 @@ def _smooth(entry: dict[str, Any], channel: str, found: Mapping[str, Diagnosed])
         entry["window_s"] = best
 
 
-def _with_values(one: Diagnosed, channel: str, width: float, reference: float) -> float:
-    """ln likelihood of the axis with trailing means of `width` s as the values of a channel, at the drift found."""
+def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, Any]) -> float:
+    """ln likelihood of the axis with a column of trailing means of `width` s, at the drift found."""
     record = one.record
-    values = trailing_mean(record.channels[channel], max(1, round(width * record.rate_hz))) - reference
+    channel = record.channel_of(str(entry["column"]), str(entry.get("input", "value")))
+    means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
+    form, about = str(entry.get("form", "static")), float(entry["reference"])
+    values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
     columns = tuple(
-        replace(column, values=values) if column.name == channel else column for column in one.state.regressors
+        replace(column, values=values) if column.name == name else column for column in one.state.regressors
     )
     fit = one.state.best
     return finish(replace(one.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
@@ -185,7 +194,7 @@ def _effects(name: str, one: Diagnosed) -> list[str]:
     kind on an axis: the strongest. Those that a cause adds are all there."""
     strongest: dict[object, tuple[Cause, float, dict[str, Any]]] = {}
     for k, (cause, strength, pairs) in enumerate([*_of_columns(one), *_of_findings(one)]):
-        place = cause.id if cause.add is None else k
+        place = k if cause.several else cause.id
         if place not in strongest or strongest[place][1] < strength:
             strongest[place] = (cause, strength, pairs)
     texts = []
@@ -212,6 +221,7 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
     sizes: dict[str, list[int]] = {}
     for k, column in enumerate(one.state.regressors):
         sizes.setdefault(regressor_key(column.name), []).append(k)
+    forms: dict[tuple[str, str, str], tuple[Cause, float, dict[str, Any]]] = {}
     for places in sizes.values():
         column = one.state.regressors[places[0]]
         c = [float(fit.c[1 + k]) for k in places]
@@ -220,7 +230,15 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
         )
         cause = CAUSES.get(column.cause)
         if cause is not None and cause.of_column is not None:
-            yield cause, strength, cause.of_column(column, c)
+            pairs = cause.of_column(column, c)
+            if "column" not in column.entry:
+                yield cause, strength, pairs
+                continue
+            # The forms of one channel are one effect.
+            key = (cause.id, str(column.entry["column"]), str(column.entry.get("input", "value")))
+            _, before, others = forms.get(key, (cause, 0.0, {}))
+            forms[key] = (cause, before + strength, {**pairs, **others} | {k: v for k, v in pairs.items() if v})
+    yield from forms.values()
 
 
 def check_not_by_hand(path: Path | str) -> None:

@@ -206,7 +206,7 @@ def _rounds(
         looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least)
         if waiting and (not looks or looks[0].net < least):
             more, unworthy = _looked(one, record, waiting, least)
-            looks, idle = sorted([*looks, *more], key=lambda look: -look.net), idle | unworthy
+            looks, idle = _by_worth([*looks, *more]), idle | unworthy
         else:
             idle |= set(waiting)
         one.refused = looks
@@ -237,7 +237,12 @@ def _looked(
         found += looks
         if all(look.net < least for look in looks):
             idle.add(cause)
-    return sorted(found, key=lambda look: -look.net), idle
+    return _by_worth(found), idle
+
+
+def _by_worth(looks: Sequence[Look]) -> list[Look]:
+    """The most worth first; what has no name comes after every cause that has one."""
+    return sorted(looks, key=lambda look: (look.cause == "unexplained" or look.net < NET_LEAST, -look.net))
 
 
 def _share(found: Mapping[str, Diagnosed]) -> None:
@@ -260,6 +265,8 @@ def _unexplained(one: Diagnosed) -> None:
     if one.state.below_lattice:
         return
     one.after = judged(one.state, seed=1)
+    if any(finding.look.cause == "unexplained" for finding in one.findings):
+        return
     p = combined(one.after)
     if P_CERTAIN < p < P_UNEXPLAINED:
         one.after = judged(one.state, seed=2, count=AGAIN)

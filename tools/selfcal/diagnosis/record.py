@@ -13,6 +13,7 @@ from selfcal import _library32
 from selfcal.diagnosis.state import Regressor, State
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.errors import UserError
+from selfcal.forms import variance_of
 from selfcal.model import Group, Model
 from selfcal.model import Regressor as Stated
 from selfcal.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
@@ -42,7 +43,8 @@ class Record:
     """All axes of a recording on its grid of n instants. `channels`: temperature and supply where they were recorded,
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `present` [n]: where the grid
     has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
-    the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it."""
+    the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it. `roughness` [n] of each axis:
+    variance of its noise by differences of the samples as recorded."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -55,6 +57,7 @@ class Record:
     change: RateChange | None = None
     unclipped: Mapping[str, Array] = field(default_factory=dict)
     start_s: float = 0.0
+    roughness: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def time_s(self) -> Array:
@@ -63,6 +66,21 @@ class Record:
     def other_axes(self, axis: str) -> dict[str, Array]:
         """The other axes about their level, bridged where missing."""
         return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
+
+    def variances(self, axis: str) -> dict[str, Array]:
+        """Short-term variance of the other axes, bridged where an axis is missing or left out."""
+        return {
+            name: bridged(np.where(np.isfinite(self.axes[name].y), values, np.nan))
+            for name, values in self.roughness.items()
+            if name != axis and name in self.axes and np.isfinite(self.axes[name].y + values).sum() > 1
+        }
+
+    def channel_of(self, column: str, by: str = "value") -> Array:
+        """The values of a side channel or another axis, or its variance."""
+        if by == "variance":
+            return self.variances("")[column]
+        causes = {name: cause for cause, name in self.channel_names.items()}
+        return self.channels[causes[column]] if column in causes else self.other_axes("")[column]
 
 
 def of_recording(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
@@ -117,9 +135,12 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
                 "frequency_hz": one.frequency_hz,
                 "time_s": one.time_s - recording.start_s,
                 "time_constant_s": one.time_constant_s,
+                "kind": one.kind,
+                "form": one.form,
+                "input": one.input,
             }
             for column, row in zip(one.columns, values.T, strict=True):
-                about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.reference
+                about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.offset
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
         return tuple(found)
 
@@ -137,6 +158,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     gone: dict[str, Missing] = {}
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
+    roughness: dict[str, Array] = {}
     for name in known:
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
@@ -170,6 +192,9 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             gone[name] = lost
         found = one.lattice
         level = float(np.nanmedian(y))
+        alone = recording.along(name)
+        rough = variance_of(alone.in_unit(name, group.unit), alone.missing_before)
+        roughness[name] = on_grid(replace(alone.clock, start_s=recording.clock_of(name).start_s), rough)[0]
         if each == 1 and one.clipped is not None:
             unclipped[name] = on_grid(clock, spread(one.drawn))[0] - level
         states[name] = State(
@@ -206,6 +231,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         change,
         unclipped,
         recording.start_s,
+        roughness,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from selfcal.diagnosis.fit import FTOL, Fit, Series, best, curved, finish, fit, moved, nodes, refit, run
+from selfcal.diagnosis.fit import FTOL, Fit, Series, Sums, best, curved, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.diagnosis.statemodel import Array, Terms
 from selfcal.errors import UserError
 from selfcal.result import HALF_90, of_mixture
@@ -27,6 +27,8 @@ FAR = 40.0
 ALIKE = 3.0
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
+#: Columns that one pass of the filter takes beside the model's.
+ABREAST = 8
 
 
 #: No term beside white noise and the drift.
@@ -106,6 +108,16 @@ class State:
         residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
         return replace(state, whitened=residual, variance=s * chosen.sigma**2)
 
+    def stiffer(self, by: float) -> list[Fit]:
+        """The best fit with a drift smaller by exp(-by), if it has one."""
+        fit = self.best
+        names = [name for name in ("ln_rho", "ln_markov", "ln_flicker") if name in fit.terms.names]
+        if not names:
+            return []
+        lower = np.array([by if name in names else 0.0 for name in fit.terms.names])
+        limits = np.array(fit.terms.limits(self.dt)).reshape(-1, 2)
+        return [replace(fit, theta=np.maximum(fit.theta - lower, limits[:, 0]))]
+
     def with_columns(self, more: Array) -> tuple[float, Fit]:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
         fits = [self.fitted_with(terms, more) for terms in self.near()]
@@ -115,24 +127,48 @@ class State:
         """The fit of one drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
 
-    def posterior(self, more: Array) -> tuple[Array, Array, Array]:
+    def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
         """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
-        [m], means [m, k] and standard deviations [m, k] of the normals that they are the sum of."""
-        series = self.series.beside(more)
-        k = len(np.atleast_2d(more))
+        [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
+        `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
+        blocks = [np.atleast_2d(one) for one in alternatives]
+        series = self.series.beside(blocks[0])
         drifts = [*self.near()]
         if not self.extras.flicker:
             drifts.append(self.rich.terms)
-        ln_weight, means, sds = [], [], []
+        k = len(blocks[0])
+        found: list[tuple[Array, Array, Array]] = []
         for terms in drifts:
-            started = refit(series, self.rich) if terms == self.rich.terms else self.fitted_with(terms, more)
+            started = refit(series, self.rich) if terms == self.rich.terms else self.fitted_with(terms, blocks[0])
             for theta, ln_share in nodes(series, started):
-                one = finish(series, terms, theta)
-                ln_weight.append(ln_share + one.ln_likelihood + float(np.log(one.sd[-k:]).sum()))
-                means.append(one.c[-k:])
-                sds.append(one.sd[-k:])
-        value = np.array(ln_weight)
-        return np.exp(value - value.max()), np.array(means), np.array(sds)
+                ln_weight, means, sds = [], [], []
+                for sums in self._sums(terms, theta, blocks):
+                    c, inverse, rss = sums.coefficients()
+                    sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
+                    ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
+                    means.append(c[-k:])
+                    sds.append(sd)
+                found.append((np.array(ln_weight), np.array(means), np.array(sds)))
+        value = np.array([one[0] for one in found]).T
+        places = [np.swapaxes(np.array([one[i] for one in found]), 0, 1) for i in (1, 2)]
+        return np.exp(value - value.max()), places[0], places[1]
+
+    def _sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
+        """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
+        known = 1 + 1 + len(self.regressors)
+        at = 0
+        while at < len(blocks):
+            upto, width = at, 0
+            while upto < len(blocks) and (upto == at or width + len(blocks[upto]) <= ABREAST):
+                width += len(blocks[upto])
+                upto += 1
+            sums = run(self.series.beside(np.vstack(blocks[at:upto])), terms, theta)[0][0]
+            place = known
+            for block in blocks[at:upto]:
+                chosen = [*range(known), *range(place, place + len(block))]
+                yield replace(sums, G=sums.G[np.ix_(chosen, chosen)], x=sums.x[chosen])
+                place += len(block)
+            at = upto
 
     @cached_property
     def rich(self) -> Fit:
@@ -148,20 +184,12 @@ class State:
         after = refit(self.series.beside(more), self.rich)
         return after.ln_likelihood - max(self.rich.ln_likelihood, self.best.ln_likelihood)
 
-    def scores(self, more: Array) -> Array:
-        """Gain [k] of each further column alone at the fitted drift: one pass for all of them."""
-        found: list[float] = []
-        for at in range(0, len(more), 8):
-            series = self.series.beside(more[at : at + 8])
-            G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
-            known = 1 + len(self.regressors) + 1
-            inner = np.linalg.pinv(G[1:known, 1:known], rcond=1e-12, hermitian=True)
-            for k in range(known, len(G)):
-                cross = G[1:known, k]
-                A = G[k, k] - cross @ inner @ cross
-                B = G[k, 0] - cross @ inner @ G[1:known, 0]
-                found.append(0.5 * B * B / A if 1e-9 * G[k, k] < A and A > 0.0 else 0.0)
-        return np.array(found)
+    def scores(self, blocks: Sequence[Array], at: Fit | None = None) -> Array:
+        """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
+        from below for what they gain with it refitted. One pass for many of them."""
+        at = self.best if at is None else at
+        found = [ln_likelihood(sums) for sums in self._sums(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])]
+        return np.array(found) - self.best.ln_likelihood
 
     def least(self, column: Array) -> float:
         """The coefficient of a column that gains NET_LEAST at the fitted noise."""

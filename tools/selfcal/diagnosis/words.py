@@ -30,6 +30,16 @@ LABELS = {
     "time_constant_s": "time constant",
     "amplitude_2": "second amplitude",
     "time_constant_2_s": "time constant",
+    "lag_s": "time constant of the lag",
+    "width": "width of the play",
+}
+#: What a form adds to the sentence; the static one is what the sentence says by itself.
+FORMS = {
+    "lag": "late by a first-order lag",
+    "rate": "by its rate",
+    "square": "by its square as well",
+    "cube": "by its cube as well",
+    "play": "through a play (hysteresis)",
 }
 #: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
 #: coefficient so many times larger is no leak of that kind.
@@ -66,6 +76,12 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             parts.append(_intervals(value))
         elif key == "band_hz":
             parts.append(f"between {value[0]:.3g} Hz and {value[1]:.3g} Hz")
+        elif key == "form":
+            parts += [FORMS[value]] if value in FORMS else []
+        elif key == "form_also_possible":
+            parts.append(f"not to be told from {', '.join(value)}")
+        elif key == "input":
+            continue
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)

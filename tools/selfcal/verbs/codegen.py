@@ -102,7 +102,14 @@ def assumption(tables: Tables) -> str:
 
 def write_tables(model: Model, tables: Tables, folder: Path, target: str, start: str = "") -> None:
     """Write the files into `folder`, the sizes as for a core. `start`: where measured priors come from. Raises
-    UserError if it cannot be written."""
+    UserError if it cannot be written, or if a regressor has a form that the library does not make."""
+    for one in model.regressors:
+        if not one.on_module:
+            what = f"form: {one.form}" if one.form != "static" else f"input: {one.input}"
+            raise UserError(
+                f"{model.path}: regressor '{one.name}': no module makes `{what}` yet: leave the regressor out, or take "
+                "`identify`, which does"
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -25,6 +25,7 @@ from selfcal.diagnosis.causes import (
     turn_on,
     unexplained,
     variance_change,
+    vibration,
 )
 
 CAUSES: Mapping[str, _Cause] = MappingProxyType(
@@ -34,6 +35,7 @@ CAUSES: Mapping[str, _Cause] = MappingProxyType(
             temperature,
             supply,
             cross_axis,
+            vibration,
             shared,
             ramp,
             step,

@@ -1,4 +1,4 @@
-"""Another axis leaks into this one: its readings as a column."""
+"""Another axis leaks into this one: at once, through a filter, by its rate or its square."""
 
 from __future__ import annotations
 
@@ -6,13 +6,42 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.causes import regressors
 from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.forms import Channel
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import ALIKE, Regressor, State
+from selfcal.diagnosis.state import ALIKE, Look, Regressor, State
 from selfcal.regressors import coefficient_unit
+
+#: Windows of a rate, s: another axis moves faster than a temperature.
+RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """One look for every other axis."""
+    others = {name: values for name, values in record.other_axes(state.axis).items() if np.ptp(values) > 0.0}
+    return forms.look(
+        state,
+        [
+            Channel(
+                "cross_axis",
+                f"axis_{name}",
+                name,
+                record.axes[name].unit,
+                values,
+                rate_windows_s=RATE_WINDOWS_S,
+                forms=("static", "lag", "rate", "square"),
+                slow=False,
+                ln_looks=math.log(len(others)),
+                extra={"other": name},
+            )
+            for name, values in others.items()
+        ],
+    )
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
@@ -25,7 +54,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
         for finding in one.findings
-        if finding.look.cause == "cross_axis"
+        if finding.look.cause == "cross_axis" and finding.look.estimate["form"] == "static"
     }
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
@@ -44,8 +73,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
 
 def without(state: State, other: str) -> State:
-    """The state without the column of another axis."""
-    kept = tuple(column for column in state.regressors if column.name != f"axis_{other}")
+    """The state without the columns of another axis."""
+    kept = tuple(one for one in state.regressors if one.cause != "cross_axis" or one.entry["column"] != other)
     return state.refit(regressors=kept)
 
 
@@ -61,23 +90,26 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
 
 def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
     """A module knows the reading and not its level."""
+    if entry.get("form") == "rate":
+        return dict(entry)
     return {**entry, "reference": digits(record.axes[str(entry["column"])].level)}
 
 
 def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
-    return {"coefficient": c[0], "other": str(column.entry["column"])}
+    return {**forms.of_column(column, c), "other": str(column.entry["column"])}
 
 
 CAUSE = Cause(
     "cross_axis",
     "Another axis leaks into this one.",
     "Turn the sensor so that the other axis reads something else.",
-    looks=regressors.looks,
+    looks=looks,
     settle=_settle,
     pictures=shown("means", "evidence"),
     least=_least,
     entry=_entry,
     of_column=_of_column,
-    keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient")},
+    keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
+    add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
     follows=True,
 )

@@ -164,7 +164,7 @@ def _line(state: State, record: Record) -> list[Look]:
     amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
 
     def measure() -> dict[str, Any]:
-        weight, means, sds = state.posterior(pair)
+        weight, means, sds = (of[0] for of in state.posterior(pair))
         return {"amplitude": mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)}
 
     name = f"line_{f:.6g}Hz"

@@ -2,10 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.causes import regressors
+from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import State
+from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.regressors import coefficient_unit
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """One look while the model has no ramp."""
+    if any(one.name == "time" for one in state.regressors):
+        return []
+    t = record.time_s
+    middle = float(0.5 * t[-1])
+    column = Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})
+    if state.scores([column.values])[0] < SCREEN:
+        return []
+    gain, fit = state.with_columns(column.values)
+    gain = min(gain, state.rich_gain(column.values))
+    worth = net(gain, 1, LN_SLOW)
+    if worth < 1.0:
+        return []
+    unit = coefficient_unit(state.unit, column.unit)
+    slope = interval(float(fit.c[-1]), float(fit.sd[-1]), unit)
+
+    def measure() -> dict[str, Any]:
+        weight, means, sds = (of[0] for of in state.posterior(column.values))
+        return {"slope": mixture(weight, means[:, 0], sds[:, 0], unit)}
+
+    changes = {"regressors": (*state.regressors, column)}
+    return [Look("ramp", gain, worth, {"slope": slope}, changes, measure=measure)]
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
@@ -17,7 +45,7 @@ CAUSE = Cause(
     "ramp",
     "The bias drifts at a constant rate.",
     "Record three times as long, with the temperature beside it.",
-    looks=regressors.looks,
+    looks=looks,
     slow=True,
     pictures=shown("means", "evidence"),
     least=_least,

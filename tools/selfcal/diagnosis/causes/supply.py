@@ -1,18 +1,20 @@
-"""The bias follows the supply voltage: its channel as a column."""
+"""The bias follows the supply voltage, in any of its forms."""
 
 from __future__ import annotations
 
+from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.causes import regressors
 
 CAUSE = Cause(
     "supply",
     "The bias follows the supply voltage.",
     "Change the supply by 0.1 V and back, twice, at a constant temperature.",
-    looks=regressors.looks,
+    looks=lambda state, record: forms.side_looks(state, record, "supply"),
     alike=lambda a, b: True,
     pictures=shown("means", "evidence"),
-    least=lambda state, record: regressors.least(state, record, "supply"),
-    of_column=lambda column, c: {"coefficient": c[0]},
-    keys={"coefficient": Key(lambda s: 50.0 * s.n, "supply_coefficient")},
+    least=lambda state, record: forms.least(state, record, "supply"),
+    smoothed=True,
+    of_column=forms.of_column,
+    keys={"coefficient": Key(lambda s: 50.0 * s.n, "supply_coefficient"), **forms.EFFECT_KEYS},
+    add=lambda keys, channels: forms.added(keys, channels, channels.supply),
 )

@@ -1,19 +1,21 @@
-"""The bias follows the temperature: its channel as a column."""
+"""The bias follows the temperature, in any of its forms."""
 
 from __future__ import annotations
 
+from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.causes import regressors
 
 CAUSE = Cause(
     "temperature",
     "The bias follows the temperature.",
     "Cycle the temperature up and down, so that it does not only rise with time.",
-    looks=regressors.looks,
+    looks=lambda state, record: forms.side_looks(state, record, "temperature"),
     alike=lambda a, b: True,
     pictures=shown("means", "evidence"),
-    least=lambda state, record: regressors.least(state, record, "temperature"),
+    least=lambda state, record: forms.least(state, record, "temperature"),
+    smoothed=True,
     from_zero=True,
-    of_column=lambda column, c: {"coefficient": c[0]},
-    keys={"coefficient": Key(lambda s: 0.3 * s.n, "temperature_coefficient")},
+    of_column=forms.of_column,
+    keys={"coefficient": Key(lambda s: 0.3 * s.n, "temperature_coefficient"), **forms.EFFECT_KEYS},
+    add=lambda keys, channels: forms.added(keys, channels, channels.temperature),
 )

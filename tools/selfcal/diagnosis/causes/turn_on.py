@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
-from selfcal.diagnosis.causes.regressors import LN_SLOW
 from selfcal.diagnosis.fit import Fit, Series, nodes, refit, run
+from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, mixture, net

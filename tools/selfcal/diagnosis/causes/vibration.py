@@ -1,0 +1,75 @@
+"""Vibration that rectifies: the bias follows the short-term variance of another axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from selfcal.diagnosis import forms
+from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.forms import LN_SLOW, Channel
+from selfcal.diagnosis.record import Record, smoothed
+from selfcal.diagnosis.state import Look, Regressor, State
+from selfcal.diagnosis.statemodel import Array
+from selfcal.forms import variance_of
+from selfcal.recording import bridged
+
+#: Widths of the means of a variance, s.
+WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
+#: Differences that a variance is taken from at least: one alone scatters by 1.7 times itself.
+LEAST = 8
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """One look for every other axis whose variance is known."""
+    others = {name: values for name, values in record.variances(state.axis).items() if np.ptp(values) > 0.0}
+    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= LEAST) or WIDTHS_S[-1:]
+    return forms.look(
+        state,
+        [
+            Channel(
+                "vibration",
+                f"vibration_{name}",
+                name,
+                record.axes[name].unit,
+                values,
+                input="variance",
+                reference=float(f"{values.mean():.6g}"),
+                widths_s=widths,
+                forms=("static", "lag"),
+                ln_looks=LN_SLOW + math.log(len(others)),
+                extra={"other": name},
+            )
+            for name, values in others.items()
+        ],
+    )
+
+
+def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    return {**forms.of_column(column, c), "other": str(column.entry["column"])}
+
+
+def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
+    """The variance of 1 s of the other axis, about its mean."""
+    interval_s = float(channels.time_s[1] - channels.time_s[0])
+    variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(LEAST, round(1.0 / interval_s)))
+    about: Array = variance - variance.mean()
+    return float(keys["coefficient"]) * about + forms.added(keys, channels, about)
+
+
+CAUSE = Cause(
+    "vibration",
+    "The bias follows the vibration of another axis.",
+    "Switch the source of the vibration off and on, twice.",
+    looks=looks,
+    alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
+    pictures=shown("means", "evidence"),
+    smoothed=True,
+    of_column=_of_column,
+    keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
+    follows=True,
+    add=_add,
+)

@@ -1,0 +1,454 @@
+"""How a channel acts on an axis: its forms scored side by side with the drift refitted, and the look at the best.
+
+A channel is the temperature, the supply, another axis, or another axis' short-term variance. Its influence may be
+static, late by a first-order lag, its rate, its square or cube, or come through a play. Each form is one or more
+columns. The simplest form is taken unless another gains clearly more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.stats import chi2
+
+from selfcal.diagnosis.cause import Channels, Key
+from selfcal.diagnosis.fit import Fit, run
+from selfcal.diagnosis.record import Record, smoothed
+from selfcal.diagnosis.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.diagnosis.statemodel import Array
+from selfcal.forms import FORMS, NUMBER, POWER, formed
+from selfcal.recording import SIDE_CHANNELS
+from selfcal.regressors import coefficient_unit
+from selfcal.units import power
+
+#: The columns of each form: a power comes with all that are simpler.
+PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube")}
+#: Estimate key of a column's coefficient; of all others `coefficient`.
+KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
+#: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
+#: file's window is as wide and trails: a module has no later values.
+SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
+#: Windows of a rate, s. A lattice of 0.14 degC wants a long one, a large coefficient a short one: it lags by half.
+RATE_WINDOWS_S = (20.0, 40.0, 60.0, 90.0, 150.0, 400.0)
+#: Widths of a play over the channel's own range.
+PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
+#: A lag is looked at up to this share of the record: a longer one is a ramp as well.
+LONGEST_LAG = 1.0 / 3.0
+#: A lag or a play that changes the column by less than this share of it is none.
+ALIKE_COLUMN = 0.1
+#: Forms that are refitted: those that score best.
+REFITTED = 3
+#: A drift of less: where a form has pulled the drift up, its score is too small there.
+STIFFER = 1.5
+#: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
+LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "cube": 2.0, "play": 3.0}
+#: Numbers of a lag or a play that stand for its posterior.
+FINE = 15
+#: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
+LN_SMOOTHINGS = math.log(2.0)
+#: A drift that is known from few of its own turns leaves slow columns a longer tail. Of 2267 clean axes at 1 and 10 Hz
+#: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
+#: on to 10.2. With 1.8 two show 7.6 of any.
+LN_SLOW = 1.8
+#: Bands of equal information that must agree on another axis' coefficient.
+BANDS = 16
+#: Drawn records of a channel's own noise, and the share of a coefficient that it leaves at least.
+NOISES = 4
+KEPT_LEAST = 0.3
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What may act: `values` [n] of the channel `column` in `unit`, about `reference` of it. `name` is that of its
+    regressors, `widths_s` of its smoothing means. `slow`: its gain must hold beside a drift of two terms. `extra`: what
+    the estimate says of it. `ln_looks`: price of its search."""
+
+    cause: str
+    name: str
+    column: str
+    unit: str
+    values: Array
+    input: str = "value"
+    reference: float = 0.0
+    widths_s: tuple[float, ...] = (0.0,)
+    rate_windows_s: tuple[float, ...] = RATE_WINDOWS_S
+    forms: tuple[str, ...] = FORMS
+    slow: bool = True
+    noisy: bool = False
+    ln_looks: float = 0.0
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def of(self) -> str:
+        """Unit of what acts."""
+        return power(self.unit, 2) if self.input == "variance" else self.unit
+
+
+@dataclass(frozen=True)
+class Option:
+    """One form with its number: a time constant, s, or a width; `regressors` are its columns."""
+
+    form: str
+    number: float
+    regressors: tuple[Regressor, ...]
+    window: int = 1
+
+    @property
+    def columns(self) -> Array:
+        return np.array([one.values for one in self.regressors])
+
+
+def side_looks(state: State, record: Record, cause: str) -> list[Look]:
+    """The look at a side channel, if it was recorded."""
+    if cause not in record.channels:
+        return []
+    values = record.channels[cause]
+    channel = Channel(
+        cause,
+        cause,
+        record.channel_names[cause],
+        SIDE_CHANNELS[cause][1],
+        values,
+        reference=float(np.round(values.mean(), 3)),
+        widths_s=SMOOTHING_S,
+        noisy=True,
+        ln_looks=LN_SMOOTHINGS + LN_SLOW,
+    )
+    return look(state, [channel])
+
+
+def look(state: State, channels: Sequence[Channel]) -> list[Look]:
+    """The look of each channel that is worth one nat."""
+    return [one for channel in channels for one in _look(state, channel)]
+
+
+def column_of(channel: Channel, state: State, form: str, number: float, width_s: float) -> Option:
+    """A form's columns as the diagnosis takes them: of centred means, which have no lag of their own."""
+    window = max(1, round(width_s / state.dt))
+    about = smoothed(channel.values, window) - channel.reference
+    entry: dict[str, Any] = {"kind": "column", "column": channel.column, "unit": channel.unit}
+    entry |= {"input": channel.input} if channel.input != "value" else {}
+    entry |= {"reference": channel.reference}
+    smooth = {"window_s": width_s} if window > 1 else {}
+
+    def regressor(form: str, values: Array, **more: Any) -> Regressor:
+        name = channel.name if form == "static" else f"{channel.name}_{form}"
+        unit = power(channel.of, POWER.get(form, 1)) + ("/s" if form == "rate" else "")
+        stated = {"form": form} if form != "static" else {}
+        own = {key: value for key, value in entry.items() if form != "rate" or key != "reference"}
+        return Regressor(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
+
+    known = {form_of(one) for one in state.regressors}
+    parts = [part for part in PARTS.get(form, (form,)) if (channel.column, channel.input, part) not in known]
+    return Option(
+        form,
+        number,
+        tuple(
+            regressor(
+                part, formed(about, part, number, 0.0, state.dt), **({NUMBER[part]: number} if part in NUMBER else {})
+            )
+            for part in parts
+        ),
+        window,
+    )
+
+
+def form_of(column: Regressor) -> tuple[str, str, str]:
+    """Channel, input and form of a column in a model; no channel for one of time alone."""
+    entry = column.entry
+    form = "rate" if entry.get("kind") == "rate" else str(entry.get("form", "static"))
+    return str(entry.get("column", "")), str(entry.get("input", "value")), form
+
+
+def options_of(channel: Channel, state: State) -> Iterator[Option]:
+    """Every form over its grid of numbers and smoothing means."""
+    n, dt = channel.values.size, state.dt
+    widths = [width for k, width in enumerate(channel.widths_s) if k == 0 or round(width / dt) <= n // 10]
+    middle = widths[len(widths) // 2]
+    known = {form_of(one) for one in state.regressors}
+    for form in channel.forms:
+        if (channel.column, channel.input, form) in known:
+            continue
+        if form == "lag":
+            yield from (column_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
+        elif form == "rate":
+            windows = [max(window, dt) for window in channel.rate_windows_s if window <= n * dt / 6.0]
+            yield from (column_of(channel, state, form, window, 0.0) for window in dict.fromkeys(windows))
+        elif form == "play":
+            span = float(np.ptp(smoothed(channel.values, max(1, round(middle / dt)))))
+            yield from (column_of(channel, state, form, share * span, middle) for share in PLAYS)
+        else:
+            yield from (column_of(channel, state, form, math.nan, width) for width in widths)
+
+
+def _lags(channel: Channel, state: State) -> list[float]:
+    """Time constants a factor 2 apart from dt to a third of the record, less those that the channel is too slow for."""
+    dt = state.dt
+    about = channel.values - channel.values.mean()
+    longest = LONGEST_LAG * about.size * dt
+    found = dt * 2.0 ** np.arange(max(1, math.floor(math.log2(max(longest / dt, 1.0))) + 1))
+    if not channel.noisy:
+        return [float(lag) for lag in found]
+    smooth = smoothed(about, max(1, round(channel.widths_s[-1] / 3.0 / dt)))
+    spread = float(smooth.std())
+    return [float(lag) for lag in found if _differs(formed(smooth, "lag", lag, 0.0, dt), smooth, spread)]
+
+
+def _differs(column: Array, plain: Array, spread: float) -> bool:
+    """Whether a column is another one than the plain one times a constant."""
+    a, b = column - column.mean(), plain - plain.mean()
+    left = a - b * (float(a @ b) / max(float(b @ b), 1e-300))
+    return float(left.std()) > ALIKE_COLUMN * spread
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A form's best option: gain, worth net of its search, and the fit with its columns where that was made."""
+
+    option: Option
+    gain: float
+    net: float
+    fit: Fit
+
+
+def _look(state: State, channel: Channel) -> list[Look]:
+    tried = _tried(state, channel)
+    if not tried:
+        return []
+    best = max(one.net for one in tried.values())
+    if best < 1.0:
+        return []
+    alike = [form for form in FORMS if form in tried and tried[form].net > best - ALIKE]
+    if "lag" in alike and tried["lag"].option.number > LONGEST_LAG / 2.0 * channel.values.size * state.dt:
+        # The longest lag that is looked at sums the channel up: any slower change of it looks so.
+        alike.append(alike.pop(alike.index("lag")))
+    chosen = tried[alike[0]]
+    if not channel.slow:
+        constant = [form for form in alike if _constant(state, tried[form])]
+        if not constant:
+            # The coefficient depends on the frequency, and no form explains it: no cause, and not nothing either.
+            if best < NET_LEAST:
+                return []
+            estimate = {"statistic": f"dependence on {channel.column}", "measured": _inconstant(state, chosen)}
+            return [Look("unexplained", chosen.gain, chosen.net, estimate, {}, shown_by=channel.column)]
+        chosen = tried[constant[0]]
+    estimate = _estimate(state, channel, chosen)
+    rivals = [form for form in alike if form != chosen.option.form]
+    estimate |= {"form_also_possible": rivals} if rivals else {}
+    changes = {"regressors": (*state.regressors, *chosen.option.regressors)}
+
+    def measure() -> dict[str, Any]:
+        return _measured(state, channel, chosen)
+
+    return [Look(channel.cause, chosen.gain, chosen.net, estimate, changes, measure=measure)]
+
+
+def _tried(state: State, channel: Channel) -> dict[str, _Tried]:
+    """The best option of each form. Scores rank them at the drift without the channel and at a stiffer one; each refit
+    gives a drift at which all are scored again."""
+    options = [one for one in options_of(channel, state) if all(np.ptp(column) > 0.0 for column in one.columns)]
+    if not options:
+        return {}
+    blocks = [one.columns for one in options]
+    drifts = [state.best, *state.stiffer(STIFFER)]
+    gains = np.max([state.scores(blocks, at) for at in drifts], axis=0)
+    if gains.max() < SCREEN:
+        return {}
+    done: dict[str, tuple[float, Option, Fit]] = {}
+    for _ in range(REFITTED):
+        left = [k for k, one in enumerate(options) if one.form not in done]
+        if not left:
+            break
+        k = max(left, key=lambda k: _worth(channel, options[k], gains[k]))
+        gain, fit = state.with_columns(blocks[k])
+        gains = np.maximum(gains, state.scores(blocks, fit))
+        of_form = [j for j, one in enumerate(options) if one.form == options[k].form]
+        better = max(of_form, key=lambda j: gains[j])
+        if better != k and gains[better] > gain:
+            k = better
+            gain, fit = state.with_columns(blocks[k])
+        done[options[k].form] = (gain, options[k], fit)
+    found: dict[str, _Tried] = {}
+    for form in channel.forms:
+        of_form = [j for j, one in enumerate(options) if one.form == form]
+        if not of_form:
+            continue
+        if form in done:
+            gain, option, fit = done[form]
+            if channel.slow:
+                gain = min(gain, state.rich_gain(option.columns))
+        else:
+            k = max(of_form, key=lambda j: gains[j])
+            gain, option, fit = float(gains[k]), options[k], state.best
+        found[form] = _Tried(option, gain, _worth(channel, option, gain), fit)
+    # A form whose score alone is known is refitted by who takes it: only a finding needs that.
+    return {form: one for form, one in found.items() if form in done}
+
+
+def _worth(channel: Channel, option: Option, gain: float) -> float:
+    return net(float(gain), len(option.regressors), channel.ln_looks + LN_FORMS[option.form])
+
+
+def _constant(state: State, one: _Tried) -> bool:
+    """Whether each column of a form has one coefficient at all frequencies, as far as the record shows."""
+    return one.net < 3.0 or _inconstant(state, one) < NET_LEAST
+
+
+def _inconstant(state: State, one: _Tried) -> float:
+    return inconstancy(state, one.option.columns[-1], one.option.columns[:-1])
+
+
+def inconstancy(state: State, column: Array, beside: Array | None = None) -> float:
+    """-ln p of a coefficient that is the same at every frequency.
+
+    A reading that follows another axis does so at all frequencies alike. Two axes that share a line, a temperature or a
+    shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
+    Bands hold equal information; in each the coefficient is estimated by itself. `beside`: columns [k, n] that are in
+    the model as well.
+    """
+    fit = state.best
+    more = column[None] if beside is None or not len(beside) else np.vstack([beside, column])
+    _, white, _ = run(state.series.beside(more), fit.terms, fit.theta, innovations=True)
+    white = np.nan_to_num(white)
+    q, _ = np.linalg.qr(white[:, 1:-1])
+    u = white[:, -1] - q @ (q.T @ white[:, -1])
+    w = white[:, 0] - q @ (q.T @ white[:, 0])
+    c = float(u @ w) / float(u @ u)
+    U, W = rfft(u), rfft(w - c * u)
+    A, B = np.abs(U) ** 2, (np.conj(U) * W).real
+    edges = np.searchsorted(np.cumsum(A) / A.sum(), np.linspace(0.0, 1.0, BANDS + 1)[1:-1])
+    edges = np.unique(np.concatenate([[0], edges + 1, [A.size]]))
+    edges = edges[edges <= A.size]
+    information = np.add.reduceat(A, edges[:-1])
+    score = np.add.reduceat(B, edges[:-1])
+    # The transform doubles every bin but the first: half of the bins' power is in the real part.
+    noise = float(np.var(w - c * u)) * u.size / 2.0
+    chi = float((score**2 / np.maximum(information, 1e-300)).sum()) / noise
+    freedom = information.size - 1
+    return float(-chi2.logsf(chi, freedom)) if freedom > 0 else 0.0
+
+
+def _sizes(state: State, option: Option) -> list[tuple[str, str]]:
+    """Estimate key and unit of each column's coefficient."""
+    return [
+        (KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in option.regressors
+    ]
+
+
+def _estimate(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
+    """Intervals of the coefficients at the fitted drift, and the form."""
+    fit, option = chosen.fit, chosen.option
+    first = fit.c.size - len(option.regressors)
+    sizes = {
+        key: interval(float(fit.c[first + j]), float(fit.sd[first + j]), unit)
+        for j, (key, unit) in enumerate(_sizes(state, option))
+    }
+    number = {"window_s": option.number} if option.form == "rate" else {}
+    return {**sizes, "form": option.form, **number, "input": channel.input, **channel.extra}
+
+
+def _measured(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
+    """Intervals of the coefficients and of the form's number, over the drift's parameters."""
+    option, form = chosen.option, chosen.option.form
+    shaped = form in ("lag", "play")
+    width_s = option.window * state.dt if option.window > 1 else 0.0
+    numbers = _around(state, channel, chosen) if shaped else []
+    alternatives = [option, *(column_of(channel, state, form, number, width_s) for number in numbers)]
+    weight, means, sds = state.posterior(*(one.columns for one in alternatives))
+    kept = 1.0
+    if form == "static" and channel.noisy:
+        kept = _kept(state, chosen.fit, option.columns[0], channel, option.window)
+    sizes: dict[str, Any] = {
+        key: mixture(weight.ravel(), means[..., j].ravel() / kept, sds[..., j].ravel() / kept, unit)
+        for j, (key, unit) in enumerate(_sizes(state, option))
+    }
+    if shaped:
+        tried = np.array([one.number for one in alternatives])
+        # The deviation within a cell of the grid: its width over the root of 12.
+        apart = np.gradient(np.sort(tried))[np.argsort(np.argsort(tried))] / math.sqrt(12.0)
+        sizes[NUMBER[form]] = mixture(weight.sum(axis=1), tried, apart, "s" if form == "lag" else channel.of)
+    return sizes
+
+
+def _around(state: State, channel: Channel, chosen: _Tried) -> list[float]:
+    """Numbers about the best one, over all that the record leaves possible."""
+    options = [one for one in options_of(channel, state) if one.form == chosen.option.form]
+    gains = state.scores([one.columns for one in options], chosen.fit)
+    numbers = np.array([one.number for one in options])
+    possible = numbers[gains > gains.max() - 2.0 * ALIKE]
+    factor = float(numbers[1] / numbers[0]) if numbers.size > 1 else 2.0
+    low, high = float(possible.min()) / factor, float(possible.max()) * factor
+    if chosen.option.form == "lag":
+        high = min(high, LONGEST_LAG * channel.values.size * state.dt)
+    return [float(x) for x in np.geomspace(low, high, FINE)]
+
+
+def _kept(state: State, fit: Fit, column: Array, channel: Channel, window: int) -> float:
+    """Share of a coefficient that the own noise of a channel leaves: the share of the information that is none of it.
+
+    `column` is the channel smoothed over `window` samples. Neighbouring readings differ by their noise alone. It is
+    drawn anew, smoothed and whitened as the channel is. The column enters whole, so its noise lowers the coefficient.
+    """
+    random = np.random.default_rng(1)
+    noise = math.sqrt(0.5 * float(np.var(np.diff(channel.values)))) * random.standard_normal((NOISES, column.size))
+    columns = np.vstack([column, *(smoothed(row, window) for row in noise)])
+    known = 1 + len(state.regressors) + 1
+    G = run(state.series.beside(columns), fit.terms, fit.theta)[0][0].G
+    cross = G[1:known, known]
+    information = G[known, known] - cross @ np.linalg.pinv(G[1:known, 1:known], rcond=1e-12, hermitian=True) @ cross
+    return float(np.clip(1.0 - np.diag(G)[known + 1 :].mean() / max(information, 1e-300), KEPT_LEAST, 1.0))
+
+
+def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, str]] | None:
+    """The coefficient of a channel that this record would have shown; None where it has none that changes."""
+    if channel not in record.channels:
+        return None
+    values = record.channels[channel]
+    size = state.least(smoothed(values, round(10.0 * record.rate_hz)) - float(values.mean()))
+    unit = coefficient_unit(state.unit, SIDE_CHANNELS[channel][1])
+    return {"coefficient": (size, unit)} if math.isfinite(size) else None
+
+
+def _is_positive(value: float) -> bool:
+    return value > 0.0
+
+
+#: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
+EFFECT_KEYS = {
+    **{key: Key(None, fits=_is_positive, limits="above 0") for key in ("lag_s", "width", "window_s")},
+    **{key: Key(None) for key in ("rate", "square", "cube")},
+}
+#: Window of a rate whose effect states none, s.
+RATE_WINDOW_S = 60.0
+
+
+def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
+    """What the forms of a channel add to a reading beside its static coefficient, [n]; 0 at the first sample."""
+    interval_s = float(channels.time_s[1] - channels.time_s[0])
+    total = np.zeros(values.size)
+    for form in ("lag", "play"):
+        if NUMBER[form] in keys:
+            late = formed(values, form, float(keys[NUMBER[form]]), 0.0, interval_s)
+            total += float(keys["coefficient"]) * (late - values)
+    if "rate" in keys:
+        window_s = float(keys.get("window_s", RATE_WINDOW_S))
+        total += float(keys["rate"]) * formed(values, "rate", window_s, 0.0, interval_s)
+    for form in POWER:
+        if form in keys:
+            column = formed(values, form, about=float(values.mean()))
+            total += float(keys[form]) * (column - column[0])
+    return total
+
+
+def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    """Keys of `simulate --effect` for one column of a form."""
+    form = form_of(column)[2]
+    if form in ("rate", "square", "cube"):
+        window = {"window_s": float(column.entry["window_s"])} if form == "rate" else {}
+        return {"coefficient": 0.0, form: c[0], **window}
+    return {"coefficient": c[0], **({NUMBER[form]: float(column.entry[NUMBER[form]])} if form in NUMBER else {})}
