@@ -225,6 +225,9 @@ def _look(state: State, channel: Channel) -> list[Look]:
     if best < 1.0:
         return []
     alike = [form for form in FORMS if form in tried and tried[form].net > best - ALIKE]
+    if "lag" in alike and tried["lag"].option.number > LONGEST_LAG / 2.0 * channel.values.size * state.dt:
+        # The longest lag that is looked at sums the channel up: any slower change of it looks so.
+        alike.append(alike.pop(alike.index("lag")))
     chosen = tried[alike[0]]
     if not channel.slow:
         constant = [form for form in alike if _constant(state, tried[form])]
@@ -381,6 +384,8 @@ def _around(state: State, channel: Channel, chosen: _Tried) -> list[float]:
     possible = numbers[gains > gains.max() - 2.0 * ALIKE]
     factor = float(numbers[1] / numbers[0]) if numbers.size > 1 else 2.0
     low, high = float(possible.min()) / factor, float(possible.max()) * factor
+    if chosen.option.form == "lag":
+        high = min(high, LONGEST_LAG * channel.values.size * state.dt)
     return [float(x) for x in np.geomspace(low, high, FINE)]
 
 
