@@ -263,12 +263,12 @@ def rest_of(random: np.random.Generator, rate: float, markov: bool, shape: tuple
 def test_a_knock_leaves_the_rest_as_it_is() -> None:
     """Raw at 10, 50 or 100 Hz, judged at means of 1 s: `motion` alone, N, K, sigma_m and the bias in their intervals.
 
-    10 to 300 times the noise of a sample. Neither tail of the binomial of 90 % below 1 in 1000. At 10 Hz a knock of a
-    few samples, or one that rings, may be `outliers`: in 1 of 20."""
+    10 to 300 times the noise of a sample. Neither tail of the binomial of 90 % below 1 in 1000. In 1 of 20 it may be
+    missed. At 10 Hz a knock of a few samples that rings is `outliers`, or nothing: there in 1 of 3."""
     random = np.random.default_rng(417)
     held: dict[str, list[bool]] = {}
     count = case_records(4, 240)
-    named = 0
+    missed = {10.0: 0, 50.0: 0, 100.0: 0}
     for k in range(count):
         rate, markov = (100.0, 50.0, 10.0)[k % 3], bool(k // 3 % 2)
         axes = 6 if k % 12 == 3 else 1
@@ -280,7 +280,7 @@ def test_a_knock_leaves_the_rest_as_it_is() -> None:
         one = diagnose_record(of_recording(recording, MODEL, 1.0), ["gx"])["gx"]
         found = identify_axis(recording, "gx", MODEL, "library", None)
         causes = [finding.look.cause for finding in one.findings]
-        named += causes == ["motion"] and "motion" in found.judged.checks
+        missed[rate] += causes != ["motion"] or "motion" not in found.judged.checks
         if "motion" in causes:
             (interval,) = one.findings[causes.index("motion")].look.estimate["intervals"]
             assert begin - 1.2 < interval[0] < begin + 0.5
@@ -294,8 +294,9 @@ def test_a_knock_leaves_the_rest_as_it_is() -> None:
         held.setdefault("bias", []).append(off < HALF_90)
         fit = next(each for each in one.state.fits if (each.terms.markov if markov else each.terms.walk))
         held.setdefault("N of diagnose", []).append(abs(math.log(fit.sigma / 0.04)) < HALF_90 * math.sqrt(0.5 / fit.n))
-    print(f"{named} of {count} named, held { ({name: f'{sum(one)}/{len(one)}' for name, one in held.items()}) }")
-    assert count - named <= max(1.0, 0.05 * count)
+    print(f"missed of {count}: {missed}, held { ({name: f'{sum(one)}/{len(one)}' for name, one in held.items()}) }")
+    assert missed[50.0] + missed[100.0] <= max(1.0, 0.05 * count * 2 / 3)
+    assert missed[10.0] <= max(1.0, count / 9)
     for name, one in held.items():
         assert binom.cdf(sum(one), len(one), 0.9) > 1e-3, name
         assert binom.sf(sum(one) - 1, len(one), 0.9) > 1e-3, name
