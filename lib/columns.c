@@ -39,8 +39,15 @@ static bool valid_source(const selfcal_source_t *source) {
     case SELFCAL_COLUMN_COSINE:
     case SELFCAL_COLUMN_TURN_ON: return source->number > 0.0F && isfinite(source->number);
     case SELFCAL_COLUMN_STEP: return source->number >= 0.0F && isfinite(source->number);
+    case SELFCAL_COLUMN_PULSE:
+        return source->number >= 0.0F && source->until > source->number && isfinite(source->until);
     default: return false;
     }
+}
+
+/* The first sample at a time or after it. */
+static uint64_t sample_at(const selfcal_former_t *self, float time_s) {
+    return (uint64_t)fmin(ceil((selfcal_wide_t)time_s / interval_of(self->model) - 1e-3), 1e18);
 }
 
 selfcal_status_t selfcal_former_init(selfcal_former_t *self, const selfcal_model_t *model) {
@@ -63,8 +70,11 @@ selfcal_status_t selfcal_former_init(selfcal_former_t *self, const selfcal_model
             const cut_t cut = cut_of(self, source);
             trail->window = cut.window;
             trail->bin = cut.bin;
-        } else if (source->kind == SELFCAL_COLUMN_STEP) {
-            trail->step = (uint64_t)fmin(ceil((selfcal_wide_t)source->number / interval_of(model) - 1e-3), 1e18);
+        } else if (source->kind == SELFCAL_COLUMN_STEP || source->kind == SELFCAL_COLUMN_PULSE) {
+            trail->step = sample_at(self, source->number);
+            if (source->kind == SELFCAL_COLUMN_PULSE) {
+                trail->window = (uint32_t)fmin((selfcal_wide_t)(sample_at(self, source->until) - trail->step), 4e9);
+            }
         } else if (source->kind == SELFCAL_COLUMN_SINE || source->kind == SELFCAL_COLUMN_COSINE) {
             const selfcal_wide_t turns = (selfcal_wide_t)source->number * interval_of(model); /* a sample */
             trail->step = (uint64_t)((turns - floor(turns)) * 18446744073709551616.0);
@@ -185,6 +195,9 @@ void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[]
             values[k] = isfinite(raw) ? gained(trail, raw, first, stride) / source->number : raw;
             break;
         case SELFCAL_COLUMN_TURN_ON: values[k] = (float)r_exp(-elapsed_s / (selfcal_real_t)source->number); break;
+        case SELFCAL_COLUMN_PULSE: /* before the pulse the difference wraps */
+            values[k] = self->samples - trail->step < trail->window ? 1.0F : 0.0F;
+            break;
         case SELFCAL_COLUMN_STEP: values[k] = self->samples >= trail->step ? 1.0F : 0.0F; break;
         default: values[k] = wave(trail->step * self->samples, source->kind == SELFCAL_COLUMN_COSINE); break;
         }

@@ -186,14 +186,16 @@ typedef enum {
     SELFCAL_COLUMN_SINE = 3,    /* of a line */
     SELFCAL_COLUMN_COSINE = 4,
     SELFCAL_COLUMN_STEP = 5,    /* 0, and 1 from a time on */
-    SELFCAL_COLUMN_TURN_ON = 6  /* exp(-t / time constant) */
+    SELFCAL_COLUMN_TURN_ON = 6, /* exp(-t / time constant) */
+    SELFCAL_COLUMN_PULSE = 7    /* 0, and 1 from a time on until another */
 } selfcal_column_kind_t;
 
 typedef struct {
     selfcal_column_kind_t kind;
     uint8_t channel; /* CHANNEL, RATE: an axis; from the model's `axes` on, a channel beside the readings */
-    float number;    /* CHANNEL, RATE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz; STEP: time, s;
-                      * TURN_ON: time constant, s */
+    float number;    /* CHANNEL, RATE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz;
+                      * STEP, PULSE: time, s; TURN_ON: time constant, s */
+    float until;     /* PULSE: end, s */
 } selfcal_source_t;
 
 /* Optional code. Only a model that names it links it. */
@@ -204,10 +206,10 @@ extern const selfcal_forgetting_code_t selfcal_forgetting_code;
 typedef struct selfcal_states_code selfcal_states_code_t;
 extern const selfcal_states_code_t selfcal_states_code;
 
-/* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step, a turn-on).
- * Each adds a constant coefficient times its value to every reading. Every subset of them is a hypothesis of its own.
- * The values come with the samples, see selfcal_push_with(); their unit is the application's. With SELFCAL_FIXED the
- * bank then runs in software floating point. */
+/* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step, a turn-on, a
+ * pulse). Each adds a constant coefficient times its value to every reading. Every subset of them is a hypothesis of
+ * its own. The values come with the samples, see selfcal_push_with(); their unit is the application's. With
+ * SELFCAL_FIXED the bank then runs in software floating point. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */

@@ -247,8 +247,8 @@ struct selfcal {
 #define SELFCAL_COLUMN_BINS 32U
 
 typedef struct {
-    uint64_t step;        /* STEP: its sample; SINE, COSINE: 2^64 turns a sample */
-    uint32_t window, bin; /* samples */
+    uint64_t step;        /* STEP, PULSE: its sample; SINE, COSINE: 2^64 turns a sample */
+    uint32_t window, bin; /* samples; PULSE: window is its length */
     uint32_t bins, in_bin;
     float ring[SELFCAL_COLUMN_BINS + 2U];
     float sum, first, last;

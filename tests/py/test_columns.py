@@ -9,17 +9,20 @@ import pytest
 
 from selfcal import _library32
 
-TIME, CHANNEL, RATE, SINE, COSINE, STEP, TURN_ON = range(7)
+TIME, CHANNEL, RATE, SINE, COSINE, STEP, TURN_ON, PULSE = range(8)
 
 
 def form(
-    source: tuple[int, float], values: np.ndarray, missing: np.ndarray | None = None, dt: float = 0.1
+    source: tuple[float, ...],
+    values: np.ndarray,
+    missing: np.ndarray | None = None,
+    dt: float = 0.1,
 ) -> np.ndarray:
     """[n] of one source over one channel [n]."""
-    kind, number = source
+    kind, number, until = (*source, 0.0)[:3]
     gaps = np.zeros(values.size, np.uint64) if missing is None else missing.astype(np.uint64)
     rows = np.ascontiguousarray(values[:, None], np.float32)
-    return np.asarray(_library32.form([(kind, 0, number)], dt, rows, gaps)[:, 0], float)
+    return np.asarray(_library32.form([(kind, 0, number, until)], dt, rows, gaps)[:, 0], float)
 
 
 def walk(n: int, seed: int) -> np.ndarray:
@@ -91,6 +94,7 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
     nothing = np.zeros(t.size)
     assert form((TIME, 0.0), nothing, missing) == pytest.approx(t, rel=2e-7)
     assert (form((STEP, 42.3), nothing, missing) == (t >= 42.3 - 1e-6)).all()
+    assert (form((PULSE, 42.3, 77.0), nothing, missing) == ((t >= 42.3 - 1e-6) & (t < 77.0 - 1e-6))).all()
     for tau in (0.7, 42.3, 5000.0):
         assert np.abs(form((TURN_ON, tau), nothing, missing) - np.exp(-t / tau)).max() < 1e-6
     stretch = float(np.float32(0.1)) / 0.1
@@ -101,6 +105,13 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
 
 def test_a_source_that_cannot_be_is_refused() -> None:
     values = np.zeros(3)
-    for source in ((7, 1.0), (RATE, 0.0), (SINE, -1.0), (TURN_ON, 0.0), (CHANNEL, float("nan"))):
+    for source in (
+        (8, 1.0),
+        (PULSE, 3.0),
+        (RATE, 0.0),
+        (SINE, -1.0),
+        (TURN_ON, 0.0),
+        (CHANNEL, float("nan")),
+    ):
         with pytest.raises(ValueError, match="cannot be"):
             form(source, values)

@@ -42,6 +42,7 @@ EFFECTS = {
     "cross_axis": ("other=gy,coefficient=0.5", 1.0),
     "ramp": ("slope=3e-4", 1.0),
     "step": ("time_s=900,amplitude=0.3", 1.0),
+    "pulse": ("start_s=900,end_s=1200,amplitude=0.3", 1.0),
     "turn_on": ("amplitude=0.6,time_constant_s=60", 1.0),
     "periodic": ("frequency_hz=0.05,amplitude=0.02", 1.0),
     "flicker": ("B=0.05", 10.0),
@@ -156,7 +157,7 @@ def _columns(entry: dict[str, Any]) -> range:
     return range(2 if entry["kind"] == "periodic" else 1)
 
 
-@pytest.mark.parametrize("cause", ["cross_axis", "ramp", "step", "turn_on", "periodic"])
+@pytest.mark.parametrize("cause", ["cross_axis", "ramp", "step", "pulse", "turn_on", "periodic"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_library_gains_what_the_diagnosis_gained(cause: str, seed: int, tmp_path: Path) -> None:
     """Measured: 0.01 nat, which the library's float and the ±0.1 % of the point leave.

@@ -351,8 +351,8 @@ def test_csv_and_npz_hold_the_same_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "effect",
-    ["temperature", "supply", "cross_axis", "ramp", "step", "turn_on", "periodic", "flicker", "colored_noise",
-     "quantization", "outliers", "variance_change", "saturation", "motion", "missing_samples", "stuck",
+    ["temperature", "supply", "cross_axis", "ramp", "step", "pulse", "turn_on", "periodic", "flicker",
+     "colored_noise", "quantization", "outliers", "variance_change", "saturation", "motion", "missing_samples", "stuck",
      "held_samples", "rate_change"],
 )  # fmt: skip
 def test_every_effect_changes_the_recording_with_its_defaults(effect: str, tmp_path: Path) -> None:

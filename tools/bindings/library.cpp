@@ -487,17 +487,17 @@ private:
     selfcal_gate_t gate_{};
 };
 
-using SourceTuple = std::tuple<int, int, float>; // kind, channel, number
+using SourceTuple = std::tuple<int, int, float, float>; // kind, channel, number, until
 
 // The values [n, sources] of regressors over channels [n, c], after missing_before [n] samples each.
 using Missing = nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s,
                                           const Rows &channels, const Missing &missing_before) {
     std::vector<selfcal_source_t> sources;
-    for (const auto &[kind, channel, number] : tuples) {
+    for (const auto &[kind, channel, number, until] : tuples) {
         if (channel < 0 || static_cast<size_t>(channel) >= std::max<size_t>(channels.shape(1), 1))
             throw std::invalid_argument("a source is no channel");
-        sources.push_back({static_cast<selfcal_column_kind_t>(kind), static_cast<uint8_t>(channel), number});
+        sources.push_back({static_cast<selfcal_column_kind_t>(kind), static_cast<uint8_t>(channel), number, until});
     }
     const size_t n = missing_before.shape(0), p = sources.size();
     if (channels.shape(0) != n || p == 0 || p > SELFCAL_REGRESSORS_MAX)

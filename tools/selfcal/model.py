@@ -44,6 +44,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
     "turn_on": ("time_constant_s",),
+    "pulse": ("start_s", "end_s"),
 }
 #: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
@@ -97,6 +98,8 @@ class Regressor:
     frequency_hz: float = math.nan
     time_s: float = math.nan
     time_constant_s: float = math.nan
+    start_s: float = math.nan
+    end_s: float = math.nan
     channel_unit: str = ""
     input: str = "value"
     form: str = "static"
@@ -418,7 +421,8 @@ class _Reader:
         if not isinstance(kind, str) or kind not in REGRESSORS:
             raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
-        unit = {"time": "s", "periodic": "1", "step": "1", "turn_on": "1"}.get(kind) or self.unit(fields, where)
+        shapes = dict.fromkeys(("periodic", "step", "turn_on", "pulse"), "1")
+        unit = {"time": "s", **shapes}.get(kind) or self.unit(fields, where)
         chosen: dict[str, Any] = {
             key: self.choice(fields.get(key, known[0]), f"{where}.{key}", known)
             for key, known in (("input", INPUTS), ("form", FORMS))
@@ -434,9 +438,11 @@ class _Reader:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
         needed: dict[str, Any] = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
-            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s", "lag_s", "width")
+            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s", "start_s", "end_s", "lag_s", "width")
             if key in REGRESSORS[kind] and (kind != "column" or key in fields or key == NUMBER.get(chosen["form"]))
         }
+        if kind == "pulse" and not needed["end_s"] > needed["start_s"]:
+            raise self.fail(f"{where}.end_s", "must be later than start_s")
         power = POWER.get(chosen["form"], 1) * (2 if chosen["input"] == "variance" else 1)
         return Regressor(
             name=self.text(fields, "name", where),

@@ -19,8 +19,10 @@ from selfcal.recording import Recording, as_float, bridged
 from selfcal.result import HALF_90, AxisResult, of_mixture
 
 #: `selfcal_column_kind_t`: names in C, by number.
-COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP", "TURN_ON")
-_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP, _TURN_ON = range(len(COLUMN_KINDS))
+COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP", "TURN_ON", "PULSE")
+_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP, _TURN_ON, _PULSE = range(len(COLUMN_KINDS))
+#: End of a pulse that is over before the first row, s.
+OVER_S = 1e-6
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -65,10 +67,11 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
     The library forms them (`selfcal_form()`), as it does on a module. forms.py makes the forms that it lacks of its
-    means. Time counts from the first row, s; a step's and a turn-on's are those of the recording that the rows were cut
-    from. A column with a `window_s` is the mean over that time up to each row. A step is 1 from its time on. A rate
-    (the kind) is the channel's gain over the last `window_s`, in the first window its gain since the first row, over
-    `window_s`. Raises UserError for a column that is absent or of another kind.
+    means. Time counts from the first row, s; a step, a pulse and a turn-on have the clock of the recording that the
+    rows were cut from. A column with a `window_s` is the mean over that time up to each row. A step is 1 from its time
+    on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the last `window_s`, in the
+    first window its gain since the first row, over `window_s`. Raises UserError for a column that is absent or of
+    another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
@@ -106,7 +109,9 @@ def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regresso
 
     def moved(one: Regressor) -> Regressor:
         if one.kind == "step":
-            return replace(one, time_s=one.time_s - start_s)
+            return replace(one, time_s=max(0.0, one.time_s - start_s))
+        if one.kind == "pulse":
+            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(OVER_S, one.end_s - start_s))
         return replace(one, sd={group: sd * _left(one, start_s) for group, sd in one.sd.items()})
 
     return tuple(moved(one) for one in regressors)
@@ -137,19 +142,21 @@ def _channel(one: Regressor) -> tuple[str, str, str]:
     return one.column, one.channel_unit, one.input
 
 
-def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[tuple[int, int, float]]:
-    """Kind, channel and number of each of its columns: `selfcal_source_t`."""
+def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[tuple[int, int, float, float]]:
+    """Kind, channel, number and end of each of its columns: `selfcal_source_t`."""
     if one.kind == "time":
-        return [(_TIME, 0, 0.0)]
+        return [(_TIME, 0, 0.0, 0.0)]
     if one.kind == "step":
-        return [(_STEP, 0, one.time_s)]
+        return [(_STEP, 0, one.time_s, 0.0)]
     if one.kind == "turn_on":
-        return [(_TURN_ON, 0, one.time_constant_s)]
+        return [(_TURN_ON, 0, one.time_constant_s, 0.0)]
+    if one.kind == "pulse":
+        return [(_PULSE, 0, one.start_s, one.end_s)]
     if one.kind == "periodic":
-        return [(_SINE, 0, one.frequency_hz), (_COSINE, 0, one.frequency_hz)]
+        return [(_SINE, 0, one.frequency_hz, 0.0), (_COSINE, 0, one.frequency_hz, 0.0)]
     if one.kind == "rate":
-        return [(_RATE, channels.index(_channel(one)), one.window_s)]
-    return [(_CHANNEL, channels.index(_channel(one)), one.mean_s)]
+        return [(_RATE, channels.index(_channel(one)), one.window_s, 0.0)]
+    return [(_CHANNEL, channels.index(_channel(one)), one.mean_s, 0.0)]
 
 
 def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
@@ -157,7 +164,7 @@ def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float6
     if window <= 1:
         return values
     rows = np.ascontiguousarray(values[:, None], np.float32)
-    made = _library32.form([(_CHANNEL, 0, float(window))], 1.0, rows, np.zeros(values.size, np.uint64))
+    made = _library32.form([(_CHANNEL, 0, float(window), 0.0)], 1.0, rows, np.zeros(values.size, np.uint64))
     return np.asarray(made[:, 0], np.float64)
 
 

@@ -76,14 +76,15 @@ class AxisTable:
 class RegressorTable:
     """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
 
-    `source`: kind and number (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds` [axes]:
-    prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]: none is 0."""
+    `source`: kind, number and end (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds`
+    [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]: none is
+    0."""
 
     name: str
     unit: str
     reference: float
     coefficient_sd: tuple[float, ...]
-    source: tuple[int, float, str, str] = (0, 0.0, "", "")
+    source: tuple[int, float, float, str, str] = (0, 0.0, 0.0, "", "")
     ln_odds: tuple[float, ...] = ()
     coefficient_mean: tuple[float, ...] = ()
 
@@ -146,7 +147,7 @@ class Tables:
     def channels(self) -> tuple[tuple[str, str], ...]:
         """Name and unit of what the regressors take beside the readings of these axes."""
         axes = {(axis.name, axis.unit) for axis in self.axes}
-        taken = dict.fromkeys(column.source[2:] for column in self.regressors if column.source[2])
+        taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
         return tuple(one for one in taken if one not in axes)
 
     @property
@@ -297,11 +298,11 @@ def _priors(group: Group, law: str) -> tuple[PriorRow, ...]:
     return tuple((math.log(p.min), math.log(p.max), p.law == "uniform", False) for p in chosen)
 
 
-def _source(regressor: Regressor, place: int) -> tuple[int, float, str, str]:
+def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
     """Of a column by its place in the regressor."""
     channels = channels_of((regressor,))
-    kind, _, number = sources_of(regressor, channels)[place]
-    return kind, number, *(channels[0][:2] if channels else ("", ""))
+    kind, _, number, until = sources_of(regressor, channels)[place]
+    return kind, number, until, *(channels[0][:2] if channels else ("", ""))
 
 
 def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:

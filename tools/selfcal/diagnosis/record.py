@@ -144,6 +144,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
                 "kind": one.kind,
                 "form": one.form,
                 "input": one.input,
+                "start_s": one.start_s - recording.start_s,
+                "end_s": one.end_s - recording.start_s,
             }
             for column, row in zip(one.columns, values.T, strict=True):
                 about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.offset

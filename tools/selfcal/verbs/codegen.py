@@ -331,9 +331,10 @@ def _regressors(tables: Tables) -> list[str]:
 
 
 def _column_source(tables: Tables, column: RegressorTable) -> str:
-    kind, number, name, unit = column.source
+    kind, number, until, name, unit = column.source
     places = [*((axis.name, axis.unit) for axis in tables.axes), *tables.channels]
-    return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {places.index((name, unit)) if name else 0}U, {_f(number)}}}"
+    channel = places.index((name, unit)) if name else 0
+    return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {channel}U, {_f(number)}, {_f(until)}}}"
 
 
 def _gate(model: Model, tables: Tables) -> list[str]:
