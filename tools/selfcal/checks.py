@@ -98,6 +98,17 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     return replace(judged, checks={**judged.checks, **checks})
 
 
+def against(checks: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """The checks that speak against the model, the surest first: each with its distance in standard deviations.
+    Infinite where a check has none."""
+    failed = {name: one for name, one in checks.items() if not one["passed"]}
+    sure = {
+        name: abs(one.get("deviations", CHECK_LIMIT * one["value"] / one["limit"] if one["limit"] > 0.0 else math.inf))
+        for name, one in failed.items()
+    }
+    return dict(sorted(sure.items(), key=lambda item: -item[1]))
+
+
 def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
     """Posterior means [p] of the coefficients of the columns in use, under the most probable law."""
     return np.array([mean for mean, _ in result.coefficients[result.best]])
@@ -162,7 +173,8 @@ def innovation_checks(
     half = n // 2
     lag1 = float((nu[1:] * nu[:-1])[pairs].sum() / (whole**2).sum())
     kurtosis = float(((whole - whole.mean()) ** 4).mean() / whole.var() ** 2 - 3.0)
-    ratio = math.log(float(whole[half:].var() / whole[:half].var()))
+    nothing = 1e-30 * float(whole.var())  # of a dead band, a half may have no variance
+    ratio = math.log(max(float(whole[half:].var()), nothing) / max(float(whole[:half].var()), nothing))
     # Standard deviations under white normal innovations.
     checks = {
         "innovation_mean": (float(whole.mean() / whole.std()), 1.0 / math.sqrt(n)),

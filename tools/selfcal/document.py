@@ -13,7 +13,7 @@ from typing import Any
 
 from selfcal import units
 from selfcal.allan import Sampled
-from selfcal.checks import Judged, allan_limit
+from selfcal.checks import Judged, against, allan_limit
 from selfcal.errors import UserError, printable
 from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
@@ -40,7 +40,7 @@ class Identified:
     @property
     def adequate(self) -> bool:
         """All checks passed: nothing in the record speaks against the best model."""
-        return all(bool(check["passed"]) for check in self.judged.checks.values())
+        return not against(self.judged.checks)
 
 
 def recording_entry(recording: Recording) -> dict[str, Any]:

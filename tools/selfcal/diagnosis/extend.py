@@ -20,7 +20,7 @@ from selfcal.ending import Stopped
 from selfcal.errors import UserError, remark
 from selfcal.forms import NUMBER, formed
 from selfcal.laws import averaged
-from selfcal.model import MOST_COLUMNS, Model
+from selfcal.model import MOST_COLUMNS, SMALLEST, Model
 from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
@@ -93,7 +93,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             ):
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
-            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), float(f"{WIDE * (abs(c) + 2.0 * sd):.3g}"))
+            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
             strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
     kept: list[dict[str, Any]] = []
     used = len(stated)
@@ -179,7 +179,7 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     return {
         "hypothesis": drift.pop("hypothesis"),
         "bias": digits(one.state.level + float(fit.c[0]) + at_first),
-        "N": digits(math.sqrt(N**2 + lacking * fit.dt)),
+        "N": digits(max(math.hypot(N, math.sqrt(lacking * fit.dt)), SMALLEST)),
         **drift,
     }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -14,7 +13,8 @@ from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
-from selfcal.diagnosis.statistics import combined, judged
+from selfcal.diagnosis.statistics import judged
+from selfcal.diagnosis.verdict import unexplained
 from selfcal.ending import Stopped
 from selfcal.motion import Moved
 
@@ -34,11 +34,6 @@ INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
-#: Probability that the statistics together call an axis of a fitting record inadequate.
-P_UNEXPLAINED = 1e-3
-#: What is not so improbable is judged once more, by an ensemble that shows how long the tails are. With the first alone
-#: 4 of 1351 clean axes were called inadequate.
-P_CERTAIN, AGAIN = 1e-12, 240
 
 
 def diagnose_record(
@@ -103,7 +98,7 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     advance(f"{one.state.axis}: statistics")
     one.findings = [finding for finding in one.findings if finding.round <= ROUNDS]
     _unexplained(one)
-    one.before = judged(one.first, seed=1) if one.findings and not one.first.below_lattice else one.after
+    one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
 
 def _provisional(
@@ -280,17 +275,6 @@ def _same(a: Look, b: Look) -> bool:
 def _unexplained(one: Diagnosed) -> None:
     if one.state.below_lattice:
         return
-    one.after = judged(one.state, seed=1)
-    if any(finding.look.cause == "unexplained" for finding in one.findings):
-        return
-    p = combined(one.after)
-    if P_CERTAIN < p < P_UNEXPLAINED:
-        one.after = judged(one.state, seed=2, count=AGAIN)
-        p = combined(one.after)
-    if p < P_UNEXPLAINED:
-        worst = one.after[0]
-        nats = min(1e6, -math.log(max(p, 1e-300)))
-        look = Look(
-            "unexplained", nats, nats, {"statistic": worst.name, "measured": worst.measured}, {}, shown_by=worst.name
-        )
+    one.after, look = unexplained(one.state, one.record)
+    if look is not None and all(finding.look.cause != "unexplained" for finding in one.findings):
         one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))

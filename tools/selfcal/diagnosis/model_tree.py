@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
+
+from selfcal.model import LARGEST, SMALLEST
 
 #: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
 NODES = [24, 20]
@@ -27,6 +30,7 @@ def add_handling(tree: dict[str, Any], what: str, value: float | bool) -> None:
     tree["handle"] = {what: value, **(tree.get("handle") or {})}
 
 
-def digits(value: float) -> float:
-    """The six digits that a model file has of a number."""
-    return float(f"{value:.6g}")
+def digits(value: float, count: int = 6) -> float:
+    """The digits that a model file has of a number, within the numbers that it takes: some fits end at nothing."""
+    size = min(max(abs(value), SMALLEST), LARGEST) if value else 0.0
+    return float(f"{math.copysign(size, value):.{count}g}")

@@ -18,7 +18,7 @@ from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array
-from selfcal.diagnosis.statistics import simulated, whitened_of
+from selfcal.diagnosis.statistics import Indices, allan_deviation, simulated, whitened_of
 from selfcal.recording import bridged
 
 #: Simulated records a band is the range of.
@@ -27,15 +27,12 @@ RECORDS = 20
 POINTS = 400
 #: Averaging times a decade, and frequencies a decade, of the overview.
 TAUS_A_DECADE, BINS_A_DECADE = 8, 24
-#: Pairs of means that an Allan deviation rests on, at most about twice as many.
-PAIRS = 100_000
 #: Standard deviations within which 99 % of a normal deviate lie.
 TWO_SIDED_99 = 2.576
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
 Summary = Callable[[Array, Array], Array]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -141,6 +138,8 @@ def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Co
 def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
     """The picture of the statistic that shows it."""
     name, state = finding.look.shown_by, finding.before
+    if "allan" in name:
+        return _allan(state, state, factor, unit)
     if "lag" in name:
         return _correlation(state, state, magnitude="magnitude" in name or "squared" in name)
     if "kurtosis" in name or "skewness" in name:
@@ -177,27 +176,6 @@ def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
         log_x=True,
         log_y=True,
     )
-
-
-def allan_deviation(y: Array, sizes: Indices) -> Array:
-    """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
-    its samples. Pairs begin an eighth of a mean apart, in long records further."""
-    good = np.isfinite(y)
-    total = np.concatenate([[0.0], np.cumsum(np.where(good, y, 0.0))])
-    count = np.concatenate([[0.0], np.cumsum(good)])
-    found = np.full(len(sizes), np.nan)
-    for k, m in enumerate(int(size) for size in sizes):
-        every = max(1, m // 8, y.size // PAIRS)
-        last = y.size - 2 * m + 1
-        first, middle, end = (slice(j * m, last + j * m, every) for j in range(3))
-        before, after = count[middle] - count[first], count[end] - count[middle]
-        both = (2 * before >= m) & (2 * after >= m)
-        if np.count_nonzero(both) < 3:
-            continue
-        with np.errstate(invalid="ignore", divide="ignore"):
-            step = (total[end] - total[middle]) / after - (total[middle] - total[first]) / before
-        found[k] = math.sqrt(0.5 * float(np.mean(step[both] ** 2)))
-    return found
 
 
 def _power(y: Array, dt: float) -> tuple[Array, Array]:

@@ -13,15 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import norm, pearson3, skew
+from scipy.stats import norm, pearson3
 from scipy.stats import t as student
 
 from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Matrices, matrices
 
+Indices = NDArray[np.int64]
+
 #: Simulated records a band rests on.
 ENSEMBLE = 48
+#: Of which so many have a statistic at least.
+FEWEST = 8
 #: An ensemble of this size shows the skewness of a statistic too.
 SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
@@ -36,6 +40,14 @@ SEGMENTS = (32, 128, 512)
 JUMP_PLACES = 20_000
 #: Times at least that the drift forgets in a record in which jumps are looked for.
 TURNS_LEAST = 50.0
+#: Whitened residuals beyond are of a model that does not describe the readings at all, which `SPREAD` states.
+FAR_OFF, SPREAD = 1e9, "innovation_spread"
+#: Samples of the blocks whose sums show slow correlation, the lags in blocks, and blocks at least.
+BLOCKS, SLOW_LAGS, BLOCKS_LEAST = (4, 16, 64, 256), (1, 2, 3, 5), 60
+#: The longest averaging time of an Allan deviation is this part of a record; pairs of means a time, at most.
+LONGEST, PAIRS = 8, 100_000
+#: Share of simulated records beyond which the tail of the most striking statistic is fitted.
+TAIL = 1.0 / 3.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 
@@ -51,6 +63,15 @@ class Statistic:
     p: float
 
 
+@dataclass(frozen=True)
+class Judged:
+    """Every statistic of a state against its band, the most striking first; `p`: probability that the most striking of
+    a fitting record is as striking."""
+
+    statistics: list[Statistic]
+    p: float
+
+
 def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | None = None) -> dict[str, float]:
     """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read.
 
@@ -61,7 +82,9 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | N
     found: dict[str, float] = {}
     if n < 50:
         return found
-    sd = float(x.std())
+    sd = float(np.clip(x, -FAR_OFF, FAR_OFF).std())
+    if not sd > 0.0:
+        return {SPREAD: math.inf}
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
     reach = max(min(1 + max(LAGS), n // 8), min(ECHOES, n // 4))
@@ -71,6 +94,16 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | N
         if lag < min(lagged.size, n // 8):
             found[f"innovation_lag{lag}"] = float(lagged[lag])
     found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
+    for size in BLOCKS:
+        if n >= BLOCKS_LEAST * size:
+            sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
+            scale = math.sqrt(sums.size) * float(sums.var())
+            for lag in SLOW_LAGS:
+                found[f"innovation_lag{lag}_of_{size}_samples"] = float(sums[lag:] @ sums[:-lag]) / scale
+    sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
+    for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
+        if math.isfinite(deviation):
+            found[f"allan_of_{m}_samples"] = _root(n * float(deviation) ** 2, n / float(m))
     # A reading that repeats what was before, however long before.
     found["innovation_largest_correlation"] = _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
     for size in SEGMENTS:
@@ -149,6 +182,27 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | N
             same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
             found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
             found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
+    return found
+
+
+def allan_deviation(y: Array, sizes: Indices) -> Array:
+    """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
+    its samples. Pairs begin an eighth of a mean apart, in long records further."""
+    good = np.isfinite(y)
+    total = np.concatenate([[0.0], np.cumsum(np.where(good, y, 0.0))])
+    count = np.concatenate([[0.0], np.cumsum(good)])
+    found = np.full(len(sizes), np.nan)
+    for k, m in enumerate(int(size) for size in sizes):
+        every = max(1, m // 8, y.size // PAIRS)
+        last = y.size - 2 * m + 1
+        first, middle, end = (slice(j * m, last + j * m, every) for j in range(3))
+        before, after = count[middle] - count[first], count[end] - count[middle]
+        both = (2 * before >= m) & (2 * after >= m)
+        if np.count_nonzero(both) < 3:
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = (total[end] - total[middle]) / after - (total[middle] - total[first]) / before
+        found[k] = math.sqrt(0.5 * float(np.mean(step[both] ** 2)))
     return found
 
 
@@ -326,39 +380,64 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
         yield w, w
 
 
-def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> list[Statistic]:
-    """Every statistic of the state against its band; the most striking first."""
+def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
+    """Every statistic of the state against `count` records of its model."""
     response = response_of(_step_response(state.series, state.best))
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
-    rows: dict[str, list[float]] = {name: [] for name in measured}
+    if SPREAD in measured:
+        return Judged([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
+    rows = []
     for w, y in _drawn(state, np.random.default_rng(seed), count):
-        for name, value in all_statistics(w, None if state.redrawn else y, state.lsb, response).items():
-            if name in rows:
-                rows[name].append(value)
-    found: list[Statistic] = []
-    for name, value in measured.items():
-        sample = np.array(rows[name])
-        if sample.size < 8:
-            continue
-        mean, sd = float(sample.mean()), float(max(sample.std(ddof=1), LEAST_SPREAD.get(name, 0.05)))
-        # Student's t of a new value against the ensemble: its spread is known to 1/sqrt(2 count).
-        z = (value - mean) / (sd * math.sqrt(1.0 + 1.0 / sample.size))
-        freedom = sample.size - 1
-        if sample.size >= SKEWED:
-            # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
-            third = float(skew(sample))
-            p = 2.0 * float(pearson3.sf(abs(z), math.copysign(third, third * z)))
-        elif abs(z) < 8.0:
-            p = 2.0 * float(student.sf(abs(z), freedom))
-        else:
-            p = 2.0 * float(norm.sf(min(abs(z) * 0.8, 37.0)))
-        half = float(student.isf(0.005, freedom)) * sd
-        found.append(Statistic(name, value, mean - half, mean + half, p))
-    return sorted(found, key=lambda one: one.p)
+        found = all_statistics(w, None if state.redrawn else y, state.lsb, response)
+        rows.append([found.get(name, math.nan) for name in measured])
+    sample = np.array(rows).reshape(count, len(measured))
+    usual = np.isfinite(sample).sum(axis=0) >= FEWEST
+    names = [name for name, kept in zip(measured, usual, strict=True) if kept]
+    if not names:
+        return Judged([], 1.0)
+    sample, value = sample[:, usual], np.array([measured[name] for name in names])
+    # A statistic that some records do not have is usual in those.
+    sample = np.where(np.isfinite(sample), sample, np.nanmean(sample, axis=0))
+    least = np.array([LEAST_SPREAD.get(name, 0.05) for name in names])
+    ln_p = _ln_tails(value[None], sample, least)[0]
+    mean, sd = sample.mean(axis=0), np.maximum(sample.std(axis=0, ddof=1), least)
+    half = float(student.isf(0.005, count - 1)) * sd
+    found_all = [
+        Statistic(name, float(value[k]), float(mean[k] - half[k]), float(mean[k] + half[k]), math.exp(ln_p[k]))
+        for k, name in enumerate(names)
+    ]
+    return Judged(sorted(found_all, key=lambda one: one.p), _family(ln_p, sample, least))
 
 
-def combined(statistics: list[Statistic]) -> float:
-    """Probability that the most striking of all is as striking by chance."""
-    if not statistics:
-        return 1.0
-    return min(1.0, statistics[0].p * len(statistics))
+def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) -> Array:
+    """ln of the probability [r, k] of a statistic as extreme as `values` [r, k] in the ensemble `sample` [count, k].
+    `own`: the values are the sample, and each is judged by the others."""
+    n = len(sample) - own
+    centre = sample.mean(axis=0)
+    values, sample = values - centre, sample - centre
+    sums = [(sample**power).sum(axis=0) - own * values**power for power in (1, 2, 3)]
+    mean = sums[0] / n
+    second = np.maximum(sums[1] / n - mean**2, 1e-300)
+    third = sums[2] / n - 3.0 * mean * sums[1] / n + 2.0 * mean**3
+    sd = np.maximum(np.sqrt(second * n / (n - 1.0)), least)
+    # Student's t of a new value against the ensemble: its spread is known to 1 / sqrt(2 n).
+    z = (values - mean) / (sd * math.sqrt(1.0 + 1.0 / n))
+    size = np.abs(z)
+    if n >= SKEWED:
+        # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
+        p = pearson3.sf(size, np.sign(z) * third / sd**3)
+    else:
+        p = np.where(size < 8.0, student.sf(size, n - 1), norm.sf(np.minimum(0.8 * size, 37.0)))
+    found: Array = np.minimum(0.0, math.log(2.0) + np.log(np.maximum(p, 1e-300)))
+    return found
+
+
+def _family(ln_p: Array, sample: Array, least: Array) -> float:
+    """Probability that the most striking of all is as striking by chance: by the simulated records' own most striking
+    ones, each judged by the others, and an exponential tail beyond those."""
+    chance = np.sort(-_ln_tails(sample, sample, least, own=True).min(axis=1))
+    top = chance[round((1.0 - TAIL) * chance.size) :]
+    beyond = -float(ln_p.min()) - float(top[0])
+    if beyond <= 0.0:
+        return float(np.mean(chance >= -float(ln_p.min())))
+    return TAIL * math.exp(-beyond / max(1.0, float((top - top[0]).mean())))

@@ -15,9 +15,10 @@ from rich.console import Console
 from selfcal.diagnosis import words, work
 from selfcal.diagnosis.document import SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
-from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.loop import INTERRUPTED, ROUNDS, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
+from selfcal.diagnosis.verdict import joined, of_checks
 from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
 from selfcal.ending import Held, Stopped, abandon, held
 from selfcal.errors import UserError, note, printable
@@ -62,10 +63,10 @@ def diagnose(
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
     `axes`: those reported on; every other column may explain them. A long recording is looked at twice: first its means
-    of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one. A finding that
-    the means alone show stays in the axis' `only_in_means`, and counts for no verdict. An axis that the second look did
-    not finish has the first one's result if it has none of its own. `full_rate`: no first look. `decimate`: look at
-    block means at this rate alone, Hz.
+    of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one, unless it shows
+    nothing where the first one does. A further finding of the means stays in the axis' `only_in_means`. An axis that
+    the second look did not finish has the first one's result if it has none of its own. `full_rate`: no first look.
+    `decimate`: look at block means at this rate alone, Hz.
     `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
@@ -96,7 +97,11 @@ def diagnose(
             first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
             _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
-        found = _joined(names, first, seen)
+        looked = {name: joined(seen.get(name), first.get(name), INTERRUPTED) for name in names}
+        found = {name: one for name, one in looked.items() if one is not None}
+        if not ending.asked:
+            doing.now("checks")
+            _by_identify(found, recording, loaded)
         errors = {
             name: seen[name].unfinished if name in seen else _why_not(recording, loaded, record, name)
             for name in names
@@ -184,21 +189,15 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
     return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
 
 
-def _joined(
-    names: Sequence[str], first: Mapping[str, Diagnosed], seen: Mapping[str, Diagnosed]
-) -> dict[str, Diagnosed]:
-    """What there is to report of each axis: what every sample shows, if that was not interrupted; else the first look,
-    if that was not; else what either shows."""
-    found: dict[str, Diagnosed] = {}
-    for name in names:
-        looks = [one for one in (seen.get(name), first.get(name)) if one and (one.findings or not one.unfinished)]
-        looks.sort(key=lambda one: one.unfinished == INTERRUPTED)
-        if looks:
-            found[name] = looks[0]
-            if looks[0] is not seen.get(name):
-                reason = seen[name].unfinished if name in seen else INTERRUPTED
-                found[name] = replace(looks[0], unfinished=f"every sample: {reason}")
-    return found
+def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
+    """Axes without a cause must pass the checks of `identify`."""
+    for name, one in found.items():
+        if one.findings or one.state.below_lattice:
+            continue
+        with suppress(UserError):  # no report, no checks
+            look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
+            if look is not None:
+                one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
 
 
 def _show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:

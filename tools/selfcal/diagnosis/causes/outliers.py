@@ -16,6 +16,8 @@ from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
 LN_LOOKS = -1.5
 #: Outliers are exceptions: a look that takes more of the samples for them has another cause.
 MOST = 0.05
+#: Readings on no lattice that repeat the one before more often than this share are no noise with exceptions.
+REPEATS_MOST = 0.5
 #: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
 KEPT_OUT_SD = 6.0
 
@@ -33,6 +35,8 @@ def mixed(state: State, record: Record) -> list[Look]:
     n = x.size
     if n < 50 or np.abs(x).max() < 3.5:
         return []
+    if state.lsb <= 0.0 and float(np.mean(np.diff(state.y) == 0.0)) > REPEATS_MOST:
+        return []  # a dead band: without the readings beyond it no noise is left
     share, wide, core = max(1.0, float((np.abs(x) > 4.0).sum())) / n, max(3.0, float(np.abs(x).max()) / 2.0), 1.0
     plain = -0.5 * (x**2).sum() / np.mean(x**2) - n * 0.5 * math.log(float(np.mean(x**2)))
     weight = np.zeros(n)

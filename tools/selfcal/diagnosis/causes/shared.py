@@ -227,25 +227,30 @@ def by_frequency(pair: Pair) -> tuple[Array, Array, Array]:
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """Noise that two axes share, on both, with the evidence of the pair. Returns the axes whose model changed."""
-    judged = {name: one for name, one in found.items() if not one.state.below_lattice}
-    changed = [name for name, one in judged.items() if _leaks(one, judged)]
-    pairs = list(combinations(judged, 2))
+    """Noise that two axes share, on both, with the evidence of the pair. Returns the axes whose model changed.
+
+    An axis that is not in `found` has the model that it was fitted with at first."""
+    states = {**record.axes, **{name: one.state for name, one in found.items()}}
+    states = {name: state for name, state in states.items() if state.whitened.size and not state.below_lattice}
+    changed = [name for name, one in found.items() if name in states and _leaks(one, states)]
+    states |= {name: found[name].state for name in changed}
+    pairs = [pair for pair in combinations(states, 2) if any(name in found for name in pair)]
     for names in pairs:
-        states = [judged[name].state for name in names]
-        pair = pair_of(states[0].whitened, states[1].whitened, states[0].dt)
+        one, two = (states[name] for name in names)
+        pair = pair_of(one.whitened, two.whitened, one.dt)
         both = common(pair, math.log(len(pairs)))
         if both is None or both.net < NET_LEAST:
             continue
-        for k, name in enumerate(names):
-            other, findings = names[1 - k], judged[name].findings
-            last = max((one.round for one in findings if one.look.changes), default=0)
-            seen = look(pair, both, other)
-            findings.append(Finding(seen, last, states[k], states[k], (), (other,), states[1 - k]))
+        for name, other in (names, names[::-1]):
+            if name in found:
+                findings = found[name].findings
+                last = max((one.round for one in findings if one.look.changes), default=0)
+                state, partner = states[name], states[other]
+                findings.append(Finding(look(pair, both, other), last, state, state, (), (other,), partner))
     return changed
 
 
-def _leaks(one: Diagnosed, judged: Mapping[str, Diagnosed]) -> bool:
+def _leaks(one: Diagnosed, states: Mapping[str, State]) -> bool:
     """Judge whether an axis that follows another shares a source with it instead; returns whether its model changed.
 
     A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
@@ -253,10 +258,10 @@ def _leaks(one: Diagnosed, judged: Mapping[str, Diagnosed]) -> bool:
     changed = False
     for finding in [finding for finding in one.findings if finding.look.cause == "cross_axis"]:
         other = str(finding.look.estimate["other"])
-        if other not in judged:
+        if other not in states:
             continue
         free = without(one.state, other)
-        both = common(pair_of(free.whitened, judged[other].state.whitened, free.dt))
+        both = common(pair_of(free.whitened, states[other].whitened, free.dt))
         if both is None or both.net < NET_LEAST:
             continue
         ahead = both.gain - (one.state.best.ln_likelihood - free.best.ln_likelihood)
