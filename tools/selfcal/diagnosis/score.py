@@ -45,12 +45,12 @@ def gain(
     cause = CAUSES[look.cause]
     if cause.no_gain:
         return None, cause.no_gain
-    if before is after:
-        return None, "the readings are left out before and after: the model of the noise is the same"
     n = before.y.size
     split = n // 2
     if cause.together is not None and partner is not None:
         return _joint(cause.together, look, (before, partner), split)
+    if before is after:
+        return None, "the readings are left out before and after: the model of the noise is the same"
     if cause.onset and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):

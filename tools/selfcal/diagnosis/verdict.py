@@ -28,6 +28,8 @@ SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "no
 LN_TWICE = math.log(2.0)
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
 P_FAMILY, P_COHERENCE = 2e-3, 5e-4
+#: Drift within a block of means over its white noise from which on the means alone show nothing: sqrt(6), less a tenth.
+WITHIN = 2.2
 #: A first ensemble screens: axes below this have a second one, which knows its tail, unless there is no doubt.
 P_SCREEN, P_CERTAIN, AGAIN = 2e-2, 1e-12, 240
 
@@ -78,8 +80,24 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
     if means is None or looks[0].findings or not means.findings:
         return looks[0]
     strongest = max(means.findings, key=lambda one: one.look.net)
+    if not strongest.look.changes and _moves_within(looks[0].state, means.state.dt):
+        return looks[0]
     least = NET_LEAST if strongest.look.changes else -math.log(P_FAMILY)
     return means if strongest.look.net >= least + LN_TWICE else looks[0]
+
+
+def _moves_within(state: State, block_s: float) -> bool:
+    """Whether the drift moves so far within a block, s, that no model of point drift and white noise has its means.
+
+    Means of a walk are a walk at points and white noise less a sixth of its step: none is left beyond sqrt(6) N."""
+    fit = state.best
+    N, K = fit.sigma * math.sqrt(fit.dt), 0.0
+    if fit.terms.walk:
+        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
+    if fit.terms.markov:
+        sigma_m, alpha = fit.sigma * math.exp(fit.value("ln_markov")), math.exp(fit.value("ln_alpha"))
+        K = math.hypot(K, sigma_m * math.sqrt(2.0 * alpha))
+    return K * block_s > WITHIN * N
 
 
 def coherence(state: State, record: Record) -> list[Statistic]:

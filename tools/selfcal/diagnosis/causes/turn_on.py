@@ -311,6 +311,7 @@ CAUSE = Cause(
     alike=_alike,
     pictures=shown("means", "evidence"),
     trained=_trained,
+    anew=True,
     least=_least,
     of_column=lambda column, c: {"amplitude": c[0], "time_constant_s": float(column.entry["time_constant_s"])},
     add=_add,
