@@ -46,7 +46,7 @@ static bool valid_source(const selfcal_source_t *source) {
 }
 
 /* The first sample at a time or after it. */
-static uint64_t sample_of_time(const selfcal_former_t *self, float time_s) {
+static uint64_t sample_of(const selfcal_former_t *self, float time_s) {
     return (uint64_t)fmin(ceil((selfcal_wide_t)time_s / interval_of(self->model) - 1e-3), 1e18);
 }
 
@@ -71,9 +71,9 @@ selfcal_status_t selfcal_former_init(selfcal_former_t *self, const selfcal_model
             trail->window = cut.window;
             trail->bin = cut.bin;
         } else if (source->kind == SELFCAL_COLUMN_STEP || source->kind == SELFCAL_COLUMN_PULSE) {
-            trail->step = sample_of_time(self, source->number);
+            trail->step = sample_of(self, source->number);
             if (source->kind == SELFCAL_COLUMN_PULSE) {
-                trail->window = (uint32_t)fmin((selfcal_wide_t)(sample_of_time(self, source->until) - trail->step), 4e9);
+                trail->window = (uint32_t)fmin((selfcal_wide_t)(sample_of(self, source->until) - trail->step), 4e9);
             }
         } else if (source->kind == SELFCAL_COLUMN_SINE || source->kind == SELFCAL_COLUMN_COSINE) {
             const selfcal_wide_t turns = (selfcal_wide_t)source->number * interval_of(model); /* a sample */

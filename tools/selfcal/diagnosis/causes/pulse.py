@@ -297,6 +297,7 @@ CAUSE = Cause(
     most=3,
     slow=True,
     alike=_alike,
+    once="a pulse is an event of its recording",
     pictures=shown("means", "evidence"),
     onset=True,
     least=_least,
