@@ -361,17 +361,17 @@ template <class T, int D, bool PLAIN> struct Filter {
         for (int a = 0; a < D; a++)
             K[a] = Ph[a] * inverse;
         for (int a = 0; a < D; a++)
-            for (int b = 0; b < D; b++)
-                A[a][b] = P[a][b] - K[a] * Ph[b];
+            for (int b = a; b < D; b++)
+                A[a][b] = A[b][a] = P[a][b] - K[a] * Ph[b];
         for (int a = 0; a < D; a++) {
             const int before = a > 0 ? a - 1 : 0, after = a < D - 1 ? a + 1 : a;
             FK[a] = on[a] * K[a];
-            for (int b = 0; b < D; b++)
+            for (int b = before; b < D; b++) // no more is needed of a symmetric P
                 FA[a][b] = on[a] * A[a][b];
             if (!tied[a])
                 continue;
             FK[a] += below[a] * K[before] + above[a] * K[after];
-            for (int b = 0; b < D; b++)
+            for (int b = before; b < D; b++)
                 FA[a][b] += below[a] * A[before][b] + above[a] * A[after][b];
         }
         for (int a = 0; a < D; a++)
@@ -756,12 +756,12 @@ template <int V, int D, bool PLAIN> void passed(const Input &in, const Sums &out
     }
 }
 
-// Of many states, every second number is compiled.
+// Compiled for few numbers of states: every one up to 4 and every second beyond, of many parameters every eighth.
 template <int V, int D>
 void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
     if (in.states > D) {
         if constexpr (D < states_max)
-            differentiated<V, D < 4 ? D + 1 : D + 2>(diagonal, in, out, slopes);
+            differentiated<V, D + (V == 2 ? 8 : D < 4 ? 1 : 2)>(diagonal, in, out, slopes);
     } else if constexpr (V == 1) {
         if (diagonal)
             return passed<V, D, true>(in, out, slopes);
@@ -982,7 +982,7 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
         if (count <= width)
             differentiated<1, 1>(diagonal, in, out, by);
         else
-            differentiated<2, 1>(diagonal, in, out, by);
+            differentiated<2, 8>(diagonal, in, out, by);
     }
     return nb::make_tuple(G, D, counted, G_by, D_by, innovations, spread);
 }
