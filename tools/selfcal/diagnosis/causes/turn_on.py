@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -111,8 +112,9 @@ def looks(state: State, record: Record) -> list[Look]:
         )
         for one, row in zip(times, found, strict=True)
     )
-    estimate = posterior(state, t, times, record, brief=worth < NET_LEAST)
-    return [Look("turn_on", gain, worth, estimate, {"regressors": (*state.regressors, *added)})]
+    estimate = posterior(state, t, times, record, brief=True)
+    changes = {"regressors": (*state.regressors, *added)}
+    return [Look("turn_on", gain, worth, estimate, changes, measure=partial(posterior, state, t, times, record))]
 
 
 def _search(state: State, t: Array, record: Record, least: float) -> tuple[float, Array]:
