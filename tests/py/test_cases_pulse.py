@@ -56,7 +56,8 @@ def test_times_and_amplitude_lie_in_their_intervals(law: str) -> None:
     held: dict[str, list[bool]] = {"start_s": [], "end_s": [], "amplitude": []}
     for _ in range(case_records(6, 200)):
         shape, *truth = drawn(random, 1.0)
-        found = pulse.looks(*recorded(noise(random, law, shape.size, 1.0) + shape, 1.0))
+        looks = pulse.looks(*recorded(noise(random, law, shape.size, 1.0) + shape, 1.0))
+        found = [look.measured() for look in looks]
         for (key, each), value in zip(held.items(), truth, strict=True):
             each.append(bool(found) and found[0].estimate[key]["q05"] <= value <= found[0].estimate[key]["q95"])
     for key, each in held.items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.diagnosis.state import Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import SIZE_LIMITS, Array, Terms
 
 #: Blocks that the pairs are looked for in, and places of a step among them.
@@ -77,9 +78,10 @@ def looks(state: State, record: Record) -> list[Look]:
     times = [float(record.time_s[place]) for place in (begin, end)]
     entry = {"kind": "pulse", "start_s": times[0], "end_s": times[1]}
     column = Regressor(_name(*times), "pulse", found, "1", entry)
-    estimate = posterior(state, record.time_s, begin, end, fit, brief=worth < NET_LEAST)
+    estimate = posterior(state, record.time_s, begin, end, fit, brief=True)
     changes = {"regressors": (*state.regressors, column)}
-    return [Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]))]
+    measure = partial(posterior, state, record.time_s, begin, end, fit)
+    return [Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]), measure=measure)]
 
 
 def _worth(state: State, gain: float) -> float:
