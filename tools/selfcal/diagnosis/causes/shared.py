@@ -247,7 +247,20 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 last = max((one.round for one in findings if one.look.changes), default=0)
                 state, partner = states[name], states[other]
                 findings.append(Finding(look(pair, both, other), last, state, state, (), (other,), partner))
-    return changed
+    return [*changed, *(name for name, one in found.items() if _accounted(name, one, found))]
+
+
+def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> bool:
+    """Drop a dependence on another axis that no form explains where that axis leaks or shares a source; returns whether
+    there was one. Seen from the axis that leaks, its coefficient differs from one frequency to the next."""
+    known = {str(finding.look.estimate["other"]) for finding in one.findings if "other" in finding.look.estimate}
+    for other, two in found.items():
+        if any(finding.look.estimate.get("other") == name for finding in two.findings):
+            known.add(other)
+    kept = [finding for finding in one.findings if finding.look.changes or finding.look.shown_by not in known]
+    dropped = len(kept) < len(one.findings)
+    one.findings[:] = kept
+    return dropped
 
 
 def _leaks(one: Diagnosed, states: Mapping[str, State]) -> bool:
