@@ -152,6 +152,11 @@ class Cause:
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
 
+    @property
+    def several(self) -> bool:
+        """Whether the simulator makes several of its effects on an axis: it has no member that holds one."""
+        return self.add is not None and not any(key.field for key in self.keys.values())
+
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:
     """The same pictures for every look."""

@@ -194,7 +194,7 @@ def _effects(name: str, one: Diagnosed) -> list[str]:
     kind on an axis: the strongest. Those that a cause adds are all there."""
     strongest: dict[object, tuple[Cause, float, dict[str, Any]]] = {}
     for k, (cause, strength, pairs) in enumerate([*_of_columns(one), *_of_findings(one)]):
-        place = cause.id if cause.add is None else k
+        place = k if cause.several else cause.id
         if place not in strongest or strongest[place][1] < strength:
             strongest[place] = (cause, strength, pairs)
     texts = []

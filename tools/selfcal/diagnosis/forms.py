@@ -344,7 +344,8 @@ def _estimate(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
         key: interval(float(chosen.fit.c[place]), float(chosen.fit.sd[place]), unit)
         for (key, unit), place in zip(keys, places, strict=True)
     }
-    return sizes | {"form": chosen.option.form, "input": channel.input, **channel.extra}
+    window = {NUMBER["rate"]: chosen.option.number} if chosen.option.form == "rate" else {}
+    return {**sizes, "form": chosen.option.form, **window, "input": channel.input, **channel.extra}
 
 
 def _measured(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
@@ -370,7 +371,8 @@ def _measured(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
     }
     if shaped:
         numbers = np.array([one.number for one in alternatives])
-        apart = 0.29 * np.gradient(np.sort(numbers))[np.argsort(np.argsort(numbers))]
+        # The deviation within a cell of the grid: its width over the root of 12.
+        apart = np.gradient(np.sort(numbers))[np.argsort(np.argsort(numbers))] / math.sqrt(12.0)
         total = weight.sum(axis=1)
         sizes[NUMBER[form]] = mixture(total, numbers, apart, "s" if form == "lag" else channel.of)
     return sizes

@@ -15,6 +15,7 @@ def verdict(axis: Mapping[str, Any]) -> str:
         return str(axis["verdict"])
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
 
+
 #: Stretches of time that a sentence names.
 INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.

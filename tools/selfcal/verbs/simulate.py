@@ -50,7 +50,7 @@ def simulate(
     applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
     asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
     for name, axis in asked:
-        if asked.count((name, axis)) > 1 and CAUSES[name].add is None:
+        if asked.count((name, axis)) > 1 and not CAUSES[name].several:
             raise UserError(f"--effect {name}: twice on {axis}, which has room for one effect of a kind")
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
@@ -278,7 +278,8 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
             model.group_of(record["other"])
             if record["other"] == axis_name:
                 raise UserError(f"--effect {name}: axis {axis_name} cannot be its own other")
-            axis.cross_axis = model.axes.index(record["other"])
+            if not cause.several:
+                axis.cross_axis = model.axes.index(record["other"])
         applied["axes"][axis_name] = record
     return applied
 

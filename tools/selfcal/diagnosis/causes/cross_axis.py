@@ -73,8 +73,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
 
 def without(state: State, other: str) -> State:
-    """The state without the column of another axis."""
-    kept = tuple(column for column in state.regressors if column.name != f"axis_{other}")
+    """The state without the columns of another axis."""
+    kept = tuple(one for one in state.regressors if one.cause != "cross_axis" or one.entry["column"] != other)
     return state.refit(regressors=kept)
 
 

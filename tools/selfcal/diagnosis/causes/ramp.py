@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from selfcal.diagnosis.cause import Cause, Key, shown
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, mixture, net
 from selfcal.regressors import coefficient_unit
 
 
@@ -25,10 +27,13 @@ def looks(state: State, record: Record) -> list[Look]:
         return []
     unit = coefficient_unit(state.unit, column.unit)
     slope = interval(float(fit.c[-1]), float(fit.sd[-1]), unit)
-    if worth >= NET_LEAST:
+
+    def measure() -> dict[str, Any]:
         weight, means, sds = (of[0] for of in state.posterior(column.values))
-        slope = mixture(weight, means[:, 0], sds[:, 0], unit)
-    return [Look("ramp", gain, worth, {"slope": slope}, {"regressors": (*state.regressors, column)})]
+        return {"slope": mixture(weight, means[:, 0], sds[:, 0], unit)}
+
+    changes = {"regressors": (*state.regressors, column)}
+    return [Look("ramp", gain, worth, {"slope": slope}, changes, measure=measure)]
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
