@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from selfcal.diagnosis.statemodel import Array
 
 if TYPE_CHECKING:
@@ -57,12 +59,14 @@ class Key:
 
 @dataclass(frozen=True)
 class Channels:
-    """Before the read-out, each [n]: time, s, temperature, degC, supply, V, and the other axes."""
+    """Before the read-out, each [n]: time, s, temperature, degC, supply, V, and the other axes. `random`: numbers of
+    this effect on this axis alone."""
 
     time_s: Array
     temperature: Array
     supply: Array
     axes: Mapping[str, Array]
+    random: np.random.Generator
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def simulate(
     if scene.missing > scene.samples - 2:
         raise UserError(f"--effect missing_samples: {scene.missing} of {scene.samples} samples cannot be missing")
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
-        added = _added(applied, model, scene.rate_hz)
+        added = _added(applied, model, scene.rate_hz, seed)
         values, temperature, supply, present, bias_now = _reference.simulate(scene, axes, added)
         changed = _read_out(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, _DRAWS + len(axes)))
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
@@ -86,7 +86,7 @@ def simulate(
 
 
 def _added(
-    applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float
+    applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float, seed: int
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
     """Adds the effects that a cause forms by itself to `values` [axes, n] before the read-out; None without any."""
     own = [one for one in applied if CAUSES[one["id"]].add is not None]
@@ -95,12 +95,14 @@ def _added(
 
     def add(values: NDArray[np.float64], temperature: NDArray[np.float64], supply: NDArray[np.float64]) -> None:
         time_s = np.arange(temperature.size) / rate_hz
-        channels = Channels(time_s, temperature, supply, dict(zip(model.axes, values.copy(), strict=True)))
-        for one in own:
+        axes = dict(zip(model.axes, values.copy(), strict=True))
+        for number, one in enumerate(own):
             form = CAUSES[one["id"]].add
             assert form is not None
             for name, keys in one["axes"].items():
-                values[model.axes.index(name)] += form(keys, channels)
+                place = model.axes.index(name)
+                random = np.random.default_rng([seed, number, place])
+                values[place] += form(keys, Channels(time_s, temperature, supply, axes, random))
 
     return add
 

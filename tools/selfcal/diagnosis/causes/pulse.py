@@ -61,7 +61,9 @@ def looks(state: State, record: Record) -> list[Look]:
     n = state.y.size
     if n < 10 * SHORTEST or state.extras.color or state.extras.bands:
         return []
-    tried = [_moved(state, begin, end) for begin, end in (*_coarse(state), *_of_step(state)) if end - begin >= SHORTEST]
+    pairs = [(begin, end) for begin, end in (*_coarse(state), *_of_step(state)) if end - begin >= SHORTEST]
+    moved = [_moved(state, begin, end) for begin, end in pairs]
+    tried = [one for one in moved if one[1] >= EDGE and one[2] <= n - EDGE and one[2] - one[1] >= SHORTEST]
     if not tried:
         return []
     gain, begin, end, fit = max(tried, key=lambda one: one[0])
@@ -102,14 +104,14 @@ def _column(n: int, begin: int, end: int) -> Array:
 
 def _coarse(state: State) -> list[tuple[int, int]]:
     """The best pairs of places, some way apart, of block means."""
-    series, block = _blocks(state)
+    series, block = blocks(state)
     m = series.y.size
     places = np.unique(np.linspace(0, m, PLACES + 2).astype(int)[1:-1])
     value = np.full((places.size, places.size), -math.inf)
     near = state.near()
     for fit in (one for one in state.fits if one.terms in near):
         for less in SIZES:
-            value = np.maximum(value, _pairs(series, fit.terms, _of_blocks(fit, block, less), places))
+            value = np.maximum(value, _pairs(series, fit.terms, of_blocks(fit, block, less), places))
     found: list[tuple[int, int]] = []
     while len(found) < TRIED and np.isfinite(value.max()):
         i, j = divmod(int(value.argmax()), places.size)
@@ -127,7 +129,7 @@ def _of_step(state: State) -> list[tuple[int, int]]:
     return [(place, int(np.argmax(ahead))), (int(np.argmax(behind)), place)]
 
 
-def _blocks(state: State) -> tuple[Series, int]:
+def blocks(state: State) -> tuple[Series, int]:
     """Means of blocks, NaN where half of one is missing, and the samples of a block."""
     n = state.y.size
     block = max(1, n // BLOCKS)
@@ -144,7 +146,7 @@ def _blocks(state: State) -> tuple[Series, int]:
     return Series(mean, state.dt * block, r, columns), block
 
 
-def _of_blocks(fit: Fit, block: int, less: float) -> Array:
+def of_blocks(fit: Fit, block: int, less: float) -> Array:
     """The parameters of a fit for means of so many samples; sizes of the drift are relative to the white noise's."""
     by = {name: 0.5 * math.log(block) for name in SIZE_NAMES} | {"ln_rho": math.log(block)}
     least = math.log(SIZE_LIMITS[0])
@@ -220,6 +222,8 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
     ln_weight, amplitude, sd, starts, ends = [], [], [], [], []
     for at, ln_share in _nodes(state, begin, end, fit, brief):
         first, last = _other(state, at, end, after=False), _other(state, at, begin, after=True)
+        if not (first.A[begin] > 0.0 and last.A[end] > 0.0):  # this drift forgets too fast to know
+            continue
         i, j = _likely(first, begin), _likely(last, end)
         middle = float(last.B[end] / last.A[end])
         gain = first.gain[i][:, None] + last.gain[j][None, :] - last.gain[end]
@@ -230,10 +234,13 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
         sd.append((1.0 / np.sqrt(information)).ravel())
         starts.append(np.repeat(i, j.size))
         ends.append(np.tile(j, i.size))
+    edge = state.dt / math.sqrt(12.0)
+    if not ln_weight:
+        ln_weight, amplitude, sd = [np.zeros(1)], [fit.c[-1:]], [fit.sd[-1:]]
+        starts, ends = [np.array([begin])], [np.array([end])]
     ln_all = np.concatenate(ln_weight)
     weight = np.exp(ln_all - ln_all.max())
     # An edge lies between the last reading before it and the first one after it.
-    edge = state.dt / math.sqrt(12.0)
     return {
         "start_s": mixture(weight, time_s[np.concatenate(starts)] - 0.5 * state.dt, edge, "s"),
         "end_s": mixture(weight, time_s[np.concatenate(ends)] - 0.5 * state.dt, edge, "s"),
@@ -256,7 +263,7 @@ def _nodes(state: State, begin: int, end: int, fit: Fit, brief: bool) -> Iterato
 def _likely(pulses: Pulses, place: int) -> Array:
     """The likeliest places about `place`, itself among them."""
     gain = np.where(pulses.A > 0.0, pulses.gain, -math.inf)
-    held = np.flatnonzero(gain > gain[place] + math.log(WEIGHT_LEAST))
+    held = np.flatnonzero(gain > gain.max() + math.log(WEIGHT_LEAST))
     best = held[np.argsort(-gain[held])[:MOST_TIMES]]
     return np.union1d(best, [place])
 

@@ -1,0 +1,73 @@
+"""A bias that jumps between two levels: named, its amplitude and dwell times held, and no clean record shows it.
+
+Truth: the numbers that each record was drawn with, as in `test_cases_turn_on.py`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from test_cases_turn_on import LAWS, noise, recorded
+
+from selfcal.diagnosis.causes import two_level
+from selfcal.diagnosis.loop import diagnose_record
+from selfcal.diagnosis.state import NET_LEAST
+from selfcal.diagnosis.statemodel import Array
+
+from conftest import case_records
+
+#: Amplitude, and mean times at the lower and the upper level, s.
+AMPLITUDE, LOW_S, HIGH_S = 0.12, 120.0, 240.0
+
+
+def jumps(random: np.random.Generator, n: int, rate: float) -> Array:
+    """[n]: one of two levels, each for an exponential time."""
+    level, upper, at = np.empty(n), bool(random.integers(2)), 0.0
+    while at < n:
+        level[int(at) :] = 0.5 * AMPLITUDE * (1.0 if upper else -1.0)
+        at += rate * random.exponential(HIGH_S if upper else LOW_S)
+        upper = not upper
+    return level
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_popcorn_noise_is_named_first(law: str) -> None:
+    """9 of 10; some 100 to 200 nats."""
+    random = np.random.default_rng([441, LAWS.index(law)])
+    right = total = 0
+    for _ in range(case_records(1, 40)):
+        y = noise(random, law, 3600, 1.0) + jumps(random, 3600, 1.0)
+        one = diagnose_record(recorded(y, 1.0)[1], ["gx"])["gx"]
+        total += 1
+        right += [finding.look.cause for finding in one.findings][:1] == ["two_level"]
+    print(f"two_level, {law}: {right} of {total}")
+    assert binom.cdf(right, total, 0.9) > 1e-3
+
+
+def test_amplitude_and_dwell_times_lie_in_their_intervals() -> None:
+    """90 %, the lower tail of the binomial not below 1 in 1000."""
+    random = np.random.default_rng(442)
+    truth = {"amplitude": AMPLITUDE, "dwell_low_s": LOW_S, "dwell_high_s": HIGH_S}
+    held: dict[str, list[bool]] = {key: [] for key in truth}
+    for _ in range(case_records(2, 100)):
+        y = noise(random, "walk", 3600, 1.0) + jumps(random, 3600, 1.0)
+        look = two_level.looks(*recorded(y, 1.0))[0].measured()
+        for key, value in truth.items():
+            held[key].append(look.estimate[key]["q05"] <= value <= look.estimate[key]["q95"])
+    for key, each in held.items():
+        print(f"{key}: {sum(each)} of {len(each)} in the 90 % interval")
+        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
+def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
+    """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
+    random = np.random.default_rng([444, round(rate), round(seconds), LAWS.index(law)])
+    count, named = case_records(3, 200), 0
+    for _ in range(count):
+        found = two_level.looks(*recorded(noise(random, law, round(seconds * rate), rate), rate))
+        named += bool(found) and found[0].net >= NET_LEAST
+    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    assert named <= (4 if count >= 200 else 1)

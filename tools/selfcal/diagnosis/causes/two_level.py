@@ -1,0 +1,235 @@
+"""Two levels (popcorn): the bias stays at one of two levels for a while, then jumps to the other.
+
+A switching filter on block means: a random walk beside two hypotheses of the level, merged into one Gaussian after each
+sample (a generalized pseudo-Bayesian filter of order 1). It runs for many parameters at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.stats import gamma
+
+from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.causes.pulse import blocks, of_blocks
+from selfcal.diagnosis.causes.step import scan
+from selfcal.diagnosis.forms import LN_SLOW
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import SCREEN, Look, State, mixture, net
+from selfcal.diagnosis.statemodel import Array, Mask
+
+#: Tried first: amplitudes over the white noise of a block, dwell times in blocks, ln of the drift over the fitted one.
+AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
+DWELLS = (15.0, 50.0, 150.0, 450.0)
+SIZES = (0.0, -1.5, -3.0)
+#: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
+WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
+#: Rounds of draws about the best, and draws of each; those of the posterior.
+ROUNDS, DRAWS, POSTERIOR = 6, 120, 600
+#: Places of a dwell time's posterior.
+QUANTILES = 64
+#: Fewer jumps are steps, or a pulse.
+JUMPS_LEAST = 4
+#: Price of the search beside three degrees of freedom.
+LN_LOOKS = 2.0 + LN_SLOW
+#: Limits of a probability.
+LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """`ln_likelihood` [g] of each set of parameters; probability of the upper level [n, g] after each block."""
+
+    ln_likelihood: Array
+    upper: Array
+
+
+def switching(y: Array, theta: Array, keep: bool = False) -> Filtered:
+    """The filter over y [n], NaN where missing. theta [g, 5]: ln of amplitude, lower and upper dwell time in blocks,
+    walk of a block over the white noise, white noise. `keep`: with the probabilities."""
+    A, low, high, rho, sigma = np.exp(theta).T
+    R, Q, half = sigma**2, (rho * sigma) ** 2, 0.5 * A
+    up, down = -np.expm1(-1.0 / low), -np.expm1(-1.0 / high)
+    there = y[np.isfinite(y)]
+    x, P = np.full(A.size, there[:30].mean()), 1e4 * R
+    w, total = up / (up + down), np.zeros(A.size)
+    kept = np.empty((y.size if keep else 0, A.size))
+    for k, value in enumerate(y):
+        P = P + Q
+        w = w * (1.0 - down) + (1.0 - w) * up
+        if value == value:  # not missing
+            S = P + R
+            e = value - x
+            lower = (e + half) ** 2 / S
+            odds = np.log(w / (1.0 - w)) + 0.5 * (lower - (e - half) ** 2 / S)
+            most = np.maximum(odds, 0.0)
+            total += np.log1p(-w) + most + np.log(np.exp(-most) + np.exp(odds - most)) - 0.5 * (np.log(S) + lower)
+            w = np.clip(1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0))), LEAST, 1.0 - LEAST)
+            gain = P / S
+            x = x + gain * (e - half * (2.0 * w - 1.0))
+            P = P * (1.0 - gain) + (gain * A) ** 2 * w * (1.0 - w)
+        if keep:
+            kept[k] = w
+    return Filtered(total, kept)
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """The likeliest levels and dwell times, where they jump often enough."""
+    if state.y.size < 200 or state.extras.color or state.extras.bands:
+        return []
+    if scan(state.series, state.best).gain.max() < SCREEN + 2.0:
+        return []
+    series, block = blocks(state)
+    y = series.y - state.best.c[1:] @ series.columns[1:]
+    walk = next(fit for fit in state.fits if fit.terms.walk)
+    ln_rho = of_blocks(walk, block, 0.0)[walk.terms.names.index("ln_rho")]
+    ln_sigma = math.log(walk.sigma / math.sqrt(block))
+    none = _without(y, ln_rho, ln_sigma) + _law(state)
+    tried = np.array(
+        [
+            (math.log(a) + ln_sigma, math.log(d), math.log(d), ln_rho + less, ln_sigma)
+            for a in AMPLITUDES
+            for d in DWELLS
+            for less in SIZES
+        ]
+    )
+    value = switching(y, tried).ln_likelihood
+    if net(float(value.max()) - none, 3, LN_LOOKS) < 1.0:
+        return []
+    theta, gain, cloud = _best(y, tried[int(value.argmax())])
+    upper = _smoothed(y, theta) > 0.5
+    jumps = int(np.count_nonzero(np.diff(upper)))
+    if jumps < JUMPS_LEAST:
+        return []
+    stays = _stays(upper)
+    own = theta.copy()
+    own[1:3] = [math.log(time / count) for time, count in stays]
+    now = float(switching(y, own[None, :]).ln_likelihood[0])
+    theta, gain = (own, now) if now > gain else (theta, gain)
+    worth = net(gain - none, 3, LN_LOOKS)
+    if worth < 1.0:
+        return []
+    level = math.exp(theta[0]) * (upper - 0.5)
+    places = np.minimum(np.arange(state.y.size) // block, level.size - 1)
+    dt = state.dt * block
+    measure = partial(_amplitude, y, theta, cloud, state.unit)
+    estimate = {
+        "amplitude": mixture(np.ones(1), np.exp(theta[:1]), 0.05 * math.exp(theta[0]), state.unit),
+        **{key: _dwell(*stay, dt) for key, stay in zip(("dwell_low_s", "dwell_high_s"), stays, strict=True)},
+        "jumps": jumps,
+    }
+    changes = {"y": state.y - level[places], "redrawn": True}
+    return [Look("two_level", gain - none, worth, estimate, changes, measure=measure)]
+
+
+def _without(y: Array, ln_rho: float, ln_sigma: float) -> float:
+    """The likeliest walk beside one level, by the same filter."""
+    walks, whites = (one.ravel() for one in np.meshgrid(WALKS, WHITES))
+    none, dwell = np.full(walks.size, math.log(LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
+    theta = np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
+    return float(switching(y, theta).ln_likelihood.max())
+
+
+def _law(state: State) -> float:
+    """How far the walk is behind the best drift, nats: two levels are beside a walk."""
+    walk = next(fit for fit in state.fits if fit.terms.walk)
+    return max(0.0, state.best.ln_likelihood - walk.ln_likelihood)
+
+
+def _best(y: Array, theta: Array) -> tuple[Array, float, Array]:
+    """The likeliest parameters from `theta` on, their ln likelihood, and the draws' root of the covariance."""
+    random = np.random.default_rng(1)
+    spread = np.diag([0.3, 0.8, 0.8, 0.8, 0.03])
+    middle, value = theta, float(switching(y, theta[None, :]).ln_likelihood[0])
+    for _ in range(ROUNDS):
+        drawn = middle + random.standard_normal((DRAWS, theta.size)) @ spread.T
+        found = switching(y, drawn).ln_likelihood
+        order = np.argsort(-found)
+        if found[order[0]] > value:
+            middle, value = drawn[order[0]], float(found[order[0]])
+        weight = np.exp(np.clip(found - value, -50.0, 0.0))
+        weight = np.maximum(weight, 1e-6)  # so that a few far draws do not end the search
+        weight[order[DRAWS // 3 :]] = 0.0
+        apart = drawn - middle
+        covariance = (weight[:, None] * apart).T @ apart / weight.sum()
+        spread = np.linalg.cholesky(1.5 * covariance + 1e-5 * np.eye(theta.size))
+    return middle, value, spread
+
+
+def _amplitude(y: Array, theta: Array, spread: Array, unit: str) -> dict[str, Any]:
+    """Drawn about the likeliest parameters, each weighed by its likelihood; priors are flat in the logarithms."""
+    random = np.random.default_rng(2)
+    z = random.standard_normal((POSTERIOR, theta.size)) * 1.3
+    drawn = theta + z @ spread.T
+    ln_weight = switching(y, drawn).ln_likelihood + 0.5 * (z**2).sum(axis=1) / 1.3**2
+    sizes = np.exp(drawn[:, 0])
+    return {"amplitude": mixture(np.exp(ln_weight - ln_weight.max()), sizes, 0.01 * sizes, unit)}
+
+
+def _stays(upper: Mask) -> list[tuple[float, float]]:
+    """Blocks at the lower and at the upper level, and jumps away from each."""
+    change = np.diff(upper.astype(int))
+    return [
+        (float((~upper).sum()), float((change > 0).sum())),
+        (float(upper.sum()), float((change < 0).sum())),
+    ]
+
+
+def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:
+    """Mean of exponential times of which `count` ended in `time` blocks: an inverse gamma, in equal parts."""
+    share = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    values = dt * time / gamma.ppf(share, count)
+    return mixture(np.ones(QUANTILES), values, values / QUANTILES, "s")
+
+
+def _smoothed(y: Array, theta: Array) -> Array:
+    """[n]: probability of the upper level given the whole record, by a pass backwards over the filter's."""
+    up, down = (-math.expm1(-math.exp(-float(one))) for one in theta[1:3])
+    filtered = switching(y, theta[None, :], keep=True).upper[:, 0]
+    smooth = filtered.copy()
+    for k in range(y.size - 2, -1, -1):
+        w, after = filtered[k], smooth[k + 1]
+        ahead = w * (1.0 - down) + (1.0 - w) * up
+        smooth[k] = w * ((1.0 - down) * after / ahead + down * (1.0 - after) / (1.0 - ahead))
+    return np.asarray(smooth)
+
+
+def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
+    """From one level to the other after dwell times drawn from exponentials."""
+    t = channels.time_s
+    upper, end = bool(channels.random.integers(2)), 0.0
+    values = np.empty(t.size)
+    while end <= t[-1]:
+        values[t >= end] = keys["amplitude"] * (0.5 if upper else -0.5)
+        end += channels.random.exponential(keys["dwell_high_s"] if upper else keys["dwell_low_s"])
+        upper = not upper
+    return values
+
+
+def _is_positive(value: float) -> bool:
+    return value > 0.0
+
+
+CAUSE = Cause(
+    "two_level",
+    "The bias jumps between two levels (popcorn noise).",
+    "Record longer: dwell times are known by the jumps. Try another part: single ones have it.",
+    looks=looks,
+    most=1,
+    slow=True,
+    pictures=shown("means", "evidence"),
+    no_gain="the levels are found in the readings themselves, and no model file predicts them",
+    once="its jumps are events of their recording",
+    of_estimate=lambda look: {key: value["median"] for key, value in look.estimate.items() if key != "jumps"},
+    add=_add,
+    keys={
+        "amplitude": Key(lambda s: 3.0 * s.n),
+        "dwell_low_s": Key(lambda s: s.duration_s / 20.0, fits=_is_positive, limits="above 0"),
+        "dwell_high_s": Key(lambda s: s.duration_s / 20.0, fits=_is_positive, limits="above 0"),
+    },
+)
