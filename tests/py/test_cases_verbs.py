@@ -540,7 +540,7 @@ def test_a_first_look_that_is_broken_off_says_so(
         ending._state.came, ending._state.came_at = signal.SIGINT, time.monotonic()
         raise ending.Stopped
 
-    for module, name in ((loop.motion, "handled"), (loop, "_rounds")):
+    for module, name in ((loop.work, "each"), (loop, "_rounds")):
         with monkeypatch.context() as patched:
             patched.setattr(module, name, stopped_in_the_fit)
             with pytest.raises(ending.Ended):
