@@ -23,12 +23,12 @@ SECONDS = 2400.0
 
 
 def drawn(random: np.random.Generator, rate: float) -> tuple[Array, float, float, float]:
-    """A pulse [n] of some 40 to 100 nats net of its search, its start, end and amplitude."""
+    """A pulse [n] of some 40 to 100 nats net of its search, its start, length and amplitude."""
     t = np.arange(round(SECONDS * rate)) / rate
     length = math.exp(random.uniform(math.log(40.0), math.log(400.0)))
     start = random.uniform(150.0, SECONDS - length - 150.0)
     amplitude = float(random.choice([-1.0, 1.0])) * 0.12 * (100.0 / length) ** 0.3 * random.uniform(1.0, 1.4)
-    return np.where((t >= start) & (t < start + length), amplitude, 0.0), start, start + length, amplitude
+    return np.where((t >= start) & (t < start + length), amplitude, 0.0), start, length, amplitude
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_times_and_amplitude_lie_in_their_intervals(law: str) -> None:
     """90 %, the lower tail of the binomial not below 1 in 1000. A time between two readings has the normal's interval
     of a uniform, which holds 95 %."""
     random = np.random.default_rng([432, LAWS.index(law)])
-    held: dict[str, list[bool]] = {"start_s": [], "end_s": [], "amplitude": []}
+    held: dict[str, list[bool]] = {"time_s": [], "duration_s": [], "amplitude": []}
     for _ in range(case_records(6, 200)):
         shape, *truth = drawn(random, 1.0)
         looks = pulse.looks(*recorded(noise(random, law, shape.size, 1.0) + shape, 1.0))

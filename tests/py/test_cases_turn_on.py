@@ -76,12 +76,12 @@ def test_a_plain_turn_on_is_named_first_and_alone(law: str, rate: float) -> None
 def test_amplitude_and_time_constant_lie_in_their_intervals(law: str) -> None:
     """90 %, neither tail of the binomial below 1 in 1000."""
     random = np.random.default_rng([422, LAWS.index(law)])
-    held: dict[str, list[bool]] = {"amplitude": [], "time_constant_s": []}
+    held: dict[str, list[bool]] = {"amplitude": [], "tau_s": []}
     for _ in range(case_records(8, 200)):
         shape, amplitude, tau = drawn(random, 1.0, 3600.0)
         look = looked(noise(random, law, shape.size, 1.0) + shape, 1.0)
         assert look is not None
-        for key, truth in (("amplitude", amplitude), ("time_constant_s", tau)):
+        for key, truth in (("amplitude", amplitude), ("tau_s", tau)):
             held[key].append(look.estimate[key]["q05"] <= truth <= look.estimate[key]["q95"])
     for key, each in held.items():
         print(f"{key}, {law}: {sum(each)} of {len(each)} in the 90 % interval")
@@ -93,7 +93,7 @@ def test_two_time_constants_are_one_finding() -> None:
     """Each estimate within four of its standard deviations: 1 in 10 000 of a normal's."""
     random = np.random.default_rng(423)
     t = np.arange(3600.0)
-    truth = {"amplitude": 0.5, "time_constant_s": 20.0, "amplitude_2": -0.3, "time_constant_2_s": 300.0}
+    truth = {"amplitude": 0.5, "tau_s": 20.0, "amplitude_2": -0.3, "tau_2_s": 300.0}
     shape = 0.5 * np.exp(-t / 20.0) - 0.3 * np.exp(-t / 300.0)
     look = looked(noise(random, "walk", t.size, 1.0) + shape, 1.0)
     assert look is not None and set(look.estimate) == set(truth)

@@ -43,7 +43,7 @@ EFFECTS = {
     "ramp": ("slope=3e-4", 1.0),
     "step": ("time_s=900,amplitude=0.3", 1.0),
     "pulse": ("start_s=900,end_s=1200,amplitude=0.3", 1.0),
-    "turn_on": ("amplitude=0.6,time_constant_s=60", 1.0),
+    "turn_on": ("amplitude=0.6,tau_s=60", 1.0),
     "periodic": ("frequency_hz=0.05,amplitude=0.02", 1.0),
     "flicker": ("B=0.05", 10.0),
     "colored_noise": ("lag1=0.4", 1.0),

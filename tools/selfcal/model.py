@@ -43,7 +43,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
-    "turn_on": ("time_constant_s",),
+    "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
 #: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
@@ -97,7 +97,7 @@ class Regressor:
     window_s: float = math.nan  # of a rate; of a column that is smoothed
     frequency_hz: float = math.nan
     time_s: float = math.nan
-    time_constant_s: float = math.nan
+    tau_s: float = math.nan
     start_s: float = math.nan
     end_s: float = math.nan
     channel_unit: str = ""
@@ -438,7 +438,7 @@ class _Reader:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
         needed: dict[str, Any] = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
-            for key in ("window_s", "frequency_hz", "time_s", "time_constant_s", "start_s", "end_s", "lag_s", "width")
+            for key in ("window_s", "frequency_hz", "time_s", "tau_s", "start_s", "end_s", "lag_s", "width")
             if key in REGRESSORS[kind] and (kind != "column" or key in fields or key == NUMBER.get(chosen["form"]))
         }
         if kind == "pulse" and not needed["end_s"] > needed["start_s"]:

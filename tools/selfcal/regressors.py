@@ -119,7 +119,7 @@ def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regresso
 
 def _left(one: Regressor, start_s: float) -> float:
     """The part of a turn-on that is left at a time, s; 1 of all others."""
-    return math.exp(-start_s / one.time_constant_s) if one.kind == "turn_on" else 1.0
+    return math.exp(-start_s / one.tau_s) if one.kind == "turn_on" else 1.0
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
@@ -149,7 +149,7 @@ def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list
     if one.kind == "step":
         return [(_STEP, 0, one.time_s, 0.0)]
     if one.kind == "turn_on":
-        return [(_TURN_ON, 0, one.time_constant_s, 0.0)]
+        return [(_TURN_ON, 0, one.tau_s, 0.0)]
     if one.kind == "pulse":
         return [(_PULSE, 0, one.start_s, one.end_s)]
     if one.kind == "periodic":

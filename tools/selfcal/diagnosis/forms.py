@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -144,7 +144,7 @@ def column_of(channel: Channel, state: State, form: str, number: float, width_s:
         own = {key: value for key, value in entry.items() if form != "rate" or key != "reference"}
         return Regressor(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
 
-    known = {form_of(one) for one in state.regressors}
+    known = _known(state)
     parts = [part for part in PARTS.get(form, (form,)) if (channel.column, channel.input, part) not in known]
     return Option(
         form,
@@ -166,12 +166,28 @@ def form_of(column: Regressor) -> tuple[str, str, str]:
     return str(entry.get("column", "")), str(entry.get("input", "value")), form
 
 
+def _known(state: State) -> set[tuple[str, str, str]]:
+    """The forms that the model has."""
+    return {form_of(one) for one in state.regressors}
+
+
+def _widths(channel: Channel, state: State) -> list[float]:
+    """Widths of the means that the record is long enough for, s."""
+    most = channel.values.size // 10
+    return [width for k, width in enumerate(channel.widths_s) if k == 0 or round(width / state.dt) <= most]
+
+
+def _windows(channel: Channel, state: State) -> list[int]:
+    """The same in samples."""
+    return [max(1, round(width / state.dt)) for width in _widths(channel, state)]
+
+
 def options_of(channel: Channel, state: State) -> Iterator[Option]:
     """Every form over its grid of numbers and smoothing means."""
     n, dt = channel.values.size, state.dt
-    widths = [width for k, width in enumerate(channel.widths_s) if k == 0 or round(width / dt) <= n // 10]
+    widths = _widths(channel, state)
     middle = widths[len(widths) // 2]
-    known = {form_of(one) for one in state.regressors}
+    known = _known(state)
     for form in channel.forms:
         if (channel.column, channel.input, form) in known:
             continue
@@ -238,6 +254,12 @@ def _look(state: State, channel: Channel) -> list[Look]:
             estimate = {"statistic": f"dependence on {channel.column}", "measured": _inconstant(state, chosen)}
             return [Look("unexplained", chosen.gain, chosen.net, estimate, {}, shown_by=channel.column)]
         chosen = tried[constant[0]]
+    if channel.noisy and chosen.net >= NET_LEAST and (channel.column, channel.input, "static") in _known(state):
+        # What other means of the channel explain as well is its own noise in the column that the model has.
+        plain = max(state.with_columns(smoothed(channel.values, window))[0] for window in _windows(channel, state))
+        chosen = replace(chosen, gain=chosen.gain - plain, net=_worth(channel, chosen.option, chosen.gain - plain))
+        if chosen.net < 1.0:
+            return []
     rivals = [form for form in alike if form != chosen.option.form]
     estimate = _estimate(state, channel, chosen) | ({"form_also_possible": rivals} if rivals else {})
     changes = {"regressors": (*state.regressors, *chosen.option.regressors)}

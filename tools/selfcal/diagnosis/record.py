@@ -140,7 +140,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
                 "column": one.column,
                 "frequency_hz": one.frequency_hz,
                 "time_s": one.time_s - recording.start_s,
-                "time_constant_s": one.time_constant_s,
+                "tau_s": one.tau_s,
                 "kind": one.kind,
                 "form": one.form,
                 "input": one.input,

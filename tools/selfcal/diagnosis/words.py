@@ -28,9 +28,9 @@ LABELS = {
     "after_hz": "to",
     "frequency_hz": "frequency",
     "width_hz": "half width",
-    "time_constant_s": "time constant",
+    "tau_s": "time constant",
     "amplitude_2": "second amplitude",
-    "time_constant_2_s": "time constant",
+    "tau_2_s": "time constant",
     "lag_s": "time constant of the lag",
     "width": "width of the play",
 }

@@ -216,7 +216,7 @@ def _other(state: State, fit: Fit, place: int, after: bool) -> Pulses:
 
 
 def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief: bool = False) -> dict[str, Any]:
-    """Start, end and amplitude over every near drift and the spread of its parameters; of a `brief` one at the best.
+    """Time, duration and amplitude over every near drift and its parameters' spread; of a `brief` one at the best.
 
     The two times hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
     ln_weight, amplitude, sd, starts, ends = [], [], [], [], []
@@ -235,6 +235,7 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
         starts.append(np.repeat(i, j.size))
         ends.append(np.tile(j, i.size))
     edge = state.dt / math.sqrt(12.0)
+    begun, ended = (time_s[np.concatenate(places)] for places in (starts, ends))
     if not ln_weight:
         ln_weight, amplitude, sd = [np.zeros(1)], [fit.c[-1:]], [fit.sd[-1:]]
         starts, ends = [np.array([begin])], [np.array([end])]
@@ -242,8 +243,8 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
     weight = np.exp(ln_all - ln_all.max())
     # An edge lies between the last reading before it and the first one after it.
     return {
-        "start_s": mixture(weight, time_s[np.concatenate(starts)] - 0.5 * state.dt, edge, "s"),
-        "end_s": mixture(weight, time_s[np.concatenate(ends)] - 0.5 * state.dt, edge, "s"),
+        "time_s": mixture(weight, begun - 0.5 * state.dt, edge, "s"),
+        "duration_s": mixture(weight, ended - begun, math.sqrt(2.0) * edge, "s"),
         "amplitude": mixture(weight, np.concatenate(amplitude), np.concatenate(sd), state.unit),
     }
 
@@ -290,12 +291,13 @@ def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
 
 
 def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
-    return {"start_s": float(column.entry["start_s"]), "end_s": float(column.entry["end_s"]), "amplitude": c[0]}
+    start_s, end_s = (float(column.entry[key]) for key in ("start_s", "end_s"))
+    return {"time_s": start_s, "duration_s": end_s - start_s, "amplitude": c[0]}
 
 
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
-    t = channels.time_s
-    return np.where((t >= keys["start_s"]) & (t < keys["end_s"]), keys["amplitude"], 0.0)
+    t = channels.time_s - keys["time_s"]
+    return np.where((t >= 0.0) & (t < keys["duration_s"]), keys["amplitude"], 0.0)
 
 
 CAUSE = Cause(
@@ -314,8 +316,8 @@ CAUSE = Cause(
     of_column=_of_column,
     add=_add,
     keys={
-        "start_s": Key(lambda s: 0.45 * s.duration_s),
-        "end_s": Key(lambda s: 0.55 * s.duration_s),
+        "time_s": Key(lambda s: 0.45 * s.duration_s),
+        "duration_s": Key(lambda s: 0.1 * s.duration_s, fits=lambda v: v > 0.0, limits="above 0"),
         "amplitude": Key(lambda s: 2.0 * s.n),
     },
 )

@@ -108,7 +108,7 @@ def looks(state: State, record: Record) -> list[Look]:
         return []
     added = tuple(
         Regressor(
-            f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "time_constant_s": digits(float(one))}
+            f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))}
         )
         for one, row in zip(times, found, strict=True)
     )
@@ -230,7 +230,7 @@ def posterior(state: State, t: Array, tau: Array, record: Record, brief: bool = 
         times = np.tile(grid[places[k]], len(ln_weight))
         width = np.tile(np.gradient(grid)[places[k]], len(ln_weight)) / math.sqrt(12.0)
         estimate[f"amplitude{end}"] = mixture(weight, means[:, k], sds[:, k], state.unit)
-        estimate[f"time_constant{end}_s"] = mixture(weight, times, width, "s")
+        estimate[f"tau{end}_s"] = mixture(weight, times, width, "s")
     return estimate
 
 
@@ -267,7 +267,7 @@ def _places(series: Series, fit: Fit, t: Array, tau: Array, low: float, high: fl
 
 def _alike(a: Look, b: Look) -> bool:
     """Whether the time constants may be one."""
-    one, two = (look.estimate["time_constant_s"] for look in (a, b))
+    one, two = (look.estimate["tau_s"] for look in (a, b))
     return bool(one["q05"] <= two["q95"] and two["q05"] <= one["q95"])
 
 
@@ -290,12 +290,12 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     tau = 0.1 * record.present.size / record.rate_hz
     shape = _decays(_time(record), np.array([tau]))[0]
     size = state.least(shape) * math.sqrt(gain_for(lambda gain: net(gain, 2, LN_LOOKS)))
-    return {"amplitude": (size, state.unit), "time_constant_s": (tau, "s")}
+    return {"amplitude": (size, state.unit), "tau_s": (tau, "s")}
 
 
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     t = channels.time_s
-    first, second = (keys[f"amplitude{end}"] * np.exp(-t / keys[f"time_constant{end}_s"]) for end in ("", "_2"))
+    first, second = (keys[f"amplitude{end}"] * np.exp(-t / keys[f"tau{end}_s"]) for end in ("", "_2"))
     return np.asarray(first + second)
 
 
@@ -315,12 +315,12 @@ CAUSE = Cause(
     trained=_trained,
     anew=True,
     least=_least,
-    of_column=lambda column, c: {"amplitude": c[0], "time_constant_s": float(column.entry["time_constant_s"])},
+    of_column=lambda column, c: {"amplitude": c[0], "tau_s": float(column.entry["tau_s"])},
     add=_add,
     keys={
         "amplitude": Key(lambda s: 5.0 * s.n),
-        "time_constant_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
+        "tau_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
         "amplitude_2": Key(lambda s: 0.0),
-        "time_constant_2_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
+        "tau_2_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
     },
 )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import gamma
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, medians, shown
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.forms import LN_SLOW
@@ -120,6 +120,7 @@ def looks(state: State, record: Record) -> list[Look]:
     measure = partial(_amplitude, y, theta, cloud, state.unit)
     estimate = {
         "amplitude": mixture(np.ones(1), np.exp(theta[:1]), 0.05 * math.exp(theta[0]), state.unit),
+        "dwell_s": _dwell(sum(time for time, _ in stays), sum(count for _, count in stays), dt),
         **{key: _dwell(*stay, dt) for key, stay in zip(("dwell_low_s", "dwell_high_s"), stays, strict=True)},
         "jumps": jumps,
     }
@@ -225,7 +226,7 @@ CAUSE = Cause(
     pictures=shown("means", "evidence"),
     no_gain="the levels are found in the readings themselves, and no model file predicts them",
     once="its jumps are events of their recording",
-    of_estimate=lambda look: {key: value["median"] for key, value in look.estimate.items() if key != "jumps"},
+    of_estimate=lambda look: medians(look, "amplitude", "dwell_low_s", "dwell_high_s"),
     add=_add,
     keys={
         "amplitude": Key(lambda s: 3.0 * s.n),
