@@ -42,7 +42,7 @@ EFFECTS = {
     "cross_axis": ("other=gy,coefficient=0.5", 1.0),
     "ramp": ("slope=3e-4", 1.0),
     "step": ("time_s=900,amplitude=0.3", 1.0),
-    "pulse": ("start_s=900,end_s=1200,amplitude=0.3", 1.0),
+    "pulse": ("time_s=900,duration_s=300,amplitude=0.3", 1.0),
     "turn_on": ("amplitude=0.6,tau_s=60", 1.0),
     "periodic": ("frequency_hz=0.05,amplitude=0.02", 1.0),
     "flicker": ("B=0.05", 10.0),
