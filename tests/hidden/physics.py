@@ -435,18 +435,28 @@ def blink(scene: Scene, p: Truth) -> Made:
 # ---- channels
 
 
+#: degC and V: middle of a record's channel and its usual spread. A form's bends stand there in every record.
+TEMPERATE, SWING = 25.0, 3.0
+VOLTS, SAG = 5.0, 0.02
+
+
+def around(channel: Array, middle: float) -> Array:
+    """The channel with its mean at `middle`."""
+    return np.asarray(channel + (middle - channel.mean()))
+
+
 def warm(form: Callable[[Scene, Truth, Array], Array], price: float = 0.0) -> Callable[[Scene, Truth], Made]:
     """A bias that follows the temperature by `form`, in a box whose temperature swings."""
 
     def make(scene: Scene, p: Truth) -> Made:
-        scene.temperature = swings(scene.random, scene.t)
-        return column(scene, p["sign"] * form(scene, p, scene.temperature), price=price)
+        scene.temperature = around(swings(scene.random, scene.t), TEMPERATE)
+        return column(scene, p["sign"] * form(scene, p, (scene.temperature - TEMPERATE) / SWING), price=price)
 
     return make
 
 
 def _static(scene: Scene, p: Truth, channel: Array) -> Array:
-    return np.asarray(channel - channel.mean())
+    return channel
 
 
 def _rate(scene: Scene, p: Truth, channel: Array) -> Array:
@@ -455,11 +465,11 @@ def _rate(scene: Scene, p: Truth, channel: Array) -> Array:
 
 
 def _square(scene: Scene, p: Truth, channel: Array) -> Array:
-    return np.asarray((channel - channel.mean() - p["middle"] * channel.std()) ** 2)
+    return np.asarray((channel - p["middle"]) ** 2)
 
 
 def _cube(scene: Scene, p: Truth, channel: Array) -> Array:
-    return np.asarray((channel - channel.mean()) ** 3)
+    return np.asarray(channel**3)
 
 
 def _lag(scene: Scene, p: Truth, channel: Array) -> Array:
@@ -468,7 +478,7 @@ def _lag(scene: Scene, p: Truth, channel: Array) -> Array:
 
 def _play(scene: Scene, p: Truth, channel: Array) -> Array:
     every = max(round(0.1 / scene.dt), 1)
-    slow = play(channel[::every], p["width"] * float(np.ptp(channel)))
+    slow = play(channel[::every], p["width"])
     return np.interp(scene.t, scene.t[::every], slow)
 
 
@@ -476,9 +486,9 @@ def powered(form: Callable[[Scene, Truth, Array], Array], price: float = 0.0) ->
     """A bias that follows the supply, whose loads switch and whose level sags."""
 
     def make(scene: Scene, p: Truth) -> Made:
-        slow = 0.02 * smooth_noise(scene.random, scene.t, p["sag"])
-        scene.supply = scene.supply + slow
-        return column(scene, p["sign"] * form(scene, p, scene.supply), price=price)
+        slow = SAG * smooth_noise(scene.random, scene.t, p["sag"])
+        scene.supply = around(scene.supply + slow, VOLTS)
+        return column(scene, p["sign"] * form(scene, p, (scene.supply - VOLTS) / SAG), price=price)
 
     return make
 
@@ -569,8 +579,8 @@ def breathing(scene: Scene, p: Truth) -> Made:
 
 
 def noise_of_temperature(scene: Scene, p: Truth) -> Made:
-    scene.temperature = swings(scene.random, scene.t)
-    return noise_scaled(scene, (scene.temperature - scene.temperature.min()) / np.ptp(scene.temperature))
+    scene.temperature = around(swings(scene.random, scene.t), TEMPERATE)
+    return noise_scaled(scene, np.clip(0.5 + 0.3 * (scene.temperature - TEMPERATE) / SWING, 0.0, 1.0))
 
 
 def noise_of_vibration(scene: Scene, p: Truth) -> Made:
@@ -1149,7 +1159,7 @@ KINDS: dict[str, Kind] = {
     ),
     "temperature_cube": Kind("temperature:cube", (), warm(_cube), _warmth()),
     "temperature_lag": Kind("temperature:lag", (), warm(_lag, 2.0), _warmth(lag=lambda r: _log(r, 60.0, 300.0))),
-    "temperature_play": Kind("temperature:play", (), warm(_play, 2.0), _warmth(width=lambda r: _uniform(r, 0.25, 0.5))),
+    "temperature_play": Kind("temperature:play", (), warm(_play, 2.0), _warmth(width=lambda r: _uniform(r, 0.6, 1.2))),
     "supply": Kind("supply:static", (), powered(_static), _warmth(sag=lambda r: _log(r, 40.0, 200.0)), by_effect=True),
     "supply_square": Kind(
         "supply:square",

@@ -143,6 +143,24 @@ def test_size_and_the_second_record(kind: str) -> None:
     assert float(np.abs(seen - plain).max()) > 0.1 * float(np.std(np.diff(plain)))
 
 
+@pytest.mark.parametrize("kind", ["temperature_square", "temperature_cube", "supply_square"])
+def test_a_curve_is_the_same_in_both_records(kind: str) -> None:
+    """A cubic through the first record's channel and effect gives the second one's, whose channel is another."""
+    truth = pair(kind, 5, "plain", 1.0, seconds=1200.0, second=False)[0].truth
+    curves = []
+    for number in (1, 2):
+        scene = physics._scene(truth, number)
+        effect = KINDS[kind].make(scene, truth["parameters"]).add[scene.target]
+        middle = physics.VOLTS if kind.startswith("supply") else physics.TEMPERATE
+        curves.append(((scene.supply if kind.startswith("supply") else scene.temperature) - middle, effect))
+    (channel, effect), (other, expected) = curves
+    spread = channel.std()
+    found = np.polyval(np.polyfit(channel / spread, effect, 3), other / spread)
+    assert np.abs(other - channel).max() > spread
+    # Rounding, where the second channel leaves the first one's range.
+    assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize("kind", ["turn_on", "jump", "tide", "ramp"])
 def test_gain_from_the_readings_alone(kind: str) -> None:
     """The readings on their lattice, with the shape by its formula, show the stated gain.
