@@ -148,7 +148,7 @@ def test_the_means_of_the_real_runs_show_no_lattice_statistic() -> None:
         means = replace(recorded, rate_hz=10.0, columns=columns, missing_before=np.zeros(n // 10, np.int64))
         keys = ("repeated_readings", "equal_readings", "longest_repeat", "odd_even_codes")
         for name, state in of_recording(means, MODEL).axes.items():
-            rows = {row.name: row.p for row in statistics(state.refit(), count=24)}
+            rows = {row.name: row.p for row in statistics(state.refit(), count=24).statistics}
             assert min(rows[key] for key in keys if key in rows) > 1e-6, (number, name)
 
 

@@ -35,18 +35,6 @@ def test_a_cubic_of_the_temperature_has_its_curvature(tmp_path: Path) -> None:
     assert found.get("temperature", {}).get("form") in ("square", "cube")
 
 
-@later(12, "turn_on")
-@pytest.mark.parametrize(
-    ("case", "amplitude", "tau_s"), [("P31_warmup.py", 0.4, 600.0), ("P31c_warmup_short.py", 0.2, 300.0)]
-)
-def test_self_heating_without_a_channel_is_a_turn_on(case: str, amplitude: float, tau_s: float, tmp_path: Path) -> None:
-    """Amplitude and time constant within 4 sd of 0.4 or 0.2 deg/s, 600 or 300 s."""
-    found = causes_of(shared_case(case, tmp_path))
-    assert "turn_on" in found
-    for key, truth in (("amplitude", amplitude), ("tau_s", tau_s)):
-        assert abs(abs(found["turn_on"][key]["median"]) - truth) < 4.0 * found["turn_on"][key]["sd"]
-
-
 @later(14, "priors from the record")
 def test_a_tactical_gyro_has_an_answer(tmp_path: Path) -> None:
     """P94: 0.012 deg/sqrt(h) is N = 2e-4 deg/s/sqrt(Hz), without a model file. 4 sd."""

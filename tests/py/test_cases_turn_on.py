@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statemodel import Array
+from selfcal.verbs.diagnose import diagnose
 
-from conftest import case_records
+from conftest import case_records, shared_case
 
 N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
 LAWS = ("walk", "markov")
@@ -124,3 +126,15 @@ def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:
         (look,) = (one.measured() for one in turn_on.looks(state, its))
         assert abs(look.estimate["amplitude"]["mean"] - 0.8) < 3.0 * look.estimate["amplitude"]["sd"]
         assert look.estimate["amplitude"]["sd"] < 0.03
+
+
+@pytest.mark.parametrize(
+    ("case", "amplitude", "tau_s"), [("P31_warmup.py", 0.4, 600.0), ("P31c_warmup_short.py", 0.2, 300.0)]
+)
+def test_self_heating_without_a_channel_is_a_turn_on(case: str, amplitude: float, tau_s: float, tmp_path: Path) -> None:
+    """Amplitude and time constant within 4 sd of 0.4 or 0.2 deg/s, 600 or 300 s."""
+    (axis,) = diagnose(shared_case(case, tmp_path), decimate=1.0)["axes"].values()
+    found = {finding["cause"]: finding["estimate"] for finding in axis["findings"]}
+    assert "turn_on" in found
+    for key, truth in (("amplitude", amplitude), ("tau_s", tau_s)):
+        assert abs(abs(found["turn_on"][key]["median"]) - truth) < 4.0 * found["turn_on"][key]["sd"]

@@ -23,10 +23,12 @@ class Outcome:
 
 def check(wanted: str | None, more: Collection[str] = ()) -> None:
     """Raise UserError for what is no cause. `more`: what the verb takes besides."""
-    from selfcal.diagnosis.causes import CAUSES
+    if wanted is None:
+        return
+    from selfcal.diagnosis.causes import CAUSES  # a second of imports
 
     known = (INADEQUATE, *more, *CAUSES)
-    if wanted is not None and wanted not in known:
+    if wanted not in known:
         raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter, oaconvolve
 
 Array = NDArray[np.float64]
 
@@ -60,6 +59,8 @@ def variance_of(values: Array, missing: NDArray[np.integer[Any]] | None = None) 
 
 def _lagging(values: Array, gain: float, missing: NDArray[np.integer[Any]] | None) -> Array:
     """A first-order low pass: x += gain (value - x) at each sample."""
+    from scipy.signal import lfilter  # its import takes longer than all else at the start
+
     out = np.empty(values.size)
     starts = [0] if missing is None else [0, *(np.flatnonzero(missing[1:] > 0) + 1).tolist()]
     state = float(values[0])
@@ -84,6 +85,8 @@ def _lagging(values: Array, gain: float, missing: NDArray[np.integer[Any]] | Non
 def _slopes(values: Array, window: int, missing: NDArray[np.integer[Any]] | None) -> Array:
     """The slope, per sample, of the straight line that fits the last `window` values best. A gap as long as the window
     begins it anew."""
+    from scipy.signal import oaconvolve  # its import takes longer than all else at the start
+
     out = np.empty(values.size)
     far = [] if missing is None else (np.flatnonzero(missing[1:] >= window) + 1).tolist()
     # The newest value first: a convolution turns its kernel round.

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from selfcal.recording import bridged
 
@@ -44,8 +44,8 @@ SAMPLES_LEAST, ROUGH_LEAST, ROUGH_COUNT, SHORT_S = 3, 0.2, 4, 5.0
 BACK_LEAST = 0.1
 #: So many stretches on one level, alike to this share of it, or a long one, are a bias with two levels.
 ALIKE_LEAST, ALIKE = 2, 0.2
-#: ln of the probability, a record, that samples which are loud by chance make a stretch.
-LN_CHANCE = math.log(1e-5)
+#: Probability, a record, that samples which are loud by chance make a stretch.
+CHANCE = 1e-5
 #: More than this share of a record is no exception.
 SHARE_MOST = 0.25
 #: Deviations beyond this count no more: the evidence of a stretch is certain long before.
@@ -146,7 +146,7 @@ def _alike(levels: Array) -> bool:
 
 def _rare(count: int, of: int, stretches: int, n: int) -> bool:
     """Whether `count` loud ones of `of` are no chance where `stretches` of them lie scattered among n."""
-    return count >= SAMPLES_LEAST and float(binom.logsf(count - 1, of, stretches / n)) + math.log(n) < LN_CHANCE
+    return count >= SAMPLES_LEAST and n * float(bdtrc(count - 1, of, stretches / n)) < CHANCE
 
 
 def _wild(y: Array, level: Array, spread: Array, around: int, block: int, lsb: float) -> Mask:

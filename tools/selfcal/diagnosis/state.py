@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2
 
@@ -203,6 +202,8 @@ class State:
 
 def gain_for(worth: Callable[[float], float]) -> float:
     """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
+    from scipy.optimize import brentq
+
     gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
     return float(gain) / NET_LEAST
 

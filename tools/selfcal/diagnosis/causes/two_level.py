@@ -16,6 +16,7 @@ import numpy as np
 from scipy.stats import gamma
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, shown
+from selfcal.diagnosis.causes import flicker, variance_change
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.forms import LN_SLOW
@@ -31,6 +32,8 @@ SIZES = (0.0, -1.5, -3.0)
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
 #: Rounds of draws about the best, and draws of each; those of the posterior.
 ROUNDS, DRAWS, POSTERIOR = 6, 120, 600
+#: Share of samples of another noise level at most: gaps have some, a change of the noise has more.
+UNEVEN_MOST = 0.05
 #: Places of a dwell time's posterior.
 QUANTILES = 64
 #: Fewer jumps are steps, or a pulse.
@@ -80,7 +83,9 @@ def switching(y: Array, theta: Array, keep: bool = False) -> Filtered:
 
 def looks(state: State, record: Record) -> list[Look]:
     """The likeliest levels and dwell times, where they jump often enough."""
-    if state.y.size < 200 or state.extras.color or state.extras.bands:
+    # The filter knows a walk and white noise of one level alone.
+    uneven = float((state.r != np.median(state.r)).mean()) > UNEVEN_MOST
+    if state.y.size < 200 or uneven or state.extras.color or state.extras.bands or state.extras.flicker:
         return []
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0:
         return []
@@ -111,6 +116,12 @@ def looks(state: State, record: Record) -> list[Look]:
     own[1:3] = [math.log(time / count) for time, count in stays]
     now = float(switching(y, own[None, :]).ln_likelihood[0])
     theta, gain = (own, now) if now > gain else (theta, gain)
+    worth = net(gain - none, 3, LN_LOOKS)
+    if worth < 1.0:
+        return []
+    # Jumps between two levels make some nats of any drift on several time scales, and of noise that comes and goes.
+    others = [look.gain for cause in (flicker, variance_change) for look in cause.looks(state, record)]
+    none += max(others, default=0.0)
     worth = net(gain - none, 3, LN_LOOKS)
     if worth < 1.0:
         return []
