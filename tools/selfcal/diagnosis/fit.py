@@ -19,6 +19,9 @@ FTOL = 0.01
 ROUGH_FTOL = 0.3
 #: Standard deviations of a model's parameters at which posteriors of coefficients are summed.
 NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
+#: A direction whose standard deviation is above this is walked instead, in such steps, while ln likelihood is within so
+#: much of the best; where it changes by less a step, the term that the parameter sizes has vanished.
+HARDLY, NODE_STEP, POSSIBLE, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
 #: Longer records know their parameters well enough: the best ones stand for all.
 NODES_MOST = 100_000
 #: The slopes of a model's matrices are taken over this much of each parameter: exact to 1e-8.
@@ -341,13 +344,40 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     spread = found.spread
     limits = np.array(found.terms.limits(found.dt)).reshape(-1, 2)
     k = found.theta.size
-    volume = float(np.linalg.slogdet(spread)[1] - np.log(limits[:, 1] - limits[:, 0]).sum())
+    length = np.linalg.norm(spread, axis=0)
     # Of three parameters and more only the two least known are varied.
-    wide = set(np.argsort(-np.linalg.norm(spread, axis=0))[:2])
-    grid = product(*(NODES if j in wide else (0.0,) for j in range(k)))
-    places = [found.theta + spread @ np.array(z) for z in grid]
+    wide = np.argsort(-length)[:2]
+    steps = [np.array(NODES) if j in wide else np.zeros(1) for j in range(k)]
+    for j in wide[length[wide] > HARDLY]:
+        steps[j] = _possible(series, found, spread[:, j] / length[j], limits) / length[j]
+    apart = [float(np.diff(one).mean()) if one.size > 1 else 1.0 for one in steps]
+    volume = float(np.log(length * apart).sum() - np.log(limits[:, 1] - limits[:, 0]).sum())
+    places = [found.theta + spread @ np.array(z) for z in product(*steps)]
     inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
     return [(theta, volume) for theta in inside or [found.theta]]
+
+
+def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Array:
+    """Moves of theta along a `direction` that the record leaves possible, evenly spaced.
+
+    A parameter that the record hardly knows has no normal posterior: on one side its term vanishes, and nothing changes
+    any more. Of that plateau one node is kept: a term so small acts on no coefficient."""
+
+    def value(move: float) -> float:
+        theta = found.theta + move * direction
+        if np.any((theta < limits[:, 0]) | (theta > limits[:, 1])):
+            return -math.inf
+        return ln_likelihood(run(series, found.terms, theta)[0][0])
+
+    found_at = {0.0: value(0.0)}
+    for side in (-NODE_STEP, NODE_STEP):
+        move = side
+        while abs(move) < NODES_FARTHEST and (now := value(move)) >= found_at[0.0] - POSSIBLE:
+            found_at[move] = now
+            move += side
+    moves = np.array(sorted(found_at))
+    bent = np.flatnonzero(np.abs(np.diff([found_at[float(move)] for move in moves])) >= PLATEAU)
+    return moves[bent[0] : bent[-1] + 2] if bent.size else np.zeros(1)
 
 
 def finish(series: Series, terms: Terms, theta: Array) -> Fit:
