@@ -8,11 +8,13 @@ lost samples and 0.2 % of all.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from selfcal.recording import load
 from selfcal.sampling import Ambiguous, sampling
 
 from conftest import case_records
@@ -47,6 +49,16 @@ def test_random_steps_have_their_mean_rate(draw: Callable[[Random], Floats], spr
         # Steps beyond 20 mean ones are gaps: of Poisson's one in 5e8.
         assert missing == 0
         assert rate == pytest.approx(RATE_HZ, rel=4.0 * spread / np.sqrt(ROWS))
+
+
+@pytest.mark.parametrize(("least", "noted"), [(0.3, True), (0.75, False)])
+def test_stamps_on_no_grid_are_noted(least: float, noted: bool, tmp_path: Path) -> None:
+    """Steps from `least` to 2 - `least` intervals: samples lost among random ones do not show, those of a grid do."""
+    random = np.random.default_rng(4)
+    time = np.concatenate([[0.0], np.cumsum(random.uniform(least, 2.0 - least, ROWS) / RATE_HZ)])
+    rows = (f"{t:.6f},{value:.5f}" for t, value in zip(time, random.standard_normal(time.size), strict=True))
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    assert any("on no grid" in note for note in load(tmp_path / "log.csv").notes) == noted
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.03, 0.09, 0.14])

@@ -634,3 +634,15 @@ def test_the_fast_axis_beside_a_slower_one_can_be_taken_along_twice(tmp_path: Pa
     once = load(names).along("gx")
     assert {one.values.size for one in once.columns.values()} == {1500}
     assert {one.values.size for one in once.along("gx").columns.values()} == {1500}
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_a_log_cut_amid_its_last_line_loses_that_line_alone(separator: str, tmp_path: Path) -> None:
+    """At each byte of it, with a word."""
+    rows = [f"{0.05 * k:.2f}{separator}{0.01 * (k % 9):.4f}{separator}{-0.02 * (k % 7):.4f}" for k in range(60)]
+    head = separator.join(("t[s]", "gx[deg/s]", "gy[deg/s]"))
+    text = "\n".join([head, *rows]) + "\n"
+    log = tmp_path / "log.csv"
+    for left in range(len(rows[-1])):
+        log.write_text(text[: len(text) - 1 - len(rows[-1]) + left], encoding="utf-8")
+        assert load(log).samples == 59

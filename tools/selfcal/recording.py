@@ -39,6 +39,8 @@ from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
 from selfcal.text_table import TextTable, is_clock, is_date
 from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
 
+#: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
+_NO_GRID = 0.3
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 #: Columns that are no axis but may explain one, by cause: name and unit.
@@ -405,6 +407,15 @@ def _joined(found: Sequence[Recording], headers: Sequence[_Header]) -> Recording
         notes=(*notes, *_rates(columns, main.rate_hz)),
         paths=tuple(one.path for one in found),
     )
+
+
+def _of_clock(clock: Clock) -> list[str]:
+    """A note where the stamps lie on no grid: of samples that were lost at random such a clock shows nothing."""
+    if clock.off_grid_s is None or clock.missing_before.any() or clock.off_grid_s.size < 3:
+        return []
+    spread = float(np.diff(clock.off_grid_s).std()) * clock.rate_hz
+    told = f"the stamps lie on no grid: their mean rate, {clock.rate_hz:.4g} Hz, is taken; no lost sample shows"
+    return [told] if spread > _NO_GRID else []
 
 
 def _rates(columns: Mapping[str, Column], rate_hz: float) -> list[str]:
@@ -915,7 +926,7 @@ def _on_clocks(
     told = ", ".join(f"{name} {count}" for name, count in missing.items() if count)
     if told:
         header.notes.append(f"of {rows} rows cells without a number, taken as missing samples: {told}")
-    notes = (*header.notes, *_rates(made, main.rate_hz))
+    notes = (*header.notes, *_of_clock(main), *_rates(made, main.rate_hz))
     return Recording(
         path,
         main.rate_hz,

@@ -117,6 +117,10 @@ class TextTable:
         parts: list[list[NDArray[np.float64]] | None] = [[] for _ in index]
         lines, rows, blank, batch = 0, 0, False, self._batch
         while batch:
+            if self._lines.unfinished and batch[0].strip():
+                # A line that was cut within its last number would be taken for another value.
+                note(f"{self.path}: line {self._row + lines} has no line end and may be cut off: left out")
+                break
             filled = len(batch)
             while filled and not batch[filled - 1].strip():
                 filled -= 1
@@ -138,13 +142,6 @@ class TextTable:
             lines += len(batch) if self._skip_bad else filled
             rows += len(table)
             batch = self._lines.more()
-        kept = [part for part in parts if part is not None]
-        if self._lines.unfinished and not blank and not (self._skipped and self._skipped[-1] == lines - 1):
-            # A line that was cut within its last number would be taken for another value.
-            rows -= 1
-            for part in kept:
-                part[-1] = part[-1][:-1]
-            note(f"{self.path}: line {self._row + lines - 1} has no line end and may be cut off: left out")
         if rows < 2:
             what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
             raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
