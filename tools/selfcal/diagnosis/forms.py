@@ -319,7 +319,9 @@ def _constant(state: State, one: _Tried) -> bool:
 
 
 def _inconstant(state: State, one: _Tried) -> float:
-    return inconstancy(state, one.option.columns[-1], one.option.columns[:-1])
+    """Of the column that shows it most: beside a square the plain column may still be a common source's."""
+    columns = one.option.columns
+    return max(inconstancy(state, columns[k], np.delete(columns, k, axis=0)) for k in range(len(columns)))
 
 
 def inconstancy(state: State, column: Array, beside: Array | None = None) -> float:
