@@ -646,3 +646,13 @@ def test_a_log_cut_amid_its_last_line_loses_that_line_alone(separator: str, tmp_
     for left in range(len(rows[-1])):
         log.write_text(text[: len(text) - 1 - len(rows[-1]) + left], encoding="utf-8")
         assert load(log).samples == 59
+
+
+def test_readings_far_beyond_the_range_ask_for_the_unit(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """40 000 deg/s are beyond a range of 300: one line, no warning of a library."""
+    values = 4e4 + 0.1 * np.random.default_rng(3).standard_normal(900)
+    rows = "\n".join(f"{0.1 * k:.1f},{value:.4f}" for k, value in enumerate(values))
+    (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    with pytest.raises(UserError, match="beyond the range of 300 deg/s: is the unit right"):
+        identify(tmp_path / "log.csv")
+    assert "Warning" not in capfd.readouterr().err

@@ -215,6 +215,8 @@ def identify_axis(
     if readings.clipped is not None or readings.coarse > SPACING_LEAST:
         # What takes the place of clipped readings may lie beyond the range, and so may readings less an offset.
         beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
+        if beyond.all():
+            raise UserError(f"every reading is beyond the range of {group.range:g} {group.unit}: is the unit right?")
         values = np.where(beyond, np.nan, values)
         group = replace(group, range=0.0)
         tables = replace(tables, axes=(replace(tables.axes[0], range=0.0),))
