@@ -76,6 +76,20 @@ def test_two_steps_of_unlike_sizes_are_no_pulse() -> None:
         assert [finding.look.cause for finding in one.findings][:1] == ["step"]
 
 
+def test_a_pulse_that_no_drift_can_judge_has_the_fit_as_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each drift forgets too fast to know either place: the estimate is the fit's."""
+    random = np.random.default_rng(435)
+    shape, start, length, _ = drawn(random, 1.0)
+    state, record = recorded(noise(random, "walk", shape.size, 1.0) + shape, 1.0)
+    begin, end = math.ceil(start), math.ceil(start + length)
+    _, fit = state.with_columns((np.arange(shape.size) >= begin) * 1.0 - (np.arange(shape.size) >= end))
+    none = pulse.Pulses(np.zeros(shape.size), np.zeros(shape.size), 0.0)
+    monkeypatch.setattr(pulse, "_other", lambda *_, **__: none)
+    found = pulse.posterior(state, record.time_s, begin, end, fit)
+    assert found["amplitude"]["mean"] == pytest.approx(fit.c[-1])
+    assert found["duration_s"]["mean"] == pytest.approx(end - begin)
+
+
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
 def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
-from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, scan
+from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, scan
 from selfcal.diagnosis.causes.turn_on import SIZE_NAMES
 from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
 from selfcal.diagnosis.forms import LN_SLOW
@@ -61,20 +61,21 @@ def looks(state: State, record: Record) -> list[Look]:
     n = state.y.size
     if n < 10 * SHORTEST or state.extras.color or state.extras.bands:
         return []
-    pairs = [(begin, end) for begin, end in (*_coarse(state), *_of_step(state)) if end - begin >= SHORTEST]
+    steps = scan(state.series, state.best)
+    pairs = [(begin, end) for begin, end in (*_coarse(state), *_of_step(state, steps)) if end - begin >= SHORTEST]
     moved = [_moved(state, begin, end) for begin, end in pairs]
     tried = [one for one in moved if one[1] >= EDGE and one[2] <= n - EDGE and one[2] - one[1] >= SHORTEST]
     if not tried:
         return []
     gain, begin, end, fit = max(tried, key=lambda one: one[0])
     found = _column(n, begin, end)
-    worth = _worth(state, gain)
+    worth = _worth(steps, gain)
     if worth < 1.0:
         return []
     if state.with_columns(np.array([found, _column(n, end, n)]))[0] > gain + max(UNEQUAL, UNEQUAL_SHARE * gain):
         return []
     gain = min(gain, state.rich_gain(found))
-    worth = _worth(state, gain)
+    worth = _worth(steps, gain)
     if worth < 1.0:
         return []
     times = [float(record.time_s[place]) for place in (begin, end)]
@@ -86,10 +87,9 @@ def looks(state: State, record: Record) -> list[Look]:
     return [Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]), measure=measure)]
 
 
-def _worth(state: State, gain: float) -> float:
+def _worth(steps: Scan, gain: float) -> float:
     """Net of the search for two places: each costs as much as one of a step's."""
-    bend = scan(state.series, state.best).bend
-    return net(gain, 1, 2.0 * ln_looks(bend, gain) + LN_SLOW)
+    return net(gain, 1, 2.0 * ln_looks(steps.bend, gain) + LN_SLOW)
 
 
 def _name(start_s: float, end_s: float) -> str:
@@ -120,10 +120,10 @@ def _coarse(state: State) -> list[tuple[int, int]]:
     return found
 
 
-def _of_step(state: State) -> list[tuple[int, int]]:
+def _of_step(state: State, steps: Scan) -> list[tuple[int, int]]:
     """The best single step as the start of a pulse and as its end."""
     n = state.y.size
-    place = int(np.argmax(scan(state.series, state.best).gain))
+    place = int(np.argmax(steps.gain))
     _, fit = state.with_columns(_column(n, place, n))
     ahead, behind = (_other(state, fit, place, after).gain for after in (True, False))
     return [(place, int(np.argmax(ahead))), (int(np.argmax(behind)), place)]
@@ -234,14 +234,14 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
         sd.append((1.0 / np.sqrt(information)).ravel())
         starts.append(np.repeat(i, j.size))
         ends.append(np.tile(j, i.size))
-    edge = state.dt / math.sqrt(12.0)
-    begun, ended = (time_s[np.concatenate(places)] for places in (starts, ends))
     if not ln_weight:
         ln_weight, amplitude, sd = [np.zeros(1)], [fit.c[-1:]], [fit.sd[-1:]]
         starts, ends = [np.array([begin])], [np.array([end])]
     ln_all = np.concatenate(ln_weight)
     weight = np.exp(ln_all - ln_all.max())
+    begun, ended = (time_s[np.concatenate(places)] for places in (starts, ends))
     # An edge lies between the last reading before it and the first one after it.
+    edge = state.dt / math.sqrt(12.0)
     return {
         "time_s": mixture(weight, begun - 0.5 * state.dt, edge, "s"),
         "duration_s": mixture(weight, ended - begun, math.sqrt(2.0) * edge, "s"),
@@ -281,7 +281,8 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     """One of a tenth of the record in its middle."""
     n = record.present.size
     shape = _column(n, round(0.45 * n), round(0.55 * n))
-    return {"amplitude": (state.least(shape) * math.sqrt(gain_for(lambda gain: _worth(state, gain))), state.unit)}
+    steps = scan(state.series, state.best)
+    return {"amplitude": (state.least(shape) * math.sqrt(gain_for(lambda gain: _worth(steps, gain))), state.unit)}
 
 
 def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
