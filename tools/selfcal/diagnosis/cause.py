@@ -36,10 +36,6 @@ def _any(value: float) -> bool:
     return True
 
 
-#: What `is_count` asks for.
-A_COUNT = "a whole number of at least 1"
-
-
 def is_count(value: float) -> bool:
     """Whether a key's value counts something."""
     return value >= 1.0 and value == int(value)
@@ -55,6 +51,16 @@ class Key:
     field: str = ""
     fits: Callable[[float], bool] = _any
     limits: str = "finite"
+
+
+def counted(default: Callable[[Setting], float], field: str = "") -> Key:
+    """A key whose value counts something."""
+    return Key(default, field, is_count, "a whole number of at least 1")
+
+
+def positive(default: Callable[[Setting], float] | None, field: str = "") -> Key:
+    """A key whose value lies above 0."""
+    return Key(default, field, lambda value: value > 0.0, "above 0")
 
 
 @dataclass(frozen=True)

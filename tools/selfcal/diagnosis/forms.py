@@ -17,7 +17,7 @@ import numpy as np
 from scipy.fft import rfft
 from scipy.stats import chi2
 
-from selfcal.diagnosis.cause import Channels, Key
+from selfcal.diagnosis.cause import Channels, Key, positive
 from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
@@ -441,13 +441,9 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
     return {"coefficient": (size, unit)} if math.isfinite(size) else None
 
 
-def _is_positive(value: float) -> bool:
-    return value > 0.0
-
-
 #: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
 EFFECT_KEYS = {
-    **{key: Key(None, fits=_is_positive, limits="above 0") for key in ("lag_s", "width", "window_s")},
+    **{key: positive(None) for key in ("lag_s", "width", "window_s")},
     **{key: Key(None) for key in ("rate", "square", "cube")},
 }
 #: Window of a rate whose effect states none, s.

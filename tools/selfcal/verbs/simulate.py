@@ -89,17 +89,15 @@ def _added(
     applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float, seed: int
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
     """Adds the effects that a cause forms by itself to `values` [axes, n] before the read-out; None without any."""
-    own = [one for one in applied if CAUSES[one["id"]].add is not None]
+    own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].add) is not None]
     if not own:
         return None
 
     def add(values: NDArray[np.float64], temperature: NDArray[np.float64], supply: NDArray[np.float64]) -> None:
         time_s = np.arange(temperature.size) / rate_hz
         axes = dict(zip(model.axes, values.copy(), strict=True))
-        for number, one in enumerate(own):
-            form = CAUSES[one["id"]].add
-            assert form is not None
-            for name, keys in one["axes"].items():
+        for number, (form, chosen) in enumerate(own):
+            for name, keys in chosen.items():
                 place = model.axes.index(name)
                 random = np.random.default_rng([seed, number, place])
                 values[place] += form(keys, Channels(time_s, temperature, supply, axes, random))
@@ -263,13 +261,12 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
                 record[key] = _intervals(given[key])
                 scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
                 continue
-            if key not in given and entry.default is None:
+            if key in given:
+                value = _number(name, key, entry, given[key])
+            elif entry.default is not None:
+                value = entry.default(setting)
+            else:
                 continue
-            value = (
-                _number(name, key, entry, given[key])
-                if entry.default is None or key in given
-                else entry.default(setting)
-            )
             whole = entry.fits is is_count
             record[key] = int(value) if whole else value
             if entry.field:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, Key
+from selfcal.diagnosis.cause import Cause, positive
 from selfcal.diagnosis.statemodel import Array
 
 
@@ -25,6 +25,6 @@ CAUSE = Cause(
     "Log at the sensor's own rate, on its data-ready line.",
     alike=lambda a, b: True,
     no_gain="repeats are left out before and after",
-    keys={"rate_hz": Key(lambda s: 0.2 * s.samples / s.duration_s, "", lambda v: v > 0.0, "above 0")},
+    keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s)},
     spoil=_spoil,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis.cause import A_COUNT, Cause, Key, is_count, medians, shown
+from selfcal.diagnosis.cause import Cause, counted, medians, shown
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
@@ -16,6 +16,6 @@ CAUSE = Cause(
     no_gain="gaps are bridged before and after: the model of the noise is the same",
     least=lambda state, record: {"missing": (MISSING_LEAST * record.present.size, "samples")},
     of_estimate=lambda look: {key: max(1, round(value)) for key, value in medians(look).items()},
-    keys={"missing": Key(lambda s: max(1, round(0.02 * s.samples)), "missing", is_count, A_COUNT)},
+    keys={"missing": counted(lambda s: max(1, round(0.02 * s.samples)), "missing")},
     common=True,
 )

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from selfcal.diagnosis.cause import A_COUNT, Cause, Key, is_count, shown
+from selfcal.diagnosis.cause import Cause, Key, counted, shown
 from selfcal.diagnosis.state import Look
 from selfcal.motion import Moved, joined
 
@@ -35,7 +35,7 @@ CAUSE = Cause(
     pictures=shown("largest", "fine_level"),
     of_estimate=_of_estimate,
     keys={
-        "intervals": Key(lambda s: 5, "motion_intervals", is_count, A_COUNT),
+        "intervals": counted(lambda s: 5, "motion_intervals"),
         "amplitude": Key(lambda s: 20.0 * s.sd, "motion_amplitude"),
     },
 )

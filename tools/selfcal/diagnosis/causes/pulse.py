@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, scan
 from selfcal.diagnosis.causes.turn_on import SIZE_NAMES
 from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
@@ -318,7 +318,7 @@ CAUSE = Cause(
     add=_add,
     keys={
         "time_s": Key(lambda s: 0.45 * s.duration_s),
-        "duration_s": Key(lambda s: 0.1 * s.duration_s, fits=lambda v: v > 0.0, limits="above 0"),
+        "duration_s": positive(lambda s: 0.1 * s.duration_s),
         "amplitude": Key(lambda s: 2.0 * s.n),
     },
 )

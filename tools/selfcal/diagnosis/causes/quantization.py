@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, shown
+from selfcal.diagnosis.cause import Cause, Extension, positive, shown
 from selfcal.diagnosis.model_tree import digits
 
 
@@ -17,5 +17,5 @@ CAUSE = Cause(
     pictures=shown("lattice"),
     no_gain="the lattice is in the reading and not in the prediction",
     extend=_extend,
-    keys={"lsb": Key(lambda s: 2.0 * s.sd, "lsb", lambda v: v > 0.0, "above 0")},
+    keys={"lsb": positive(lambda s: 2.0 * s.sd, "lsb")},
 )

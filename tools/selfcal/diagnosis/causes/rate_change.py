@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis.cause import Cause, Key
+from selfcal.diagnosis.cause import Cause, Key, positive
 
 CAUSE = Cause(
     "rate_change",
@@ -11,7 +11,7 @@ CAUSE = Cause(
     no_gain="the record has one rate before and after",
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0),
-        "after_hz": Key(lambda s: 0.5 * s.samples / s.duration_s, "", lambda v: v > 0.0, "above 0"),
+        "after_hz": positive(lambda s: 0.5 * s.samples / s.duration_s),
     },
     common=True,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, shown
+from selfcal.diagnosis.cause import Cause, Extension, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 
@@ -30,5 +30,5 @@ CAUSE = Cause(
     pictures=shown("limit"),
     no_gain="readings at the limit are scored by no density",
     extend=_extend,
-    keys={"limit": Key(lambda s: abs(s.bias) + s.sd, "range", lambda v: v > 0.0, "above 0")},
+    keys={"limit": positive(lambda s: abs(s.bias) + s.sd, "range")},
 )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import A_COUNT, Cause, Key, is_count
+from selfcal.diagnosis.cause import Cause, counted
 from selfcal.diagnosis.statemodel import Array
 
 
@@ -25,6 +25,6 @@ CAUSE = Cause(
     alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0]),
     no_gain="readings that stick are no readings: none is scored",
     of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},
-    keys={"intervals": Key(lambda s: 2, "", is_count, A_COUNT)},
+    keys={"intervals": counted(lambda s: 2)},
     spoil=_spoil,
 )

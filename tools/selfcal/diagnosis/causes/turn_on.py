@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.fit import Fit, Series, nodes, refit, run
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
@@ -299,10 +299,6 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     return np.asarray(first + second)
 
 
-def _is_positive(value: float) -> bool:
-    return value > 0.0
-
-
 CAUSE = Cause(
     "turn_on",
     "The bias settles after power-on.",
@@ -319,8 +315,8 @@ CAUSE = Cause(
     add=_add,
     keys={
         "amplitude": Key(lambda s: 5.0 * s.n),
-        "tau_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
+        "tau_s": positive(lambda s: s.duration_s / 10.0),
         "amplitude_2": Key(lambda s: 0.0),
-        "tau_2_s": Key(lambda s: s.duration_s / 10.0, fits=_is_positive, limits="above 0"),
+        "tau_2_s": positive(lambda s: s.duration_s / 10.0),
     },
 )

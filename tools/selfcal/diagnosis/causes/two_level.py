@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import gamma
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
@@ -223,10 +223,6 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     return values
 
 
-def _is_positive(value: float) -> bool:
-    return value > 0.0
-
-
 CAUSE = Cause(
     "two_level",
     "The bias jumps between two levels (popcorn noise).",
@@ -241,7 +237,7 @@ CAUSE = Cause(
     add=_add,
     keys={
         "amplitude": Key(lambda s: 3.0 * s.n),
-        "dwell_low_s": Key(lambda s: s.duration_s / 20.0, fits=_is_positive, limits="above 0"),
-        "dwell_high_s": Key(lambda s: s.duration_s / 20.0, fits=_is_positive, limits="above 0"),
+        "dwell_low_s": positive(lambda s: s.duration_s / 20.0),
+        "dwell_high_s": positive(lambda s: s.duration_s / 20.0),
     },
 )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, gain_for, ln_looks, mixture, net
@@ -120,6 +120,6 @@ CAUSE = Cause(
     of_estimate=lambda look: medians(look, "time_s", "ratio"),
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0, "variance_time_s"),
-        "ratio": Key(lambda s: 2.0, "noise_ratio", lambda v: v > 0.0, "above 0"),
+        "ratio": positive(lambda s: 2.0, "noise_ratio"),
     },
 )
