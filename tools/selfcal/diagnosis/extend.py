@@ -150,7 +150,7 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     """
     block = max(1, round(one.record.recorded_hz / one.record.rate_hz)) if block is None else block
     fit = one.state.best
-    N = fit.sigma * math.sqrt(fit.dt)
+    N = fit.N
     if fit.terms.color:
         # The simulator's noise with memory has this level at low frequency, and (1 - lag1) / (1 + lag1) of it in all.
         m = math.tanh(fit.value("color"))
@@ -161,14 +161,12 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     drift: dict[str, Any] = {"hypothesis": "constant"}
     lacking = 0.0
     if fit.terms.walk:
-        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
-        drift = {"hypothesis": "random_walk", "K": digits(K)}
-        lacking = (1.0 - 1.0 / block**2) / 6.0 * K**2 * fit.dt
+        drift = {"hypothesis": "random_walk", "K": digits(fit.K)}
+        lacking = (1.0 - 1.0 / block**2) / 6.0 * fit.K**2 * fit.dt
     elif fit.terms.markov:
-        alpha = math.exp(fit.value("ln_alpha"))
-        gain, rest = averaged(alpha * fit.dt, block)
-        sigma_m = fit.sigma * math.exp(fit.value("ln_markov")) / math.sqrt(gain)
-        drift = {"hypothesis": "gauss_markov", "sigma_m": digits(sigma_m), "alpha": digits(alpha)}
+        gain, rest = averaged(fit.alpha * fit.dt, block)
+        sigma_m = fit.sigma_m / math.sqrt(gain)
+        drift = {"hypothesis": "gauss_markov", "sigma_m": digits(sigma_m), "alpha": digits(fit.alpha)}
         lacking = rest * sigma_m**2
     # The simulator's ramp and temperature begin at 0.
     at_first = sum(

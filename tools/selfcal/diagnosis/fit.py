@@ -116,6 +116,26 @@ class Fit:
         """One parameter of the vector."""
         return float(self.theta[self.terms.names.index(name)])
 
+    @property
+    def N(self) -> float:
+        """White noise density, unit/sqrt(Hz)."""
+        return self.sigma * math.sqrt(self.dt)
+
+    @property
+    def K(self) -> float:
+        """Coefficient of the random walk, unit/s/sqrt(Hz); 0 without one."""
+        return self.sigma * math.exp(self.value("ln_rho")) / math.sqrt(self.dt) if self.terms.walk else 0.0
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the Gauss-Markov drift at its samples, unit."""
+        return self.sigma * math.exp(self.value("ln_markov"))
+
+    @property
+    def alpha(self) -> float:
+        """Bandwidth of the Gauss-Markov drift, 1/s."""
+        return math.exp(self.value("ln_alpha"))
+
 
 def run(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False

@@ -175,7 +175,7 @@ def inflation(before: State, after: State) -> Mapping[str, float]:
         return {"N": 1.0, "K": 1.0}
     plain = [next(one for one in state.fits if one.terms.walk) for state in (before, after)]
     N = [one.sigma * _low_gain(one) for one in plain]
-    K = [one.sigma * math.exp(one.value("ln_rho")) for one in plain]
+    K = [one.K * math.sqrt(one.dt) for one in plain]
     return {"N": N[0] / N[1], "K": K[0] / K[1] if K[1] > 1e-4 * N[1] else math.inf}
 
 

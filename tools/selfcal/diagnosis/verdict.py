@@ -91,13 +91,8 @@ def _moves_within(state: State, block_s: float) -> bool:
 
     Means of a walk are a walk at points and white noise less a sixth of its step: none is left beyond sqrt(6) N."""
     fit = state.best
-    N, K = fit.sigma * math.sqrt(fit.dt), 0.0
-    if fit.terms.walk:
-        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt)
-    if fit.terms.markov:
-        sigma_m, alpha = fit.sigma * math.exp(fit.value("ln_markov")), math.exp(fit.value("ln_alpha"))
-        K = math.hypot(K, sigma_m * math.sqrt(2.0 * alpha))
-    return K * block_s > WITHIN * N
+    markov = fit.sigma_m * math.sqrt(2.0 * fit.alpha) if fit.terms.markov else 0.0
+    return math.hypot(fit.K, markov) * block_s > WITHIN * fit.N
 
 
 def coherence(state: State, record: Record) -> list[Statistic]:

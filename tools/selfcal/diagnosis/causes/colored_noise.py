@@ -60,8 +60,7 @@ def _extend(at: Extension) -> None:
     at_bank_rate = abs(fit.dt * float(tree["bank_rate_hz"]) - 1.0) < 0.01
     if fit.terms.color == "ar" and correlation > 0.0 and at_bank_rate and "correlation_time_s" not in tree:
         time_s = -fit.dt / math.log(correlation)
-        K = fit.sigma * math.exp(fit.value("ln_rho")) / math.sqrt(fit.dt) if fit.terms.walk else 0.0
-        most = min(10.0 * fit.sigma / max(K * math.sqrt(time_s), 1e-300), RATIO_LIMITS[1])
+        most = min(10.0 * fit.sigma / max(fit.K * math.sqrt(time_s), 1e-300), RATIO_LIMITS[1])
         tree["correlation_time_s"] = digits(time_s)
         prior = {"law": "log_uniform", "min": digits(0.01 * most), "max": digits(most)}
         add_law(tree, "walk_and_markov", "markov_ratio", prior)
