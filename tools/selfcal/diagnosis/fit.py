@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal import _likelihood
 from selfcal.diagnosis import work
-from selfcal.diagnosis.statemodel import Array, Mask, Terms, matrices
+from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array, Mask, Terms, matrices
 
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
@@ -39,7 +39,7 @@ LARGER = (
     (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
 )
 #: Parameters that are logarithms of sizes.
-SIZES = ("ln_rho", "ln_markov", "ln_flicker", "ln_band")
+SIZES = (*DRIFT_SIZES, "ln_band")
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,12 @@ class Fit:
     def value(self, name: str) -> float:
         """One parameter of the vector."""
         return float(self.theta[self.terms.names.index(name)])
+
+    def shrunk(self, by: float) -> Fit:
+        """The same model with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
+        less = np.array([by * (name in DRIFT_SIZES) for name in self.terms.names])
+        low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
+        return replace(self, theta=np.maximum(self.theta - less, low))
 
     @property
     def N(self) -> float:

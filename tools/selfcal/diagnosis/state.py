@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 from selfcal.diagnosis.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array, Terms
 from selfcal.errors import UserError
 from selfcal.result import HALF_90, of_mixture
 
@@ -109,13 +109,7 @@ class State:
 
     def stiffer(self, by: float) -> list[Fit]:
         """The best fit with a drift smaller by exp(-by), if it has one."""
-        fit = self.best
-        names = [name for name in ("ln_rho", "ln_markov", "ln_flicker") if name in fit.terms.names]
-        if not names:
-            return []
-        lower = np.array([by if name in names else 0.0 for name in fit.terms.names])
-        limits = np.array(fit.terms.limits(self.dt)).reshape(-1, 2)
-        return [replace(fit, theta=np.maximum(fit.theta - lower, limits[:, 0]))]
+        return [self.best.shrunk(by)] if any(name in DRIFT_SIZES for name in self.best.terms.names) else []
 
     def with_columns(self, more: Array) -> tuple[float, Fit]:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
@@ -126,30 +120,35 @@ class State:
         """The fit of one drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
 
+    def possible(self, more: Array, *, rich: bool) -> Iterator[tuple[Fit, Array, float]]:
+        """The fit of every near drift with further columns [k, n], `rich`: of one of two terms as well. Of each the
+        parameters that the record leaves possible, and ln of the share of those that they stand for."""
+        series = self.series.beside(more)
+        fits = [self.fitted_with(terms, more) for terms in self.near()]
+        if rich and not self.extras.flicker:
+            fits.append(refit(series, self.rich))
+        for one in fits:
+            for theta, ln_share in nodes(series, one):
+                yield one, theta, ln_share
+
     def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
         """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
         [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
         `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
         blocks = [np.atleast_2d(one) for one in alternatives]
-        series = self.series.beside(blocks[0])
-        drifts = [*self.near()]
-        if not self.extras.flicker:
-            drifts.append(self.rich.terms)
         k = len(blocks[0])
         found: list[tuple[Array, Array, Array]] = []
-        for terms in drifts:
-            started = refit(series, self.rich) if terms == self.rich.terms else self.fitted_with(terms, blocks[0])
-            for theta, ln_share in nodes(series, started):
-                ln_weight, means, sds = [], [], []
-                for sums in self._sums(terms, theta, blocks):
-                    c, inverse, rss = sums.coefficients()
-                    sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
-                    ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
-                    means.append(c[-k:])
-                    sds.append(sd)
-                found.append((np.array(ln_weight), np.array(means), np.array(sds)))
-        value = np.array([one[0] for one in found]).T
-        places = [np.swapaxes(np.array([one[i] for one in found]), 0, 1) for i in (1, 2)]
+        for one, theta, ln_share in self.possible(blocks[0], rich=True):
+            ln_weight, means, sds = [], [], []
+            for sums in self._sums(one.terms, theta, blocks):
+                c, inverse, rss = sums.coefficients()
+                sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
+                ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
+                means.append(c[-k:])
+                sds.append(sd)
+            found.append((np.array(ln_weight), np.array(means), np.array(sds)))
+        value = np.array([each[0] for each in found]).T
+        places = [np.swapaxes(np.array([each[i] for each in found]), 0, 1) for i in (1, 2)]
         return np.exp(value - value.max()), places[0], places[1]
 
     def _sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:

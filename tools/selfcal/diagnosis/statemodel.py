@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 ALPHA_LIMITS = (2e-4, 0.2)
 #: Sizes relative to the white noise of one sample.
 SIZE_LIMITS = (1e-5, 1e2)
+#: Parameters that size a term of the drift.
+DRIFT_SIZES = ("ln_rho", "ln_markov", "ln_flicker")
 
 
 @dataclass(frozen=True)

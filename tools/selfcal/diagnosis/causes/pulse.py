@@ -7,7 +7,7 @@ the other held.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,13 +16,12 @@ import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, scan
-from selfcal.diagnosis.causes.turn_on import SIZE_NAMES
-from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
+from selfcal.diagnosis.fit import Fit, Series, shifts
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, Regressor, State, gain_for, ln_looks, mixture, net
-from selfcal.diagnosis.statemodel import SIZE_LIMITS, Array, Terms
+from selfcal.diagnosis.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Terms
 
 #: Blocks that the pairs are looked for in, and places of a step among them.
 BLOCKS, PLACES = 3000, 96
@@ -148,7 +147,7 @@ def blocks(state: State) -> tuple[Series, int]:
 
 def of_blocks(fit: Fit, block: int, less: float) -> Array:
     """The parameters of a fit for means of so many samples; sizes of the drift are relative to the white noise's."""
-    by = {name: 0.5 * math.log(block) for name in SIZE_NAMES} | {"ln_rho": math.log(block)}
+    by = {name: 0.5 * math.log(block) for name in DRIFT_SIZES} | {"ln_rho": math.log(block)}
     least = math.log(SIZE_LIMITS[0])
     return np.array(
         [
@@ -220,7 +219,10 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
 
     The two times hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
     ln_weight, amplitude, sd, starts, ends = [], [], [], [], []
-    for at, ln_share in _nodes(state, begin, end, fit, brief):
+    found = _column(state.y.size, begin, end)
+    drifts = [(fit, fit.theta, 0.0)] if brief else state.possible(found, rich=False)
+    for one, theta, ln_share in drifts:
+        at = replace(one, theta=theta, sigma=fit.sigma)
         first, last = _other(state, at, end, after=False), _other(state, at, begin, after=True)
         if not (first.A[begin] > 0.0 and last.A[end] > 0.0):  # this drift forgets too fast to know
             continue
@@ -247,18 +249,6 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
         "duration_s": mixture(weight, ended - begun, math.sqrt(2.0) * edge, "s"),
         "amplitude": mixture(weight, np.concatenate(amplitude), np.concatenate(sd), state.unit),
     }
-
-
-def _nodes(state: State, begin: int, end: int, fit: Fit, brief: bool) -> Iterator[tuple[Fit, float]]:
-    """Fits at the drifts and parameters of the posterior, and ln of the share that each stands for."""
-    if brief:
-        yield fit, 0.0
-        return
-    found = _column(state.y.size, begin, end)
-    for terms in state.near():
-        started = state.fitted_with(terms, found)
-        for theta, ln_share in nodes(state.series.beside(found), started):
-            yield replace(started, theta=theta, sigma=fit.sigma), ln_share
 
 
 def _likely(pulses: Pulses, place: int) -> Array:

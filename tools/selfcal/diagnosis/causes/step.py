@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.fit import Fit, Series, nodes, shifts
+from selfcal.diagnosis.fit import Fit, Series, shifts
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
@@ -121,23 +121,20 @@ def posterior(state: State, time_s: Array, place: int) -> dict[str, Any]:
     beside = state.with_columns(_column(series.y.size, place))[1]
     sigma = beside.sigma
     elsewhere = _elsewhere(scan(series, beside).gain, place)
-    for drift in state.near():
-        started = state.fitted_with(drift, _column(series.y.size, place))
-        for theta, ln_volume in nodes(series.beside(_column(series.y.size, place)), started):
-            at = replace(started, theta=theta, sigma=sigma)
-            found = scan(series, at)
-            B, A = found.B, found.A
-            A[elsewhere] = 0.0
-            good = np.flatnonzero(A > 0.0)
-            if not good.size:
-                continue
-            value = ln_volume + found.none + found.gain[good] - 0.5 * np.log(A[good])
-            held = value > value.max() + math.log(WEIGHT_LEAST)
-            good = good[held]
-            ln_weight.append(value[held])
-            amplitude.append(B[good] / A[good])
-            sd.append(1.0 / np.sqrt(A[good]))
-            where.append(good)
+    for one, theta, ln_share in state.possible(_column(series.y.size, place), rich=False):
+        found = scan(series, replace(one, theta=theta, sigma=sigma))
+        B, A = found.B, found.A
+        A[elsewhere] = 0.0
+        good = np.flatnonzero(A > 0.0)
+        if not good.size:
+            continue
+        value = ln_share + found.none + found.gain[good] - 0.5 * np.log(A[good])
+        held = value > value.max() + math.log(WEIGHT_LEAST)
+        good = good[held]
+        ln_weight.append(value[held])
+        amplitude.append(B[good] / A[good])
+        sd.append(1.0 / np.sqrt(A[good]))
+        where.append(good)
     ln_all = np.concatenate(ln_weight)
     weight = np.exp(ln_all - ln_all.max())
     # A step lies between the last reading before it and the first one with it.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
-from selfcal.diagnosis.fit import Fit, Series, nodes, refit, run
+from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
@@ -26,9 +26,8 @@ from selfcal.diagnosis.statemodel import Array, Terms
 FASTEST = 5.0
 #: Time constants of the grid, per octave; neighbours a factor 2 apart correlate by 0.94.
 PER_OCTAVE = 1.0
-#: Drifts at which they are ranked: the fitted one's size times e to these.
-SIZES = (0.0, -1.0, -2.0, -3.0)
-SIZE_NAMES = ("ln_rho", "ln_markov", "ln_flicker")
+#: Drifts at which they are ranked: the fitted one's size over e to these.
+SIZES = (0.0, 1.0, 2.0, 3.0)
 #: Two time constants of one transient lie this factor apart at least.
 APART = 4.0
 #: Price of the search over time constants beside the second degree of freedom.
@@ -175,10 +174,8 @@ def _drifts(state: State) -> Iterator[tuple[Terms, Array]]:
     near = state.near()
     for fit in state.fits:
         if fit.terms in near:
-            size = np.array([name in SIZE_NAMES for name in fit.terms.names], np.float64)
-            limits = np.array(fit.terms.limits(fit.dt)).reshape(-1, 2)
             for less in SIZES:
-                yield fit.terms, np.clip(fit.theta + less * size, limits[:, 0], limits[:, 1])
+                yield fit.terms, fit.shrunk(less).theta
 
 
 def _refined(state: State, t: Array, tau: Array, record: Record) -> tuple[float, Array]:
@@ -215,8 +212,9 @@ def posterior(state: State, t: Array, tau: Array, record: Record, brief: bool = 
     ln_weight, mean, sd = [], [], []
     base = state.series.beside(columns)
     offset = np.cumsum([0, *(grid.size for grid in grids[:-1])])
-    for terms, theta, ln_share in _nodes(state, series, beside, found, brief):
-        value, amplitude, spread = left(base, terms, theta, len(columns)).amplitudes(places.T + offset)
+    drifts = [(beside, beside.theta, 0.0)] if brief else state.possible(found, rich=True)
+    for one, theta, ln_share in drifts:
+        value, amplitude, spread = left(base, one.terms, theta, len(columns)).amplitudes(places.T + offset)
         ln_weight.append(ln_share + value)
         mean.append(amplitude)
         sd.append(spread)
@@ -232,21 +230,6 @@ def posterior(state: State, t: Array, tau: Array, record: Record, brief: bool = 
         estimate[f"amplitude{end}"] = mixture(weight, means[:, k], sds[:, k], state.unit)
         estimate[f"tau{end}_s"] = mixture(weight, times, width, "s")
     return estimate
-
-
-def _nodes(
-    state: State, series: Series, beside: Fit, found: Array, brief: bool
-) -> Iterator[tuple[Terms, Array, float]]:
-    """Drifts, their parameters and the share of those that each stands for."""
-    if brief:
-        yield beside.terms, beside.theta, 0.0
-        return
-    fits = [state.fitted_with(terms, found) for terms in state.near()]
-    if not state.extras.flicker:
-        fits.append(refit(series, state.rich))
-    for one in fits:
-        for theta, ln_share in nodes(series, one):
-            yield one.terms, theta, ln_share
 
 
 def _places(series: Series, fit: Fit, t: Array, tau: Array, low: float, high: float) -> list[Array]:
