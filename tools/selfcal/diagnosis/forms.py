@@ -475,3 +475,8 @@ def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
         window = {"window_s": float(column.entry["window_s"])} if form == "rate" else {}
         return {"coefficient": 0.0, form: c[0], **window}
     return {"coefficient": c[0], **({NUMBER[form]: float(column.entry[NUMBER[form]])} if form in NUMBER else {})}
+
+
+def of_other(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+    """The same of another axis."""
+    return {**of_column(column, c), "other": str(column.entry["column"])}

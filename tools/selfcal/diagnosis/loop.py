@@ -19,7 +19,7 @@ from selfcal.ending import Stopped
 from selfcal.motion import Moved
 
 #: Looks that one round tries on an axis.
-LOOKS: tuple[Looks, ...] = tuple(dict.fromkeys(cause.looks for cause in CAUSES.values() if cause.looks is not None))
+LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and cause.stationary)
 CERTAIN = 25.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.forms import Channel
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import ALIKE, Look, Regressor, State
+from selfcal.diagnosis.state import ALIKE, Look, State
 from selfcal.regressors import coefficient_unit
 
 #: Windows of a rate, s: another axis moves faster than a temperature.
@@ -95,10 +95,6 @@ def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
     return {**entry, "reference": digits(record.axes[str(entry["column"])].level)}
 
 
-def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
-    return {**forms.of_column(column, c), "other": str(column.entry["column"])}
-
-
 CAUSE = Cause(
     "cross_axis",
     "Another axis leaks into this one.",
@@ -108,7 +104,7 @@ CAUSE = Cause(
     pictures=shown("means", "evidence"),
     least=_least,
     entry=_entry,
-    of_column=_of_column,
+    of_column=forms.of_other,
     keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
     add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
     follows=True,

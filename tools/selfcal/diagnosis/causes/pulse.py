@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
-from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, scan
+from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, raised, scan
 from selfcal.diagnosis.fit import Fit, Series, shifts
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
@@ -67,11 +67,11 @@ def looks(state: State, record: Record) -> list[Look]:
     if not tried:
         return []
     gain, begin, end, fit = max(tried, key=lambda one: one[0])
-    found = _column(n, begin, end)
+    found = raised(n, begin, end)
     worth = _worth(steps, gain)
     if worth < 1.0:
         return []
-    if state.with_columns(np.array([found, _column(n, end, n)]))[0] > gain + max(UNEQUAL, UNEQUAL_SHARE * gain):
+    if state.with_columns(np.array([found, raised(n, end)]))[0] > gain + max(UNEQUAL, UNEQUAL_SHARE * gain):
         return []
     gain = min(gain, state.rich_gain(found))
     worth = _worth(steps, gain)
@@ -93,12 +93,6 @@ def _worth(steps: Scan, gain: float) -> float:
 
 def _name(start_s: float, end_s: float) -> str:
     return f"pulse_{start_s:.6g}_{end_s:.6g}s"
-
-
-def _column(n: int, begin: int, end: int) -> Array:
-    values = np.zeros(n)
-    values[begin:end] = 1.0
-    return values
 
 
 def _coarse(state: State) -> list[tuple[int, int]]:
@@ -123,7 +117,7 @@ def _of_step(state: State, steps: Scan) -> list[tuple[int, int]]:
     """The best single step as the start of a pulse and as its end."""
     n = state.y.size
     place = int(np.argmax(steps.gain))
-    _, fit = state.with_columns(_column(n, place, n))
+    _, fit = state.with_columns(raised(n, place))
     ahead, behind = (_other(state, fit, place, after).gain for after in (True, False))
     return [(place, int(np.argmax(ahead))), (int(np.argmax(behind)), place)]
 
@@ -182,7 +176,7 @@ def _moved(state: State, begin: int, end: int) -> tuple[float, int, int, Fit]:
     """Exact gain, places and fit of a pair, each place in turn at its best sample. The null's drift has swallowed a
     part of the pulse: the places are sharper with the drift that is left beside it."""
     n = state.y.size
-    gain, fit = state.with_columns(_column(n, begin, end))
+    gain, fit = state.with_columns(raised(n, begin, end))
     for _ in range(2):
         there = begin, end
         for _ in range(2):
@@ -190,7 +184,7 @@ def _moved(state: State, begin: int, end: int) -> tuple[float, int, int, Fit]:
             begin = int(np.argmax(_other(state, fit, end, after=False).gain))
         if not begin < end:
             return gain, *there, fit
-        now, refitted = state.with_columns(_column(n, begin, end))
+        now, refitted = state.with_columns(raised(n, begin, end))
         if now <= gain:
             return gain, *there, fit
         gain, fit = now, refitted
@@ -200,7 +194,7 @@ def _moved(state: State, begin: int, end: int) -> tuple[float, int, int, Fit]:
 def _other(state: State, fit: Fit, place: int, after: bool) -> Pulses:
     """The other place of a pulse with one at `place`, before it or after."""
     n = state.y.size
-    found = shifts(state.series.beside(_column(n, place, n)), fit.terms, fit.theta)
+    found = shifts(state.series.beside(raised(n, place)), fit.terms, fit.theta)
     G, B, p = found.sums.G, found.B, len(found.sums.G) - 1
     inverse = np.linalg.pinv(G[1:p, 1:p], rcond=1e-12, hermitian=True)
     own, cross, y = inverse @ G[1:p, p], B[:, 1:p], G[1:p, 0]
@@ -219,7 +213,7 @@ def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief
 
     The two times hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
     ln_weight, amplitude, sd, starts, ends = [], [], [], [], []
-    found = _column(state.y.size, begin, end)
+    found = raised(state.y.size, begin, end)
     drifts = [(fit, fit.theta, 0.0)] if brief else state.possible(found, rich=False)
     for one, theta, ln_share in drifts:
         at = replace(one, theta=theta, sigma=fit.sigma)
@@ -270,7 +264,7 @@ def _alike(a: Look, b: Look) -> bool:
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     """One of a tenth of the record in its middle."""
     n = record.present.size
-    shape = _column(n, round(0.45 * n), round(0.55 * n))
+    shape = raised(n, round(0.45 * n), round(0.55 * n))
     steps = scan(state.series, state.best)
     return {"amplitude": (state.least(shape) * math.sqrt(gain_for(lambda gain: _worth(steps, gain))), state.unit)}
 

@@ -87,21 +87,21 @@ def looks(state: State, record: Record) -> list[Look]:
     gain = first.gain
     if gain.max() < SCREEN + 2.0:
         return []
-    tried = {place: state.with_columns(_column(n, place)) for place in _peaks(gain, 3, max(3, int(2.0 / state.dt)))}
+    tried = {place: state.with_columns(raised(n, place)) for place in _peaks(gain, 3, max(3, int(2.0 / state.dt)))}
     place = max(tried, key=lambda one: tried[one][0])
     # The null's drift has swallowed a part of the step: the place is sharper with the drift that is left beside it.
     beside = tried[place][1]
     again = int(np.argmax(scan(state.series, beside).gain))
     if again not in tried:
-        tried[again] = state.with_columns(_column(n, again))
+        tried[again] = state.with_columns(raised(n, again))
     place = max(tried, key=lambda one: tried[one][0])
     exact, chosen = tried[place]
-    exact = min(exact, state.rich_gain(_column(n, place)))
+    exact = min(exact, state.rich_gain(raised(n, place)))
     value = first.worth(exact)
     if value < 1.0:
         return []
     time = float(record.time_s[place])
-    column = Regressor(f"step_{time:.6g}s", "step", _column(n, place), "1", {"kind": "step", "time_s": time})
+    column = Regressor(f"step_{time:.6g}s", "step", raised(n, place), "1", {"kind": "step", "time_s": time})
     estimate = {
         "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt]), state.dt / math.sqrt(12.0), "s"),
         "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
@@ -118,10 +118,10 @@ def posterior(state: State, time_s: Array, place: int) -> dict[str, Any]:
     Places behind a valley are another step's."""
     series = state.series
     ln_weight, amplitude, sd, where = [], [], [], []
-    beside = state.with_columns(_column(series.y.size, place))[1]
+    beside = state.with_columns(raised(series.y.size, place))[1]
     sigma = beside.sigma
     elsewhere = _elsewhere(scan(series, beside).gain, place)
-    for one, theta, ln_share in state.possible(_column(series.y.size, place), rich=False):
+    for one, theta, ln_share in state.possible(raised(series.y.size, place), rich=False):
         found = scan(series, replace(one, theta=theta, sigma=sigma))
         B, A = found.B, found.A
         A[elsewhere] = 0.0
@@ -153,9 +153,10 @@ def _elsewhere(gain: Array, place: int) -> Mask:
     return (where >= (ahead[0] if ahead.size else gain.size)) | (where <= (behind[-1] if behind.size else -1))
 
 
-def _column(n: int, place: int) -> Array:
+def raised(n: int, begin: int, end: int | None = None) -> Array:
+    """[n]: 1 from a place on, or until another."""
     values = np.zeros(n)
-    values[place:] = 1.0
+    values[begin:end] = 1.0
     return values
 
 
@@ -179,7 +180,7 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     """One in the middle of the record."""
     n = record.present.size
     worth = scan(state.series, state.best).worth
-    return {"amplitude": (state.least(_column(n, n // 2)) * math.sqrt(gain_for(worth)), state.unit)}
+    return {"amplitude": (state.least(raised(n, n // 2)) * math.sqrt(gain_for(worth)), state.unit)}
 
 
 def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:

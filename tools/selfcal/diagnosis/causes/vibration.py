@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
 from selfcal.diagnosis.forms import LN_SLOW, Channel
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import Look, Regressor, State
+from selfcal.diagnosis.state import Look, State
 from selfcal.diagnosis.statemodel import Array
 from selfcal.forms import variance_of
 from selfcal.recording import bridged
@@ -48,10 +48,6 @@ def looks(state: State, record: Record) -> list[Look]:
     )
 
 
-def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
-    return {**forms.of_column(column, c), "other": str(column.entry["column"])}
-
-
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     """The variance of 1 s of the other axis, about its mean."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
@@ -68,7 +64,7 @@ CAUSE = Cause(
     alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
     pictures=shown("means", "evidence"),
     smoothed=True,
-    of_column=_of_column,
+    of_column=forms.of_other,
     keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
     follows=True,
     add=_add,
