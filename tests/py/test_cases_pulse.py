@@ -1,6 +1,6 @@
 """A lamp that is switched on and off: one pulse, named as one, and no clean record shows one.
 
-Truth: the numbers that each record was drawn with, as in `test_cases_turn_on.py`.
+Truth: the numbers that each record was drawn with (drifts.py).
 """
 
 from __future__ import annotations
@@ -9,12 +9,11 @@ import math
 
 import numpy as np
 import pytest
+from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
 from scipy.stats import binom
-from test_cases_turn_on import LAWS, noise, recorded
 
 from selfcal.diagnosis.causes import pulse
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.state import NET_LEAST
 from selfcal.diagnosis.statemodel import Array
 
 from conftest import case_records
@@ -60,9 +59,7 @@ def test_times_and_amplitude_lie_in_their_intervals(law: str) -> None:
         found = [look.measured() for look in looks]
         for (key, each), value in zip(held.items(), truth, strict=True):
             each.append(bool(found) and found[0].estimate[key]["q05"] <= value <= found[0].estimate[key]["q95"])
-    for key, each in held.items():
-        print(f"{key}, {law}: {sum(each)} of {len(each)} in the 90 % interval")
-        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
+    assert_held(held, law)
     assert binom.sf(sum(held["amplitude"]) - 1, len(held["amplitude"]), 0.9) > 1e-3
 
 
@@ -94,10 +91,5 @@ def test_a_pulse_that_no_drift_can_judge_has_the_fit_as_its_size(monkeypatch: py
 @pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
 def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
     """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
-    random = np.random.default_rng([434, round(rate), round(seconds), LAWS.index(law)])
-    count, named = case_records(3, 200), 0
-    for _ in range(count):
-        found = pulse.looks(*recorded(noise(random, law, round(seconds * rate), rate), rate))
-        named += bool(found) and found[0].net >= NET_LEAST
-    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    named, count = clean_ones_named(pulse.looks, 434, law, rate, seconds)
     assert named <= (4 if count >= 200 else 1)

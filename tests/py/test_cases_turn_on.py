@@ -1,7 +1,6 @@
 """A bias that settles after power-on: named, its size and time constants held, and no clean record shows one.
 
-Truth: the numbers that each record was drawn with, sample by sample in numpy. N 0.04, a walk of K 3e-4 or a
-Gauss-Markov drift of 0.012 and 250 s.
+Truth: the numbers that each record was drawn with (drifts.py).
 """
 
 from __future__ import annotations
@@ -12,38 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
 from scipy.stats import binom
 
 from selfcal.diagnosis.causes import turn_on
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State
+from selfcal.diagnosis.state import Look
 from selfcal.diagnosis.statemodel import Array
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records, shared_case
-
-N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
-LAWS = ("walk", "markov")
-
-
-def noise(random: np.random.Generator, law: str, n: int, rate: float) -> Array:
-    """[n]: white noise beside the drift."""
-    dt = 1.0 / rate
-    white = N / math.sqrt(dt) * random.standard_normal(n)
-    if law == "walk":
-        return white + K * math.sqrt(dt) * random.standard_normal(n).cumsum()
-    phi = math.exp(-dt / TIME_S)
-    kick = SIGMA_M * math.sqrt(1.0 - phi * phi) * random.standard_normal(n)
-    kick[0] = SIGMA_M * random.standard_normal()
-    return np.asarray(white + lfilter([1.0], [1.0, -phi], kick))
-
-
-def recorded(y: Array, rate: float) -> tuple[State, Record]:
-    level = float(np.median(y))
-    state = State("gx", "deg/s", y - level, 1.0 / rate, level, np.ones(y.size)).refit()
-    return state, Record(rate, {"gx": state}, {}, {}, np.isfinite(y), recorded_hz=rate)
 
 
 def looked(y: Array, rate: float) -> Look | None:
@@ -85,9 +62,8 @@ def test_amplitude_and_time_constant_lie_in_their_intervals(law: str) -> None:
         assert look is not None
         for key, truth in (("amplitude", amplitude), ("tau_s", tau)):
             held[key].append(look.estimate[key]["q05"] <= truth <= look.estimate[key]["q95"])
+    assert_held(held, law)
     for key, each in held.items():
-        print(f"{key}, {law}: {sum(each)} of {len(each)} in the 90 % interval")
-        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
         assert binom.sf(sum(each) - 1, len(each), 0.9) > 1e-3, key
 
 
@@ -107,11 +83,7 @@ def test_two_time_constants_are_one_finding() -> None:
 @pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
 def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
     """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
-    random = np.random.default_rng([424, round(rate), round(seconds), LAWS.index(law)])
-    count = case_records(6, 200)
-    found = [looked(noise(random, law, round(seconds * rate), rate), rate) for _ in range(count)]
-    named = sum(look is not None and look.net >= NET_LEAST for look in found)
-    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    named, count = clean_ones_named(turn_on.looks, 424, law, rate, seconds, (6, 200))
     assert named <= (4 if count >= 200 else 1)
 
 

@@ -1,18 +1,17 @@
 """A bias that jumps between two levels: named, its amplitude and dwell times held, and no clean record shows it.
 
-Truth: the numbers that each record was drawn with, as in `test_cases_turn_on.py`.
+Truth: the numbers that each record was drawn with (drifts.py).
 """
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
 from scipy.stats import binom
-from test_cases_turn_on import LAWS, noise, recorded
 
 from selfcal.diagnosis.causes import two_level
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.state import NET_LEAST
 from selfcal.diagnosis.statemodel import Array
 
 from conftest import case_records
@@ -55,19 +54,12 @@ def test_amplitude_and_dwell_times_lie_in_their_intervals() -> None:
         look = two_level.looks(*recorded(y, 1.0))[0].measured()
         for key, value in truth.items():
             held[key].append(look.estimate[key]["q05"] <= value <= look.estimate[key]["q95"])
-    for key, each in held.items():
-        print(f"{key}: {sum(each)} of {len(each)} in the 90 % interval")
-        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
+    assert_held(held, "walk")
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
 def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
     """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
-    random = np.random.default_rng([444, round(rate), round(seconds), LAWS.index(law)])
-    count, named = case_records(3, 200), 0
-    for _ in range(count):
-        found = two_level.looks(*recorded(noise(random, law, round(seconds * rate), rate), rate))
-        named += bool(found) and found[0].net >= NET_LEAST
-    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    named, count = clean_ones_named(two_level.looks, 444, law, rate, seconds)
     assert named <= (4 if count >= 200 else 1)

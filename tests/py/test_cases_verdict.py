@@ -67,15 +67,22 @@ def test_the_family_is_no_surer_than_it_states() -> None:
         assert count <= binom.isf(1e-3, records, level)
 
 
+def swinging(random: np.random.Generator, n: int, size: float, decay: float) -> Array:
+    """[n]: an oscillation of 150 samples driven by noise, which forgets in `decay` of them."""
+    keep = np.exp(-1.0 / decay + 2j * math.pi / 150.0)
+    kick = size * math.sqrt(1.0 - abs(keep) ** 2)
+    x, drift = 0j, np.zeros(n)
+    for k in range(n):
+        x = keep * x + kick * complex(*random.standard_normal(2))
+        drift[k] = x.real
+    return drift
+
+
 def test_a_damped_oscillation_shows_in_slow_statistics() -> None:
     """A drift that swings is in the Allan deviation or in the slow correlation, and judged as a family stands out."""
     random = np.random.default_rng(52)
     n = 3600
-    keep = np.exp(-1.0 / 400.0 + 2j * math.pi / 150.0)
-    x, drift = 0j, np.zeros(n)
-    for k in range(n):
-        x = keep * x + 0.6 * math.sqrt(1.0 - abs(keep) ** 2) * complex(*random.standard_normal(2))
-        drift[k] = x.real
+    drift = swinging(random, n, 0.6, 400.0)
     found = judged(fitted(random.standard_normal(n) + drift), seed=1)
     assert found.p < 1e-3
     assert found.statistics[0].name.startswith(("allan", "innovation_lag", "innovation_means", "spectrum"))
@@ -106,11 +113,7 @@ def test_identify_and_diagnose_have_one_verdict(tmp_path: Path) -> None:
     records, doubted = case_records(2, 30), 0
     for _ in range(records):
         n = 3600
-        keep = np.exp(-1.0 / 300.0 + 2j * math.pi / 150.0)
-        x, drift = 0j, np.zeros(n)
-        for k in range(n):
-            x = keep * x + 0.3 * math.sqrt(1.0 - abs(keep) ** 2) * complex(*random.standard_normal(2))
-            drift[k] = x.real
+        drift = swinging(random, n, 0.3, 300.0)
         log = log_of(tmp_path / "swing.npz", 0.04 * (random.standard_normal(n) + drift), 1.0)
         if identify(log, suspicion=False)["axes"]["gx"]["adequate"] is False:
             doubted += 1

@@ -1,0 +1,61 @@
+"""Records of one axis that the tests of a cause draw, sample by sample in numpy, and their counts.
+
+N 0.04, a walk of K 3e-4 or a Gauss-Markov drift of 0.012 and 250 s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from selfcal.diagnosis.cause import Looks
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, State
+from selfcal.diagnosis.statemodel import Array
+
+from conftest import case_records
+
+N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
+LAWS = ("walk", "markov")
+
+
+def noise(random: np.random.Generator, law: str, n: int, rate: float) -> Array:
+    """[n]: white noise beside the drift."""
+    dt = 1.0 / rate
+    white = N / math.sqrt(dt) * random.standard_normal(n)
+    if law == "walk":
+        return white + K * math.sqrt(dt) * random.standard_normal(n).cumsum()
+    phi = math.exp(-dt / TIME_S)
+    kick = SIGMA_M * math.sqrt(1.0 - phi * phi) * random.standard_normal(n)
+    kick[0] = SIGMA_M * random.standard_normal()
+    return np.asarray(white + lfilter([1.0], [1.0, -phi], kick))
+
+
+def recorded(y: Array, rate: float) -> tuple[State, Record]:
+    level = float(np.median(y))
+    state = State("gx", "deg/s", y - level, 1.0 / rate, level, np.ones(y.size)).refit()
+    return state, Record(rate, {"gx": state}, {}, {}, np.isfinite(y), recorded_hz=rate)
+
+
+def clean_ones_named(
+    looks: Looks, seed: int, law: str, rate: float, seconds: float, records: tuple[int, int] = (3, 200)
+) -> tuple[int, int]:
+    """Clean records in which a look is worth a finding, and all: few in `make test`, many in `make cases`."""
+    random = np.random.default_rng([seed, round(rate), round(seconds), LAWS.index(law)])
+    count, named = case_records(*records), 0
+    for _ in range(count):
+        found = looks(*recorded(noise(random, law, round(seconds * rate), rate), rate))
+        named += bool(found) and found[0].net >= NET_LEAST
+    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
+    return named, count
+
+
+def assert_held(held: Mapping[str, Sequence[bool]], what: str) -> None:
+    """Of each key 90 % hold the truth, the lower tail of the binomial not below 1 in 1000."""
+    for key, each in held.items():
+        print(f"{key}, {what}: {sum(each)} of {len(each)} in the 90 % interval")
+        assert binom.cdf(sum(each), len(each), 0.9) > 1e-3, key
