@@ -178,7 +178,8 @@ typedef struct {
     const selfcal_prior_t *prior; /* [axes][SELFCAL_PARAMETERS] under this law; NULL: those of the axes */
 } selfcal_hypothesis_t;
 
-/* Where a regressor's value comes from, for selfcal_form(). Times count from the first sample. */
+/* Where a regressor's value comes from, for selfcal_form(). Times count from the first sample, a turn-on's from
+ * power-on: selfcal_power_on(). */
 typedef enum {
     SELFCAL_COLUMN_TIME = 0,    /* s */
     SELFCAL_COLUMN_CHANNEL = 1, /* a channel; with a window its mean over that time up to the sample */
@@ -187,15 +188,19 @@ typedef enum {
     SELFCAL_COLUMN_COSINE = 4,
     SELFCAL_COLUMN_STEP = 5,    /* 0, and 1 from a time on */
     SELFCAL_COLUMN_TURN_ON = 6, /* exp(-t / time constant) */
-    SELFCAL_COLUMN_PULSE = 7    /* 0, and 1 from a time on until another */
+    SELFCAL_COLUMN_PULSE = 7,   /* 0, and 1 from a time on until another */
+    SELFCAL_COLUMN_LAG = 8,     /* a channel behind a first-order low pass, at rest at its first value */
+    SELFCAL_COLUMN_SLOPE = 9,   /* slope of the straight line that fits a channel's window best, per second */
+    SELFCAL_COLUMN_SQUARE = 10, /* of a channel about a value */
+    SELFCAL_COLUMN_CUBE = 11
 } selfcal_column_kind_t;
 
 typedef struct {
     selfcal_column_kind_t kind;
-    uint8_t channel; /* CHANNEL, RATE: an axis; from the model's `axes` on, a channel beside the readings */
-    float number;    /* CHANNEL, RATE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz;
-                      * STEP, PULSE: time, s; TURN_ON: time constant, s */
-    float until;     /* PULSE: end, s */
+    uint8_t channel; /* of a channel: an axis; from the model's `axes` on, a channel beside the readings */
+    float number;    /* CHANNEL, RATE, SLOPE: window, s (CHANNEL: 0 for none); SINE, COSINE: frequency, Hz;
+                      * STEP, PULSE: time, s; TURN_ON, LAG: time constant, s; SQUARE, CUBE: the value they are about */
+    float second;    /* PULSE: end, s; LAG, SQUARE, CUBE: window of the mean that they are made of, s; 0 for none */
 } selfcal_source_t;
 
 /* Optional code. Only a model that names it links it. */
@@ -206,10 +211,10 @@ extern const selfcal_forgetting_code_t selfcal_forgetting_code;
 typedef struct selfcal_states_code selfcal_states_code_t;
 extern const selfcal_states_code_t selfcal_states_code;
 
-/* Known disturbances z (time, temperature, its rate, supply, another axis, a sine and a cosine, a step, a turn-on, a
- * pulse). Each adds a constant coefficient times its value to every reading. Every subset of them is a hypothesis of
- * its own. The values come with the samples, see selfcal_push_with(); their unit is the application's. With
- * SELFCAL_FIXED the bank then runs in software floating point. */
+/* Known disturbances z (time, temperature, its rate or lag, supply, another axis, a sine and a cosine, a step, a
+ * turn-on, a pulse). Each adds a constant coefficient times its value to every reading. Every subset of them is a
+ * hypothesis of its own. The values come with the samples, see selfcal_push_with(); their unit is the application's.
+ * With SELFCAL_FIXED the bank then runs in software floating point. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code */
     uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
@@ -456,9 +461,15 @@ void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[]
 /* Value of regressor k at the last bank sample that the sums hold: where the bias of a report with it in use stands. */
 float selfcal_regressor_last(const selfcal_t *self, uint8_t k);
 
-/* `samples` went by unseen before the next one. After a restart: the bank's counters `samples` plus `missing`.
- * Times and lines go on; a window begins anew. */
-void selfcal_former_pass(selfcal_former_t *self, uint64_t samples);
+/* selfcal_former_init() where the bank has got to, as after selfcal_restore(). Times, lines and turn-ons go on. A lag
+ * goes on from its value at the bank's last sample; meanwhile the channel is taken to have had its next value. A window
+ * begins anew. SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL: as selfcal_former_init(). */
+selfcal_status_t selfcal_former_resume(selfcal_former_t *self, const selfcal_t *bank);
+
+/* The part was powered on `samples` before the next sample; without this, at the first of all. A snapshot has it.
+ * Call it before selfcal_former_resume(): at a start where power came on, with 0, or a recording that begins later.
+ * SELFCAL_BAD_ARGUMENT on NULL. */
+selfcal_status_t selfcal_power_on(selfcal_t *self, uint64_t samples);
 
 /* --------------------------------------------------------------------------------------------------------- snapshot
  * Everything a bank knows as a stream of bytes (format in snapshot.c), with a version and a CRC-32. A bank saved and

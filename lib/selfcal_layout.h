@@ -227,6 +227,7 @@ struct selfcal {
     uint32_t equal[SELFCAL_AXES_MAX];
     bool in_gap;
     float shifted[SELFCAL_AXES_MAX]; /* by selfcal_shift(), in all, unit */
+    uint64_t powered;                /* samples since power-on less those counted, modulo 2^64 */
     /* of the bias's prior, unit: the model's until selfcal_reopen() */
     float prior_mean[SELFCAL_AXES_MAX], prior_sd[SELFCAL_AXES_MAX];
     uint32_t retired;                /* a bit for each axis */
@@ -248,6 +249,8 @@ struct selfcal {
 
 typedef struct {
     uint64_t step;        /* STEP, PULSE: its sample; SINE, COSINE: 2^64 turns a sample */
+    selfcal_sum_t state;  /* LAG: the low pass less the channel */
+    selfcal_real_t gain;  /* ... and its share of a step, a sample */
     uint32_t window, bin; /* samples; PULSE: window is its length */
     uint32_t bins, in_bin;
     float ring[SELFCAL_COLUMN_BINS + 2U];
@@ -257,6 +260,7 @@ typedef struct {
 struct selfcal_former {
     const selfcal_model_t *model;
     uint64_t samples; /* before the newest, missing ones too */
+    uint64_t powered; /* ... and those since power-on less these, modulo 2^64 */
     bool begun;
     selfcal_trail_t trail[SELFCAL_REGRESSORS_MAX];
 };

@@ -43,6 +43,12 @@ selfcal_status_t app_node(app_t *app, uint8_t node)
     return selfcal_telemetry_node(&app->telemetry, node);
 }
 
+void app_power_on(app_t *app, uint64_t samples)
+{
+    (void)selfcal_power_on(&app->bank, samples);
+    app_begin_columns(app);
+}
+
 bool app_gate(app_t *app)
 {
 #if SELFCAL_MODEL_GATE

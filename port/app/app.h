@@ -140,6 +140,9 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms);
 /* After app_init(), which makes it SELFCAL_NODE: the module's number on its bus. SELFCAL_BAD_ARGUMENT beyond 11. */
 selfcal_status_t app_node(app_t *app, uint8_t node);
 
+/* After app_init(): the sensor was powered on `samples` before the first sample. Default: with it. */
+void app_power_on(app_t *app, uint64_t samples);
+
 /* After app_init(): from here on only samples of rest feed the bank. While the module moves time passes as a gap.
  * The gate starts with the model's noise, a bound. After 30 windows of rest it goes on with the measured noise.
  * False: the model has no gate, and every sample counts as one of rest. */

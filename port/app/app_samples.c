@@ -7,9 +7,7 @@
 void app_begin_columns(app_t *app)
 {
 #if SELFCAL_MODEL_REGRESSORS > 0
-    const selfcal_counters_t *seen = selfcal_counters(&app->bank);
-    (void)selfcal_former_init(&app->former, &selfcal_model);
-    selfcal_former_pass(&app->former, seen->samples + seen->missing);
+    (void)selfcal_former_resume(&app->former, &app->bank);
     memset(app->used, 0, sizeof app->used);
 #endif
 #if APP_ADEQUACY

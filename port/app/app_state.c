@@ -29,6 +29,10 @@ void app_restore(app_t *app)
             (void)selfcal_moving(&app->bank);
             const uint64_t block = app->bank.block, past = (app->bank.position + module->save_gap) % block;
             (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
+            module->tell(module->context, &app->told);
+            if (app->told.reset_cause == SELFCAL_STATUS_RESET_CAUSE_POWER_ON) {
+                (void)selfcal_power_on(&app->bank, 0);
+            }
             (void)tell_sensor(app);
             app_begin_columns(app);
             app->told.state_found = older == 0 ? SELFCAL_STATUS_STATE_FOUND_NEWEST : SELFCAL_STATUS_STATE_FOUND_OLDER;

@@ -295,6 +295,7 @@ int main(int argc, char **argv)
         app_node(&app, (uint8_t)options.node) != SELFCAL_OK) {
         return fail(2, "model", "refused by the library");
     }
+    app_power_on(&app, host.replay.powered);
     if (options.gate && !app_gate(&app)) {
         return fail(2, "model", "has no gate");
     }

@@ -160,6 +160,7 @@ int main(void)
     if (app_init(&app, &port, period_ms) != SELFCAL_OK) {
         return fail(2, "model", "refused by the library");
     }
+    app_power_on(&app, board.replay.powered);
     if (gate && !app_gate(&app)) {
         return fail(2, "model", "has no gate");
     }

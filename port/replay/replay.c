@@ -2,7 +2,7 @@
 
 #include <string.h>
 
-enum { HEADER_BYTES = 32 };
+enum { HEADER_BYTES = 40 };
 
 static uint32_t little32(const unsigned char *bytes)
 {
@@ -17,7 +17,7 @@ static uint64_t little64(const unsigned char *bytes)
 const char *replay_open(replay_t *replay)
 {
     unsigned char header[HEADER_BYTES];
-    if (!replay->read(replay->context, header, sizeof header) || memcmp(header, "SELFCAL1", 8) != 0) {
+    if (!replay->read(replay->context, header, sizeof header) || memcmp(header, "SELFCAL2", 8) != 0) {
         return "not a recording for this program";
     }
     if (little32(header + 8) != SELFCAL_MODEL_AXES) {
@@ -33,6 +33,7 @@ const char *replay_open(replay_t *replay)
         return "its rate is not that of the model built in";
     }
     replay->rows = little64(header + 24);
+    replay->powered = little64(header + 32);
     return NULL;
 }
 

@@ -1,8 +1,9 @@
 /* A recording in the sensor's place, for the targets that replay: the host's and the emulators'.
  *
- * Little-endian: "SELFCAL1", uint32 axes, uint32 channels, float64 rate (Hz), uint64 rows. Then each row: uint32
- * samples missing just before it, float32 reading of each axis and of each channel. Axes, channels and units are the
- * model's; PORT_SIDE are the last channels. Time is that of the recording: samples passed over the rate. */
+ * Little-endian: "SELFCAL2", uint32 axes, uint32 channels, float64 rate (Hz), uint64 rows, uint64 samples from power-on
+ * to the first row. Then each row: uint32 samples missing just before it, float32 reading of each axis and of each
+ * channel. Axes, channels and units are the model's; PORT_SIDE are the last channels. Time is that of the recording:
+ * samples passed over the rate. */
 #ifndef REPLAY_H
 #define REPLAY_H
 
@@ -23,6 +24,7 @@ typedef struct {
     void *context;
     double rate_hz;
     uint64_t rows;     /* still to read */
+    uint64_t powered;  /* samples from power-on to the first row */
     uint64_t passed;   /* samples since the start of the recording, missing ones too: its clock */
     uint32_t time_ms;  /* the same, modulo 2^32 */
     bool waiting;      /* `row` is read and due */

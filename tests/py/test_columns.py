@@ -6,10 +6,11 @@ held in bins: then a mean is off by what the channel moves within the oldest bin
 
 import numpy as np
 import pytest
+from scipy.signal import oaconvolve
 
 from selfcal import _library32
 
-TIME, CHANNEL, RATE, SINE, COSINE, STEP, TURN_ON, PULSE = range(8)
+TIME, CHANNEL, RATE, SINE, COSINE, STEP, TURN_ON, PULSE, LAG, SLOPE, SQUARE, CUBE = range(12)
 
 
 def form(
@@ -17,12 +18,13 @@ def form(
     values: np.ndarray,
     missing: np.ndarray | None = None,
     dt: float = 0.1,
+    powered: int = 0,
 ) -> np.ndarray:
     """[n] of one source over one channel [n]."""
-    kind, number, until = (*source, 0.0)[:3]
+    kind, number, second = (*source, 0.0)[:3]
     gaps = np.zeros(values.size, np.uint64) if missing is None else missing.astype(np.uint64)
     rows = np.ascontiguousarray(values[:, None], np.float32)
-    return np.asarray(_library32.form([(kind, 0, number, until)], dt, rows, gaps)[:, 0], float)
+    return np.asarray(_library32.form([(int(kind), 0, number, second)], dt, rows, gaps, powered)[:, 0], float)
 
 
 def walk(n: int, seed: int) -> np.ndarray:
@@ -87,6 +89,91 @@ def test_the_rate_of_a_line_is_its_slope_through_gaps(window: int) -> None:
     assert np.abs(found - 0.02)[settled].max() < 1e-6 * 0.02 * t.max() / (0.1 * window) + 1e-6
 
 
+def low_pass(values: np.ndarray, missing: np.ndarray, tau: float, dt: float) -> np.ndarray:
+    """[n] sample by sample on the full grid, in double: on a straight line between two rows."""
+    out, x, last = np.empty(values.size), values[0], values[0]
+    gain = -np.expm1(-dt / tau)
+    for i, value in enumerate(values):
+        steps = int(missing[i]) + 1
+        for part in np.arange(1, steps + 1) / steps if i else []:
+            x += gain * (last + part * (value - last) - x)
+        out[i], last = x, value
+    return out
+
+
+@pytest.mark.parametrize(("tau", "dt"), [(0.02, 0.1), (3.0, 0.1), (900.0, 0.1), (5000.0, 0.01)])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_a_lag_is_a_low_pass(tau: float, dt: float, gaps: bool) -> None:
+    """float32 at 25 is 2e-6; the slowest low pass takes a share of 2e-6 of each step, on a staircase and on noise."""
+    n = 3000
+    missing = a_gapped_record(n, 8)[0] if gaps else np.zeros(n, np.int64)
+    missing = np.minimum(missing, 5000)
+    for drawn in (walk(n, 9), 25.0 + 0.14 * np.floor(np.arange(n) / 200.0), walk(n, 10) + 0.5 * (np.arange(n) % 2)):
+        values = drawn.astype(np.float32).astype(float)
+        assert np.abs(form((LAG, tau), values, missing, dt) - low_pass(values, missing, tau, dt)).max() < 1e-5
+
+
+def test_a_slow_lag_does_not_stop() -> None:
+    """An hour at 100 Hz, 5000 s: a step of 5 is followed by a share of 1e-6 of it a sample."""
+    values = np.where(np.arange(360_000) < 10, 25.0, 30.0)
+    t = 0.01 * np.maximum(np.arange(values.size) - 9.0, 0.0)
+    assert np.abs(form((LAG, 5000.0), values, dt=0.01) - (30.0 - 5.0 * np.exp(-t / 5000.0))).max() < 1e-5
+
+
+@pytest.mark.parametrize("window", [2, 7, 32])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_a_short_slope_is_that_of_the_line_that_fits_best(window: int, gaps: bool) -> None:
+    """Against np.polyfit() on the full grid, at rest before the first value and behind a gap as long as the window."""
+    n, dt = 600, 0.1
+    missing, t = a_gapped_record(n, 11) if gaps else (np.zeros(n, np.int64), dt * np.arange(n))
+    values = walk(n, 12)
+    begins = np.maximum.accumulate(np.where(missing >= window, np.arange(n), 0))
+    found = form((SLOPE, dt * window), values, missing, dt)
+    age = dt * np.arange(1 - window, 1)
+    for i in range(n):
+        rows = slice(begins[i], i + 1)
+        assert found[i] == pytest.approx(np.polyfit(age, np.interp(t[i] + age, t[rows], values[rows]), 1)[0], abs=1e-3)
+    assert np.abs(found).max() > 0.02
+
+
+@pytest.mark.parametrize("window", [33, 100, 600, 5000])
+def test_a_long_slope_is_that_of_its_bins(window: int) -> None:
+    """A straight line's is exact. That of a parabola is the line's at half the window back: bins change it by their
+    share, squared, of what it gains over the window. Noise: the bin at the edge of the window, at most half a bin out,
+    is another one in 3/4 of a bin's share of the best slope's variance; the steps of the weights are the rest of 1."""
+    n, dt = 20 * window, 0.1
+    t = dt * np.arange(n)
+    line = form((SLOPE, dt * window), 25.0 + 0.02 * t, dt=dt)[window:]
+    assert np.abs(line - 0.02).max() < 1e-6 * 25.0 / (dt * window) + 2e-7
+    bent = form((SLOPE, dt * window), t**2 / t[-1], dt=dt)[window:]
+    middle = 2.0 * (t[window:] - 0.5 * dt * (window - 1)) / t[-1]
+    assert np.abs(bent - middle).max() < (2.0 / 32.0) ** 2 * window / n + 1e-5
+    noise = np.random.default_rng(13).normal(size=n)
+    spread = form((SLOPE, dt * window), noise, dt=dt)[window:]
+    age = dt * (np.arange(window) - 0.5 * (window - 1))
+    best = oaconvolve(noise, age[::-1] / (age @ age), mode="valid")[1:]
+    assert np.var(spread - best) < -(-window // 32) / window * np.var(best)
+
+
+@pytest.mark.parametrize("mean", [1, 5])
+def test_powers_are_of_the_mean_about_the_reference(mean: int) -> None:
+    values = walk(300, 14)
+    about = mean_of_last(values, mean) - 24.0
+    second = 0.1 * mean if mean > 1 else 0.0
+    assert form((SQUARE, 24.0, second), values) == pytest.approx(about**2, abs=1e-4)
+    assert form((CUBE, 24.0, second), values) == pytest.approx(about**3, abs=1e-4)
+    late = low_pass(mean_of_last(values, mean), np.zeros(300, int), 4.0, 0.1)
+    assert form((LAG, 4.0, second), values) == pytest.approx(late, abs=1e-5)
+
+
+@pytest.mark.parametrize("source", [(CHANNEL, 0.5), (RATE, 0.5), (LAG, 4.0), (SLOPE, 0.5), (SQUARE, 20.0, 0.5)])
+def test_a_column_begins_at_the_first_value_that_is_one(source: tuple[float, ...]) -> None:
+    values = np.concatenate([[np.nan, np.nan], walk(60, 15)])
+    found = form(source, values)
+    assert np.isnan(found[:2]).all()
+    assert found[2:] == pytest.approx(form(source, values[2:]))
+
+
 def test_time_lines_and_steps_count_the_missing_samples() -> None:
     """Times to float32's digits. A line is that of the interval and the frequency as the model holds them, in float32:
     its phase is kept in integers and does not drift."""
@@ -96,7 +183,9 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
     assert (form((STEP, 42.3), nothing, missing) == (t >= 42.3 - 1e-6)).all()
     assert (form((PULSE, 42.3, 77.0), nothing, missing) == ((t >= 42.3 - 1e-6) & (t < 77.0 - 1e-6))).all()
     for tau in (0.7, 42.3, 5000.0):
-        assert np.abs(form((TURN_ON, tau), nothing, missing) - np.exp(-t / tau)).max() < 1e-6
+        for powered in (0, 37, 10**6):
+            left = np.exp(-(t + 0.1 * powered) / tau)
+            assert np.abs(form((TURN_ON, tau), nothing, missing, powered=powered) - left).max() < 1e-6
     stretch = float(np.float32(0.1)) / 0.1
     turns = 2.0 * np.pi * np.mod(float(np.float32(0.5643)) * t * stretch, 1.0)
     assert np.abs(form((SINE, 0.5643), nothing, missing) - np.sin(turns)).max() < 2e-5
@@ -106,7 +195,12 @@ def test_time_lines_and_steps_count_the_missing_samples() -> None:
 def test_a_source_that_cannot_be_is_refused() -> None:
     values = np.zeros(3)
     for source in (
-        (8, 1.0),
+        (12, 1.0),
+        (LAG, 0.0),
+        (LAG, 5.0, -1.0),
+        (SLOPE, 0.0),
+        (SQUARE, float("inf")),
+        (CUBE, 0.0, float("nan")),
         (PULSE, 3.0),
         (RATE, 0.0),
         (SINE, -1.0),

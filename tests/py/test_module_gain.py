@@ -30,10 +30,15 @@ EFFECTS = {
     "step": ["step:time_s=900,amplitude=0.3,axis=gx"],
     "flicker": ["flicker:B=0.05,axis=gx"],
     "colored_noise": ["colored_noise:lag1=0.4,axis=gx"],
+    "turn_on": ["turn_on:amplitude=0.6,tau_s=60,axis=gx"],
+    "pulse": ["pulse:time_s=900,duration_s=300,amplitude=0.3,axis=gx"],
+    "lag": ["temperature:coefficient=0.2,lag_s=250,axis=gx"],
+    "rate": ["temperature:coefficient=0,rate=30,window_s=60,axis=gx"],
+    "square": ["temperature:coefficient=0.1,square=0.1,axis=gx"],
     "two": ["temperature:coefficient=0.1,axis=gx", "supply:coefficient=4,axis=gx"],
 }
 #: What `make test` runs; `make campaigns` runs all.
-SHORT = ("temperature", "periodic", "colored_noise")
+SHORT = ("lag", "periodic", "colored_noise")
 #: A part of the gain, beside half a nat: both are below what decides a hypothesis. The Cortex-M0 has coarser nodes.
 SHARE = {"host": 0.01, "cortex-m4f": 0.01, "cortex-m0": 0.03}
 #: Laws that are sums of terms. On the Cortex-M0 one of them has room beside the random walk.

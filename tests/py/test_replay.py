@@ -335,11 +335,11 @@ class Module:
         return self.process.returncode, said
 
 
-def rows(count: int = 600, axes: int = 1, rate_hz: float = 10.0, magic: bytes = b"SELFCAL1") -> bytes:
+def rows(count: int = 600, axes: int = 1, rate_hz: float = 10.0, magic: bytes = b"SELFCAL2") -> bytes:
     noise = np.random.default_rng(1).normal(0.0, 0.1, count).astype("<f4")
     body = np.zeros(count, dtype=[("missing", "<u4"), ("reading", "<f4"), ("side", "<f4", (2,))])
     body["reading"], body["side"] = noise, np.nan
-    return magic + struct.pack("<IIdQ", axes, 2, rate_hz, count) + body.tobytes()
+    return magic + struct.pack("<IIdQQ", axes, 2, rate_hz, count, 0) + body.tobytes()
 
 
 def read_until(line: int, end: bytes, seconds: float = 20.0) -> bytes:
@@ -355,9 +355,10 @@ def test_rows_written_are_rows_expected(tmp_path: Path) -> None:
     """The layout in the comment of port/replay/replay.h, packed here by struct."""
     path = tmp_path / "two.csv"
     path.write_text("t[s],gx[rad/s]\n0,1.0\n0.1,2.0\n0.2,2.0\n0.5,3.0\n")
-    write_rows(load(path, rate=10.0), Model.load(), ("gx",), tmp_path / "rows.bin")
+    recording = load(path, rate=10.0).later(12.3)
+    write_rows(recording, Model.load(), ("gx",), tmp_path / "rows.bin")
     degrees = 180.0 / np.pi
-    want = b"SELFCAL1" + struct.pack("<IIdQ", 1, 2, 10.0, 4)
+    want = b"SELFCAL2" + struct.pack("<IIdQQ", 1, 2, 10.0, 4, 123)
     unknown = b"\0\0\xc0\x7f"  # not a number: this recording has no temperature and no supply
     rows = ((0, 1), (0, 2), (0, 2), (2, 3))
     want += b"".join(struct.pack("<If4s4s", gap, x * degrees, unknown, unknown) for gap, x in rows)

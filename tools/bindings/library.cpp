@@ -487,17 +487,19 @@ private:
     selfcal_gate_t gate_{};
 };
 
-using SourceTuple = std::tuple<int, int, float, float>; // kind, channel, number, until
+using SourceTuple = std::tuple<int, int, float, float>; // kind, channel, number, second
 
-// The values [n, sources] of regressors over channels [n, c], after missing_before [n] samples each.
+// The values [n, sources] of regressors over channels [n, c], after missing_before [n] samples each, the first one
+// `powered` samples after power-on.
 using Missing = nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s,
-                                          const Rows &channels, const Missing &missing_before) {
+                                          const Rows &channels, const Missing &missing_before,
+                                          uint64_t powered) {
     std::vector<selfcal_source_t> sources;
-    for (const auto &[kind, channel, number, until] : tuples) {
+    for (const auto &[kind, channel, number, second] : tuples) {
         if (channel < 0 || static_cast<size_t>(channel) >= std::max<size_t>(channels.shape(1), 1))
             throw std::invalid_argument("a source is no channel");
-        sources.push_back({static_cast<selfcal_column_kind_t>(kind), static_cast<uint8_t>(channel), number, until});
+        sources.push_back({static_cast<selfcal_column_kind_t>(kind), static_cast<uint8_t>(channel), number, second});
     }
     const size_t n = missing_before.shape(0), p = sources.size();
     if (channels.shape(0) != n || p == 0 || p > SELFCAL_REGRESSORS_MAX)
@@ -512,6 +514,7 @@ static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples
     selfcal_former_t former;
     if (selfcal_former_init(&former, &model) != SELFCAL_OK)
         throw std::invalid_argument("sources cannot be");
+    former.powered = powered;
     auto *values = new float[n * p + 1];
     nb::capsule owner(values, [](void *v) noexcept { delete[] static_cast<float *>(v); });
     for (size_t i = 0; i < n; i++)

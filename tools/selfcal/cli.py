@@ -113,6 +113,9 @@ Start = Annotated[
 End = Annotated[
     float | None, typer.Option("--end", metavar="S", help="End before this, seconds of the recording; default: its end")
 ]
+SincePowerOn = Annotated[
+    float, typer.Option("--since-power-on", metavar="S", help="From power-on to the recording's beginning, s")
+]
 Gate = Annotated[bool, typer.Option("--gate", help="Keep motion out, by the model's stationary gate")]
 FailOn = Annotated[
     str | None,
@@ -177,6 +180,7 @@ def identify(
     fail_on: FailOn = None,
     start: Start = None,
     end: End = None,
+    since_power_on: SincePowerOn = 0.0,
     gate: Gate = False,
     rate: Rate = None,
     column: Column = None,
@@ -205,6 +209,7 @@ def identify(
         fail_on=fail_on,
         start_s=start,
         end_s=end,
+        since_power_on_s=since_power_on,
         gate=gate,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
@@ -242,6 +247,7 @@ def diagnose(
     fail_on: FailOn = None,
     start: Start = None,
     end: End = None,
+    since_power_on: SincePowerOn = 0.0,
     gate: Gate = False,
     rate: Rate = None,
     column: Column = None,
@@ -267,6 +273,7 @@ def diagnose(
         fail_on=fail_on,
         start_s=start,
         end_s=end,
+        since_power_on_s=since_power_on,
         gate=gate,
         rate=rate,
         columns=parse_pairs("--column", column or ()),
@@ -426,6 +433,7 @@ def replay(
     gate: Gate = False,
     begin: Start = None,
     end: End = None,
+    since_power_on: SincePowerOn = 0.0,
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
     rate: Rate = None,
@@ -452,6 +460,7 @@ def replay(
         gate=gate,
         start_s=begin,
         end_s=end,
+        since_power_on_s=since_power_on,
         json=json,
         plot=plot,
         rate=rate,

@@ -51,6 +51,7 @@ def recording_entry(recording: Recording) -> dict[str, Any]:
         "samples": recording.samples,
         "duration_s": recording.duration_s,
         "start_s": recording.start_s,
+        "since_power_on_s": recording.since_power_on_s,
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
         **({"options": [list(one) for one in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),

@@ -1,13 +1,16 @@
 """How a channel's value acts on a reading: as it is, late, by its powers, or through a play. Host tools, model file and
-simulator form columns by this one function."""
+simulator form columns here, by the library where a module has the form."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from selfcal import _library32
 
 Array = NDArray[np.float64]
 
@@ -17,8 +20,52 @@ FORMS = ("static", "lag", "rate", "square", "cube", "play")
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width"}
 #: The power of the channel's unit.
 POWER = {"square": 2, "cube": 3}
+#: `selfcal_column_kind_t`: names in C, by number.
+COLUMN_KINDS = (
+    "TIME",
+    "CHANNEL",
+    "RATE",
+    "SINE",
+    "COSINE",
+    "STEP",
+    "TURN_ON",
+    "PULSE",
+    "LAG",
+    "SLOPE",
+    "SQUARE",
+    "CUBE",
+)
+KIND = {name: number for number, name in enumerate(COLUMN_KINDS)}
+#: Kind, channel, number and second number of a column: `selfcal_source_t`.
+Source = tuple[int, int, float, float]
 #: What of the channel acts: its value, or the variance of its noise.
 INPUTS = ("value", "variance")
+
+
+def made(
+    sources: Sequence[Source],
+    interval_s: float,
+    rows: NDArray[np.floating[Any]],
+    missing: NDArray[np.integer[Any]] | None = None,
+    powered: int = 0,
+) -> Array:
+    """[n, sources]: columns of the channels `rows` [n, c], as a module forms them, in float32.
+
+    Sample i follows `missing[i]` absent ones, the first one power-on by `powered`."""
+    gaps = np.zeros(len(rows), np.uint64) if missing is None else np.ascontiguousarray(missing, np.uint64)
+    columns = _library32.form(list(sources), interval_s, np.ascontiguousarray(rows, np.float32), gaps, powered)
+    return np.ascontiguousarray(columns, np.float64)
+
+
+def source_of(form: str, channel: int, number: float, about: float, mean_s: float) -> Source:
+    """What the library makes of a form: `selfcal_source_t`. A play's is the channel: the library has none."""
+    if form == "lag":
+        return KIND["LAG"], channel, number, mean_s
+    if form == "rate":
+        return KIND["SLOPE"], channel, number, 0.0
+    if form in POWER:
+        return KIND[form.upper()], channel, about, mean_s
+    return KIND["CHANNEL"], channel, mean_s, 0.0
 
 
 def formed(
@@ -37,13 +84,21 @@ def formed(
     """
     if form == "static" or values.size == 0:
         return values
-    if form == "lag":
-        return _lagging(values, -math.expm1(-interval_s / number), missing)
-    if form == "rate":
-        return _slopes(values, max(2, round(number / interval_s)), missing) / interval_s
     if form == "play":
-        return _played(values, 0.5 * number)
-    return np.asarray((values - about) ** POWER[form])
+        return played(values, number)
+    origin = about if form in POWER else float(values[0])  # float32 has seven digits
+    column = made([source_of(form, 0, number, 0.0, 0.0)], interval_s, (values - origin)[:, None], missing)[:, 0]
+    return np.asarray(column + origin) if form == "lag" else column
+
+
+def played(values: Array, width: float) -> Array:
+    """What follows at half of `width` at most, and moves only if it must."""
+    out = np.empty(values.size)
+    at, half = float(values[0]), 0.5 * width
+    for i, value in enumerate(values.tolist()):
+        at = min(max(at, value - half), value + half)
+        out[i] = at
+    return out
 
 
 def variance_of(values: Array, missing: NDArray[np.integer[Any]] | None = None) -> Array:
@@ -55,58 +110,3 @@ def variance_of(values: Array, missing: NDArray[np.integer[Any]] | None = None) 
     if missing is not None:
         half[missing > 0] = np.nan
     return half
-
-
-def _lagging(values: Array, gain: float, missing: NDArray[np.integer[Any]] | None) -> Array:
-    """A first-order low pass: x += gain (value - x) at each sample."""
-    from scipy.signal import lfilter  # its import takes longer than all else at the start
-
-    out = np.empty(values.size)
-    starts = [0] if missing is None else [0, *(np.flatnonzero(missing[1:] > 0) + 1).tolist()]
-    state = float(values[0])
-    for k, start in enumerate(starts):
-        end = starts[k + 1] if k + 1 < len(starts) else values.size
-        if k > 0 and missing is not None:
-            # On a line of slope g the low pass ends up g (1 - gain) / gain behind; what it is off of that decays.
-            steps = int(missing[start]) + 1
-            slope = (values[start] - values[start - 1]) / steps
-            behind = slope * (1.0 - gain) / gain
-            state = values[start] - behind + (state - values[start - 1] + behind) * (1.0 - gain) ** steps
-        else:
-            state += gain * (values[start] - state)
-        out[start] = state
-        rest = values[start + 1 : end]
-        if rest.size:
-            out[start + 1 : end], _ = lfilter([gain], [1.0, gain - 1.0], rest, zi=[(1.0 - gain) * state])
-            state = float(out[end - 1])
-    return out
-
-
-def _slopes(values: Array, window: int, missing: NDArray[np.integer[Any]] | None) -> Array:
-    """The slope, per sample, of the straight line that fits the last `window` values best. A gap as long as the window
-    begins it anew."""
-    from scipy.signal import oaconvolve  # its import takes longer than all else at the start
-
-    out = np.empty(values.size)
-    far = [] if missing is None else (np.flatnonzero(missing[1:] >= window) + 1).tolist()
-    # The newest value first: a convolution turns its kernel round.
-    weight = 0.5 * (window - 1) - np.arange(window)
-    weight /= float(weight @ weight)
-    for start, end in zip([0, *far], [*far, values.size], strict=True):
-        part = values[start:end]
-        steps = np.ones(part.size, np.int64) if missing is None else missing[start:end].astype(np.int64) + 1
-        place = np.cumsum(steps) - steps[0]
-        whole = np.interp(np.arange(place[-1] + 1), place, part) if place[-1] + 1 > part.size else part
-        about = np.concatenate([np.zeros(window - 1), whole - part[0]])
-        out[start:end] = oaconvolve(about, weight, mode="valid")[place]
-    return out
-
-
-def _played(values: Array, half: float) -> Array:
-    """What follows at a distance of `half` at most, and moves only if it must."""
-    out = np.empty(values.size)
-    at = float(values[0])
-    for i, value in enumerate(values.tolist()):
-        at = min(max(at, value - half), value + half)
-        out[i] = at
-    return out

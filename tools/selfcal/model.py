@@ -114,7 +114,7 @@ class Regressor:
     @property
     def on_module(self) -> bool:
         """Whether `selfcal_form()` makes its columns."""
-        return self.form == "static" and self.input == "value"
+        return self.form != "play" and self.input == "value"
 
     @property
     def offset(self) -> float:

@@ -41,6 +41,8 @@ from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwr
 
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
+#: s from power-on to a recording's beginning, at most: a year.
+LONGEST_POWERED_S = 3.2e7
 #: Sensor columns unless a model names others; a recording needs at least one.
 SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 #: Columns that are no axis but may explain one, by cause: name and unit.
@@ -92,8 +94,9 @@ class Recording:
     """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row.
 
     `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps. `start_s`: where in the file's
-    recording the first row is, s. `moving_before`, `moving`: samples left out for motion (`Clock`). `started_s`: the
-    first stamp, s. `notes`: what a reader of the results must know of the file, one line each.
+    recording the first row is, s. `since_power_on_s`: from power-on to the file's first row, s. `moving_before`,
+    `moving`: samples left out for motion (`Clock`). `started_s`: the first stamp, s. `notes`: what a reader of the
+    results must know of the file, one line each.
     """
 
     path: Path
@@ -106,6 +109,7 @@ class Recording:
     moving_before: NDArray[np.int64] | None = None
     moving: int = 0
     started_s: float | None = None
+    since_power_on_s: float = 0.0
     notes: tuple[str, ...] = ()
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()
@@ -121,6 +125,11 @@ class Recording:
     def duration_s(self) -> float:
         """Length with the missing samples, s."""
         return (self.samples + int(self.missing_before.sum())) / self.rate_hz
+
+    @property
+    def powered(self) -> int:
+        """Samples from power-on to the first row."""
+        return round((self.since_power_on_s + self.start_s) * self.rate_hz)
 
     @property
     def lost(self) -> int:
@@ -173,6 +182,15 @@ class Recording:
             moving_before=clock.moving_before,
             moving=clock.moving,
         )
+
+    def later(self, since_power_on_s: float) -> Recording:
+        """The recording with its distance from power-on, s. Raises UserError for one that is none."""
+        if not 0.0 <= since_power_on_s <= LONGEST_POWERED_S:
+            raise UserError(
+                f"--since-power-on {since_power_on_s:g}: takes the seconds from power-on to the recording's beginning, "
+                f"0 to {LONGEST_POWERED_S:g}"
+            )
+        return replace(self, since_power_on_s=since_power_on_s)
 
     def between(self, start_s: float | None, end_s: float | None) -> Recording:
         """The stretch from `start_s` on and before `end_s`, seconds of the recording. Raises UserError for an empty

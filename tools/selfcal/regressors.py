@@ -11,16 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _library32
 from selfcal.errors import UserError
-from selfcal.forms import formed, variance_of
+from selfcal.forms import KIND, Source, made, played, source_of, variance_of
 from selfcal.model import Model, Regressor
 from selfcal.recording import Recording, as_float, bridged
 from selfcal.result import HALF_90, AxisResult, of_mixture
 
-#: `selfcal_column_kind_t`: names in C, by number.
-COLUMN_KINDS = ("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP", "TURN_ON", "PULSE")
-_TIME, _CHANNEL, _RATE, _SINE, _COSINE, _STEP, _TURN_ON, _PULSE = range(len(COLUMN_KINDS))
 #: End of a pulse that is over before the first row, s.
 OVER_S = 1e-6
 #: A subset of the regressors.
@@ -66,18 +62,18 @@ class Scored:
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module. forms.py makes the forms that it lacks of its
-    means. Time counts from the first row, s; a step, a pulse and a turn-on have the clock of the recording that the
-    rows were cut from. A column with a `window_s` is the mean over that time up to each row. A step is 1 from its time
-    on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the last `window_s`, in the
-    first window its gain since the first row, over `window_s`. Raises UserError for a column that is absent or of
-    another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. A play, which it lacks, is made of its means.
+    Time counts from the first row, s; a step and a pulse have the clock of the recording that the rows were cut from, a
+    turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each row. A step is 1 from
+    its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the last
+    `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a column that is
+    absent or of another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
     check_channels(regressors, recording)
     channels = channels_of(regressors)
-    whole, regressors = regressors, from_time(regressors, recording.start_s)
+    regressors = from_time(regressors, recording.start_s)
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
     values = [
         _varying(recording.in_unit(name, unit), missing) if by == "variance" else recording.in_unit(name, unit)
@@ -85,15 +81,11 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
     sources = [source for one in regressors for source in sources_of(one, channels)]
-    interval_s = 1.0 / recording.rate_hz
-    made = _library32.form(sources, interval_s, np.ascontiguousarray(rows, np.float32), missing)
-    columns = np.ascontiguousarray(made, np.float64)
+    columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
     place = 0
-    for one in whole:
-        columns[:, place] *= _left(one, recording.start_s)
-        if one.form != "static":
-            column = formed(columns[:, place], one.form, one.number, one.reference, interval_s, missing)
-            columns[:, place] = as_float(column)
+    for one in regressors:
+        if one.form == "play":
+            columns[:, place] = as_float(played(columns[:, place], one.width))
         place += len(one.columns)
     return columns
 
@@ -104,22 +96,16 @@ def _varying(values: NDArray[np.float64], missing: NDArray[np.uint64]) -> NDArra
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
-    """The regressors for a clock that begins at `start_s` of the one that their times are of. A turn-on's amplitude is
-    the one that is left there."""
+    """The regressors for a clock that begins at `start_s` of the one that their times are of."""
 
     def moved(one: Regressor) -> Regressor:
         if one.kind == "step":
             return replace(one, time_s=max(0.0, one.time_s - start_s))
         if one.kind == "pulse":
             return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(OVER_S, one.end_s - start_s))
-        return replace(one, sd={group: sd * _left(one, start_s) for group, sd in one.sd.items()})
+        return one
 
     return tuple(moved(one) for one in regressors)
-
-
-def _left(one: Regressor, start_s: float) -> float:
-    """The part of a turn-on that is left at a time, s; 1 of all others."""
-    return math.exp(-start_s / one.tau_s) if one.kind == "turn_on" else 1.0
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
@@ -142,30 +128,29 @@ def _channel(one: Regressor) -> tuple[str, str, str]:
     return one.column, one.channel_unit, one.input
 
 
-def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[tuple[int, int, float, float]]:
-    """Kind, channel, number and end of each of its columns: `selfcal_source_t`."""
+def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
+    """Of each of its columns."""
     if one.kind == "time":
-        return [(_TIME, 0, 0.0, 0.0)]
+        return [(KIND["TIME"], 0, 0.0, 0.0)]
     if one.kind == "step":
-        return [(_STEP, 0, one.time_s, 0.0)]
+        return [(KIND["STEP"], 0, one.time_s, 0.0)]
     if one.kind == "turn_on":
-        return [(_TURN_ON, 0, one.tau_s, 0.0)]
+        return [(KIND["TURN_ON"], 0, one.tau_s, 0.0)]
     if one.kind == "pulse":
-        return [(_PULSE, 0, one.start_s, one.end_s)]
+        return [(KIND["PULSE"], 0, one.start_s, one.end_s)]
     if one.kind == "periodic":
-        return [(_SINE, 0, one.frequency_hz, 0.0), (_COSINE, 0, one.frequency_hz, 0.0)]
+        return [(KIND[name], 0, one.frequency_hz, 0.0) for name in ("SINE", "COSINE")]
+    channel = channels.index(_channel(one))
     if one.kind == "rate":
-        return [(_RATE, channels.index(_channel(one)), one.window_s, 0.0)]
-    return [(_CHANNEL, channels.index(_channel(one)), one.mean_s, 0.0)]
+        return [(KIND["RATE"], channel, one.window_s, 0.0)]
+    return [source_of(one.form, channel, one.number, one.reference, one.mean_s)]
 
 
 def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     """float64[n]: mean of the last `window` values at each, of fewer at the beginning, as a module forms it."""
     if window <= 1:
         return values
-    rows = np.ascontiguousarray(values[:, None], np.float32)
-    made = _library32.form([(_CHANNEL, 0, float(window), 0.0)], 1.0, rows, np.zeros(values.size, np.uint64))
-    return np.asarray(made[:, 0], np.float64)
+    return made([(KIND["CHANNEL"], 0, float(window), 0.0)], 1.0, values[:, None])[:, 0]
 
 
 def offered(model: Model, axis: str) -> Choice:

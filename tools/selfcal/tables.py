@@ -76,9 +76,9 @@ class AxisTable:
 class RegressorTable:
     """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
 
-    `source`: kind, number and end (`selfcal_source_t`), and the channel's name and unit, "" without one. `ln_odds`
-    [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]: none is
-    0."""
+    `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without one.
+    `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]:
+    none is 0."""
 
     name: str
     unit: str
@@ -301,8 +301,8 @@ def _priors(group: Group, law: str) -> tuple[PriorRow, ...]:
 def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
     """Of a column by its place in the regressor."""
     channels = channels_of((regressor,))
-    kind, _, number, until = sources_of(regressor, channels)[place]
-    return kind, number, until, *(channels[0][:2] if channels else ("", ""))
+    kind, _, number, second = sources_of(regressor, channels)[place]
+    return kind, number, second, *(channels[0][:2] if channels else ("", ""))
 
 
 def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:

@@ -45,7 +45,7 @@ class Record:
     has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
     the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it.
     `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded. `moving` [n]: the raw
-    readings of an axis show that the sensor moved."""
+    readings of an axis show that the sensor moved. `since_power_on_s`: of the recording."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -60,6 +60,7 @@ class Record:
     start_s: float = 0.0
     roughness: Mapping[str, Array] = field(default_factory=dict)
     moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
+    since_power_on_s: float = 0.0
 
     @property
     def time_s(self) -> Array:
@@ -246,6 +247,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         recording.start_s,
         roughness,
         moving,
+        recording.since_power_on_s,
     )
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from rich.console import Console
 
 from selfcal.errors import UserError, remark
+from selfcal.forms import COLUMN_KINDS
 from selfcal.model import NOT_HANDLED, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
-from selfcal.regressors import COLUMN_KINDS
 from selfcal.tables import AxisTable, Grid, HypothesisTable, PriorRow, RegressorTable, Tables, gate_table, make_tables
 from selfcal.warm import load as load_start
 from selfcal.warm import warmed
@@ -105,9 +105,9 @@ def write_tables(model: Model, tables: Tables, folder: Path, target: str, start:
     UserError if it cannot be written, or if a regressor has a form that the library does not make."""
     for one in model.regressors:
         if not one.on_module:
-            what = f"form: {one.form}" if one.form != "static" else f"input: {one.input}"
+            what = f"form: {one.form}" if one.form == "play" else f"input: {one.input}"
             raise UserError(
-                f"{model.path}: regressor '{one.name}': no module makes `{what}` yet: leave the regressor out, or take "
+                f"{model.path}: regressor '{one.name}': no module makes `{what}`: leave the regressor out, or take "
                 "`identify`, which does"
             )
     try:
@@ -331,10 +331,10 @@ def _regressors(tables: Tables) -> list[str]:
 
 
 def _column_source(tables: Tables, column: RegressorTable) -> str:
-    kind, number, until, name, unit = column.source
+    kind, number, second, name, unit = column.source
     places = [*((axis.name, axis.unit) for axis in tables.axes), *tables.channels]
     channel = places.index((name, unit)) if name else 0
-    return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {channel}U, {_f(number)}, {_f(until)}}}"
+    return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {channel}U, {_f(number)}, {_f(second)}}}"
 
 
 def _gate(model: Model, tables: Tables) -> list[str]:

@@ -52,6 +52,7 @@ def diagnose(
     fail_on: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    since_power_on_s: float = 0.0,
     gate: bool = False,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
@@ -70,7 +71,8 @@ def diagnose(
     `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
-    only checked here. `start_s`, `end_s`, `gate`: as `identify` has them; times found are those of the whole recording.
+    only checked here. `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has them; times found are those of
+    the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
@@ -84,7 +86,7 @@ def diagnose(
         check_not_by_hand(write_model)
     loaded = Model.load(model)
     recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
-    recording = stretch_of(recording, loaded, start_s, end_s, gate)
+    recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     second = None
@@ -249,6 +251,7 @@ def _given(
     given = [("--axis", name) for name in axes]
     given += [] if model is None else [("--model", str(model))]
     given += [] if decimate is None else [("--decimate", f"{decimate:.15g}")]
+    given += [("--since-power-on", f"{recording.since_power_on_s:.15g}")] if recording.since_power_on_s else []
     return [*given, *recording.options]
 
 

@@ -57,6 +57,7 @@ def identify(
     fail_on: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    since_power_on_s: float = 0.0,
     gate: bool = False,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
@@ -73,7 +74,8 @@ def identify(
     `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
     `export`: a format of `selfcal.export` and the file to write. `suspicion`: look at the axes that are not adequate
     once more, for the cause that explains most. `fail_on`: see fail_on.py; it is only checked here.
-    `start_s`, `end_s`: the stretch of the recording to look at, s. `gate`: without the bank intervals in which the
+    `start_s`, `end_s`: the stretch of the recording to look at, s. `since_power_on_s`: from power-on to the recording's
+    beginning, s. `gate`: without the bank intervals in which the
     model's stationary gate sees motion.
     Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
     UserError for what the user can put right, and if no axis has a result.
@@ -94,7 +96,7 @@ def identify(
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
     recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
-    recording = stretch_of(recording, loaded_model, start_s, end_s, gate)
+    recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)

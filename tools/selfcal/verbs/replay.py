@@ -55,7 +55,7 @@ from selfcal.warm import Start, warmed
 from selfcal.warm import load as load_start
 from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus, reasons
 
-MAGIC = b"SELFCAL1"
+MAGIC = b"SELFCAL2"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
@@ -102,6 +102,7 @@ def replay(
     gate: bool = False,
     start_s: float | None = None,
     end_s: float | None = None,
+    since_power_on_s: float = 0.0,
     json: Path | str | None = None,
     plot: Path | str | None = None,
     rate: float | None = None,
@@ -120,7 +121,7 @@ def replay(
     between reports, one bank interval at least (default: a hundredth of it on the host, a tenth on the cortex-m4f, all
     of it on the cortex-m0). `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves
     time passes as a gap. `start_s`, `end_s`: the stretch of the recording to play, s; the firmware's clock begins with
-    it. `plot`: file for the picture of the run.
+    it. `since_power_on_s`: from power-on to the recording's beginning, s. `plot`: file for the picture of the run.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
@@ -144,10 +145,10 @@ def replay(
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
     recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
-    recording = recording.between(start_s, end_s)
+    recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))
-    recording = replace(recording, start_s=0.0)  # as the firmware has it
+    recording = replace(recording, start_s=0.0).later(since_power_on_s + known_s)  # as the firmware has it
     names = chosen_axes(recording, loaded_model, axes)
     recording = recording.along(*names)
     for name in names:
@@ -161,7 +162,7 @@ def replay(
     firmware = build(loaded_model, recording.rate_hz, names, target, start=known)
     history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
     document = _document(recording, loaded_model, history, why, gate)
-    document["recording"]["start_s"] = known_s
+    document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
     if json is not None:
         write_json(document, json)
     if plot is not None:
@@ -257,8 +258,15 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
         known = there or (name, unit) not in SIDE
         rows["value"][:, index] = as_float(recording.in_unit(name, unit)) if known else np.nan
     header = np.array(
-        [(MAGIC, len(axes), len(channels) + len(SIDE), recording.rate_hz, recording.samples)],
-        dtype=[("magic", "S8"), ("axes", "<u4"), ("channels", "<u4"), ("rate", "<f8"), ("rows", "<u8")],
+        [(MAGIC, len(axes), len(channels) + len(SIDE), recording.rate_hz, recording.samples, recording.powered)],
+        dtype=[
+            ("magic", "S8"),
+            ("axes", "<u4"),
+            ("channels", "<u4"),
+            ("rate", "<f8"),
+            ("rows", "<u8"),
+            ("powered", "<u8"),
+        ],
     )
     with path.open("wb") as file:
         file.write(header.tobytes())

@@ -106,9 +106,7 @@ def looks(state: State, record: Record) -> list[Look]:
     if worth < 1.0:
         return []
     added = tuple(
-        Regressor(
-            f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))}
-        )
+        Regressor(f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))})
         for one, row in zip(times, found, strict=True)
     )
     estimate = posterior(state, t, times, record, brief=True)
@@ -142,8 +140,9 @@ def _range(record: Record) -> tuple[float, float]:
 
 
 def _time(record: Record) -> Array:
-    """[n]: the middle of each sample's readings, s from the start of the recording."""
-    return record.time_s + record.start_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
+    """[n]: the middle of each sample's readings, s from power-on."""
+    begins = record.since_power_on_s + record.start_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
+    return record.time_s + begins
 
 
 def _decays(t: Array, tau: Array) -> Array:
@@ -199,7 +198,7 @@ def _refined(state: State, t: Array, tau: Array, record: Record) -> tuple[float,
 
 
 def posterior(state: State, t: Array, tau: Array, record: Record, brief: bool = False) -> dict[str, Any]:
-    """Amplitudes at the start of the recording and time constants, over the drifts, the spread of their parameters, and
+    """Amplitudes at power-on and time constants, over the drifts, the spread of their parameters, and
     the time constants. Of a `brief` one the drift is the best alone. A time constant's prior is flat in its logarithm,
     an amplitude's is flat."""
     low, high = _range(record)
