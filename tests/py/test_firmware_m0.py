@@ -287,15 +287,13 @@ def test_without_its_crystal() -> None:
 @pytest.mark.parametrize("kind", ["regressor", "two terms"])
 def test_an_extended_model_is_saved_again_and_again(kind: str, tmp_path: Path) -> None:
     """Its state is longer than the default model's, and so is the part of a slot that a save erases. After the third
-    save both slots have been written before."""
+    save both slots have been written before. A turn-on goes on through a reset, and begins anew with power."""
     tree = yaml.safe_load(Model.load().path.read_text())
     tree["bank_rate_hz"] = QUIET_BANK_HZ
     tree["groups"] = {"gyro": {**tree["groups"]["gyro"], "axes": ["gx"]}}
     tree["gate"]["N"] = {"gyro": 0.1}
     if kind == "regressor":
-        tree["regressors"] = [
-            {"name": "temperature", "kind": "column", "column": "temp", "unit": "degC", "sd": {"gyro": 0.02}}
-        ]
+        tree["regressors"] = [{"name": "settling", "kind": "turn_on", "tau_s": 250, "sd": {"gyro": 1}}]
     else:
         terms = {"probability": 1, "terms": ["markov", {"kind": "markov", "bandwidth": 17.5}]}
         tree["hypotheses"] = {"random_walk": 1, "two_markov": terms}
@@ -310,7 +308,14 @@ def test_an_extended_model_is_saved_again_and_again(kind: str, tmp_path: Path) -
     assert board.value("app.told.state_saves") >= 3
     assert board.value("app.told.state_save_failures") == 0
     samples = board.value("app.bank.counters.samples")
+    board.machine.reset("software")
+    board.run(0.4)
+    assert board.value("app.told.state_found") == 1
+    assert board.value("app.bank.powered") == 0
     board.power_cycle(board.retained())
     board.run(0.4)
     assert board.value("app.told.state_found") == 1  # the newest
     assert board.value("app.bank.counters.samples") > samples - 3 * QUIET_RATE_HZ
+    begun = int(board.value("app.bank.counters.samples")) + int(board.value("app.bank.counters.missing"))
+    since = (begun + int(board.value("app.bank.powered"))) % 2**64
+    assert 0 <= since <= 0.4 * QUIET_RATE_HZ
