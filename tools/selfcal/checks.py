@@ -68,8 +68,8 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if far ones recur at one value: their share, and the value `at` which.
     `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
-    `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the change of the
-    sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
+    `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
+    change of the sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
     factor = units.factor(group.unit, unit)
     checks: dict[str, dict[str, Any]] = {}
@@ -90,8 +90,8 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     if as_fed:
         if readings.stuck.any():
             checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}
-        if readings.change is not None:
-            ratio = readings.change.after_hz / readings.change.before_hz - 1.0
+        if readings.changes:
+            ratio = max((one.after_hz / one.before_hz - 1.0 for one in readings.changes), key=abs)
             checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}
         if readings.coarse > SPACING_MOST:
             checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}

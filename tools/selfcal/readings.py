@@ -1,4 +1,4 @@
-"""What the readings of a recording show by themselves: a change of rate, motion, held, stuck and clipped ones.
+"""What the readings of a recording show by themselves: changes of rate, motion, held, stuck and clipped ones.
 
 None of it needs a fit. `identify` and `diagnose` look at it once, at the recording's own rate, whatever they average.
 """
@@ -6,8 +6,9 @@ None of it needs a fit. `identify` and `diagnose` look at it once, at the record
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from selfcal.lattice import Lattice, lattice_of
 from selfcal.model import Group
 from selfcal.motion import Moved, loud
 from selfcal.recording import Column, Recording
-from selfcal.sampling import rate_change
+from selfcal.sampling import Change, rate_changes
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,7 +55,7 @@ ITERATIONS, SETTLED = 200, 1e-6
 
 @dataclass(frozen=True)
 class RateChange:
-    """The sampling rate changes once: `time_s`, the rates before and after, and the evidence in nats."""
+    """A change of the sampling rate: `time_s`, the rates before and after, and the evidence in nats."""
 
     time_s: float
     before_hz: float
@@ -114,7 +115,7 @@ class Readings:
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held_hz: float | None = None
-    change: RateChange | None = None
+    changes: tuple[RateChange, ...] = ()
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
         """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
@@ -138,9 +139,9 @@ class Readings:
 
 def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
-    even, change = evened(recording)
+    even, changes = evened(recording)
     own, held_hz = thinned(even, (axis,))
-    return replace(readings_of(own, axis, group), held_hz=held_hz, change=change)
+    return replace(readings_of(own, axis, group), held_hz=held_hz, changes=changes)
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
@@ -210,22 +211,24 @@ def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tup
 # ------------------------------------------------------------------------------------------------------ change of rate
 
 
-def evened(recording: Recording) -> tuple[Recording, RateChange | None]:
-    """The recording on one even grid, where its rate changes once: means over an interval that both rates share."""
+def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
+    """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
     if off is None or off.size < 60:
-        return recording, None
+        return recording, ()
     time = recording.time_s + off
-    found = rate_change(time) or _small_change(time, recording)
-    if found is None:
-        return recording, None
-    row, before_s, after_s, nats = found
-    change = RateChange(float(time[row] - time[0]), 1.0 / before_s, 1.0 / after_s, nats)
-    return _regridded(recording, time, row, before_s, after_s), change
+    found = rate_changes(time) or _small_change(time, recording)
+    if not found:
+        return recording, ()
+    rows = [one.row for one in found]
+    intervals = [found[0].before_s, *(one.after_s for one in found)]
+    return _regridded(recording, time, rows, intervals), tuple(
+        RateChange(float(time[one.row] - time[0]), 1.0 / one.before_s, 1.0 / one.after_s, one.nats) for one in found
+    )
 
 
-def _small_change(time: Array, recording: Recording) -> tuple[int, float, float, float] | None:
-    """The same of a change so small that the grid is known: the time stamps laid on it have a bend."""
+def _small_change(time: Array, recording: Recording) -> list[Change]:
+    """One change so small that the grid is known: the time stamps laid on it have a bend."""
     off = recording.off_grid_s
     assert off is not None
     k = np.arange(off.size)
@@ -240,34 +243,35 @@ def _small_change(time: Array, recording: Recording) -> tuple[int, float, float,
     change = float(lines[1][0] - lines[0][0]) / step
     bend = float(np.abs(off).max())
     if abs(change) < CLOCK_LEAST or bend < 3.0 * step or bend < 5.0 * scatter:
-        return None
+        return []
     # Random times walk off any grid. The slopes of pieces show how far.
     slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]
     if abs(change) * step < SLOPES_LEAST * math.hypot(*(float(one.std()) / math.sqrt(one.size) for one in slopes)):
-        return None
+        return []
     nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * step)) ** 2)
-    return at, step + float(lines[0][0]), step + float(lines[1][0]), nats
+    return [Change(at, step + float(lines[0][0]), step + float(lines[1][0]), nats)]
 
 
-def _regridded(recording: Recording, time: Array, row: int, before_s: float, after_s: float) -> Recording:
-    """Means of whole blocks of either side over an interval that both share; a block with a gap in it is missing."""
-    blocks = _common(before_s, after_s)
-    starts = []
-    first = 0
+def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals: Sequence[float]) -> Recording:
+    """Means of whole blocks over an interval that all parts share; a block with a gap in it is missing. `rows`: where
+    each part but the first begins; `intervals` of every part, s."""
+    blocks = _common(intervals)
+    cell_s = float(np.dot(blocks, intervals)) / len(blocks)
+    sizes = []
+    first, last_s = 0, -math.inf
     index = np.empty(time.size, np.int64)
-    for part, step, block in ((slice(0, row), before_s, blocks[0]), (slice(row, None), after_s, blocks[1])):
-        if time[part].size == 0:
-            continue
-        here = time[part]
-        rows = np.arange(here.size)
+    for (begin, end), step, block in zip(pairwise([0, *rows, time.size]), intervals, blocks, strict=True):
+        here = time[begin:end]
+        if last_s > -math.inf and here[0] - last_s > cell_s + step:  # a gap at the change itself
+            sizes.append(np.zeros(round((here[0] - last_s) / cell_s), np.int64))
+            first += sizes[-1].size
         gaps = np.rint(np.maximum(0.0, np.diff(here, prepend=here[0]) - 0.5 * step) / step).astype(np.int64)
         gaps = np.where(gaps > 1, gaps - 1, 0)  # a late stamp is no gap
-        at = (rows + np.cumsum(gaps)) // block
-        index[part] = first + at
-        starts.append((first, block))
-        first += int(at[-1]) + 1
-    size = np.full(first, starts[-1][1])
-    size[: starts[-1][0]] = starts[0][1]
+        at = (np.arange(here.size) + np.cumsum(gaps)) // block
+        index[begin:end] = first + at
+        sizes.append(np.full(int(at[-1]) + 1, block))
+        first, last_s = first + sizes[-1].size, float(here[-1])
+    size = np.concatenate(sizes)
     used = np.bincount(index, minlength=first)
     whole = np.flatnonzero(used == size)
     columns = {
@@ -278,7 +282,7 @@ def _regridded(recording: Recording, time: Array, row: int, before_s: float, aft
     }
     missing = np.diff(whole, prepend=-1) - 1
     missing[0] = 0
-    rate = float(f"{2.0 / (blocks[0] * before_s + blocks[1] * after_s):.10g}")
+    rate = float(f"{1.0 / cell_s:.10g}")
     moved = _with_moving(recording, np.searchsorted(index, whole), missing, time.size / first)
     return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
 
@@ -293,16 +297,16 @@ def _with_moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) 
     return {"moving_before": np.minimum(moved, missing), "moving": round(recording.moving / ratio)}
 
 
-def _common(before_s: float, after_s: float) -> tuple[int, int]:
-    """Samples before and after that take the same time: the fewest, else those that fit best within COMMON_S."""
-    best, least = (1, 1), math.inf
-    for count in range(1, max(1, int(COMMON_S / max(before_s, 1e-9))) + 1):
-        other = max(1, round(count * before_s / after_s))
-        off = abs(other * after_s / (count * before_s) - 1.0)
+def _common(intervals: Sequence[float]) -> tuple[int, ...]:
+    """Samples of each interval (s) that take the same time: the fewest, else those that fit best within COMMON_S."""
+    best, least, longest = (1,) * len(intervals), math.inf, max(*intervals, 1e-9)
+    for count in range(1, max(1, int(COMMON_S / longest)) + 1):
+        counts = tuple(max(1, round(count * longest / one)) for one in intervals)
+        off = max(abs(number * one / (count * longest) - 1.0) for number, one in zip(counts, intervals, strict=True))
         if off < COMMON_OFF:
-            return count, other
+            return counts
         if off < least:
-            best, least = (count, other), off
+            best, least = counts, off
     return best
 
 

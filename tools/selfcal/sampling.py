@@ -11,6 +11,8 @@ Stamps at random times, or in the bursts of a bus, lie on no grid. They have a m
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +41,9 @@ _PRICE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.15])
 #: A stamp that fits nowhere weighs as many missing samples.
 _ODD = 10
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
-_STEPS, _PIECES = 20, 100
+_STEPS, _PIECES = 20, 500
+#: A part of one rate must save so many squares of the scatter between neighbouring pieces.
+_PRICE_OF_PART = 40.0
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
 #: Stamps that need missing samples, or whose mean step is so much longer than the usual one, are asked for a grid.
@@ -69,9 +73,9 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
     record with gaps take about a second and 10^6 rows another; all others are fast.
     """
     steps = np.diff(time)
-    changed = rate_change(time) if rate is None else None
-    if changed is not None:
-        dt = min(changed[1:3])
+    changes = rate_changes(time) if rate is None else []
+    if changes:
+        dt = min(min(one.before_s, one.after_s) for one in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     window = max(1, min(_WINDOW, steps.size // 4))
     typical = float(np.median(time[window:] - time[:-window])) / window
@@ -114,44 +118,114 @@ def _mean_grid(steps: NDArray[np.float64]) -> Found:
     return dt, np.concatenate(([0], missing))
 
 
-def rate_change(time: NDArray[np.float64]) -> tuple[int, float, float, float] | None:
-    """Row, intervals (s) before and after, and evidence (nats) of one change of rate in stamps float64[n], s."""
+@dataclass(frozen=True)
+class Change:
+    """The first `row` at another rate, the intervals before and after it (s), and the evidence in nats."""
+
+    row: int
+    before_s: float
+    after_s: float
+    nats: float
+
+
+def rate_changes(time: NDArray[np.float64]) -> list[Change]:
+    """Every change of rate in stamps float64[n], s, in order of time. A rate that lasts less than two pieces of
+    n / _PIECES rows, or of 3 * _STEPS, is none."""
     n = time.size
     size = max(3 * _STEPS, n // _PIECES)
     if n < 6 * size:
-        return None
+        return []
     steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
     count = steps.size // size
     pieces = steps[: count * size].reshape(count, size)
     middle = np.quantile(pieces, 0.25, axis=1, keepdims=True)  # a lost row makes windows longer, and few shorter
     if not middle.min() > 0.0:
-        return None
+        return []
     # Quantiles of coarse stamps jump by a step of their lattice, means move with gaps: a change of rate does both.
     near = np.abs(pieces - middle) < 0.5 * middle
     value = np.log(middle[:, 0])
     mean = np.log((pieces * near).sum(axis=1) / near.sum(axis=1))
-    total, square = np.cumsum(value), np.cumsum(value**2)
-    k = np.arange(2, count - 1)
-    left = square[k - 1] - total[k - 1] ** 2 / k
-    right = square[-1] - square[k - 1] - (total[-1] - total[k - 1]) ** 2 / (count - k)
-    at = int(k[np.argmin(left + right)])
-    # The piece with the change in it belongs to neither side.
-    sides = (slice(0, at - 1 if at > 2 else at), slice(at + 1 if count - at > 2 else at, None))
-    before, after = (float(np.median(value[side])) for side in sides)
-    apart = abs(after - before)
-    means = float(np.median(mean[sides[1]]) - np.median(mean[sides[0]]))
-    scatter = max(
-        float(np.quantile(np.abs(value[side] - level), 0.9)) for side, level in zip(sides, (before, after), strict=True)
-    )
-    if apart < _CHANGE or apart < 6.0 * scatter or abs(means - (after - before)) > 0.3 * apart:
-        return None
-    first, last = max(0, (at - 2) * size), min(n - 1, (at + 2) * size + _STEPS)
-    # The bend: farthest from the line of the mean interval, gaps left out.
-    mean_step, each = 0.5 * (math.exp(before) + math.exp(after)), np.diff(time[first : last + 1])
-    line = np.cumsum(np.where(each < 1.5 * math.exp(max(before, after)), each - mean_step, 0.0))
-    row = first + 1 + int(np.argmax(line) if before > after else np.argmin(line))
-    exact = [_mean_step(part, math.exp(level)) for part, level in ((time[: row + 1], before), (time[row:], after))]
-    return row, exact[0], exact[1], min(1e6, 0.5 * n * apart**2 / max(scatter, 1e-3) ** 2)
+    parts = _constant(value, mean)
+    if len(parts) < 2:
+        return []
+    level = [math.exp(float(np.median(value[a:b]))) for a, b in parts]
+    ends = [0, *(_bend(time, *found, size) for found in zip(pairwise(parts), pairwise(level), strict=True)), n]
+    spans = [slice(a, b) for a, b in pairwise(ends)]
+    if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level):
+        return []
+    exact = [_mean_step(time[one.start : one.stop + 1], step) for one, step in zip(spans, level, strict=True)]
+    scatter = max(1e-3, _scatter(value, parts))
+    return [
+        Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
+        for row, intervals in zip(ends[1:-1], pairwise(exact), strict=True)
+    ]
+
+
+def _constant(value: NDArray[np.float64], mean: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """First piece and the piece after the last of every part of one rate. `value` and `mean` [pieces]: ln of the
+    interval by the quantile and by the mean. A piece with a change in it belongs to no part.
+
+    The sum of squares about the levels of the parts, and a price for each part, is the least (optimal partition).
+    """
+    count = value.size
+    total, square = (np.concatenate([[0.0], np.cumsum(one)]) for one in (value - value[0], (value - value[0]) ** 2))
+    noise = max(float(np.median(np.abs(np.diff(value)))), 0.05 * _CHANGE)
+    best, start = np.zeros(count + 1), np.zeros(count + 1, np.int64)
+    for end in range(1, count + 1):
+        begin = np.arange(end)
+        cost = square[end] - square[:end] - (total[end] - total[:end]) ** 2 / (end - begin)
+        each = best[:end] + cost / noise**2 + _PRICE_OF_PART
+        start[end] = int(each.argmin())
+        best[end] = each[start[end]]
+    ends = [count]
+    while ends[-1] > 0:
+        ends.append(int(start[ends[-1]]))
+    parts = [(a, b) for a, b in pairwise(ends[::-1]) if b - a > 1]
+    while len(parts) > 1:
+        scatter = _scatter(value, parts)
+        apart = [_apart(value, one, other) for one, other in pairwise(parts)]
+        means = [_apart(mean, one, other) for one, other in pairwise(parts)]
+        sound = [
+            abs(step) >= max(_CHANGE, 6.0 * scatter) and abs(both - step) <= 0.3 * abs(step)
+            for step, both in zip(apart, means, strict=True)
+        ]
+        if all(sound):
+            break
+        join = min((k for k in range(len(sound)) if not sound[k]), key=lambda k: abs(apart[k]))
+        parts[join : join + 2] = [(parts[join][0], parts[join + 1][1])]
+    return parts
+
+
+def _apart(value: NDArray[np.float64], one: tuple[int, int], other: tuple[int, int]) -> float:
+    """How far the level of a part is above the level of the part before."""
+    return float(np.median(value[slice(*other)]) - np.median(value[slice(*one)]))
+
+
+def _scatter(value: NDArray[np.float64], parts: list[tuple[int, int]]) -> float:
+    """Distance from the level of its part that one piece in ten exceeds, the largest of all parts of ten pieces and of
+    all together."""
+    off = [np.abs(value[a:b] - np.median(value[a:b])) for a, b in parts]
+    return max(float(np.quantile(one, 0.9)) for one in [np.concatenate(off), *(one for one in off if one.size >= 10)])
+
+
+def _bend(
+    time: NDArray[np.float64], parts: tuple[tuple[int, int], tuple[int, int]], level: tuple[float, float], size: int
+) -> int:
+    """First row of the second of two parts [first piece, piece after], with intervals `level`, s: the row farthest from
+    the line of the mean interval, gaps left out."""
+    (begin, a), (b, end) = parts
+    first = max(0, (max(begin + 1, a - 1)) * size)
+    last = min(time.size - 1, min(end, b + 2) * size + (_STEPS if end - b > 2 else 0))
+    each = np.diff(time[first : last + 1])
+    line = np.cumsum(np.where(each < 1.5 * max(level), each - 0.5 * sum(level), 0.0))
+    return first + 1 + int(np.argmax(line) if level[0] > level[1] else np.argmin(line))
+
+
+def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float]) -> bool:
+    """Whether a part is no slower one: it lies on the grid of the fastest part, and on none of its own interval."""
+    fastest = min(level)
+    heads = [(time[one][:_STRETCH], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
+    return any(not _even(head, step) and _even(head, fastest) for head, step in heads)
 
 
 def _mean_step(time: NDArray[np.float64], step: float) -> float:

@@ -98,23 +98,23 @@ def _repeats_of_earlier(state: State) -> float:
     return sum(float((state.y[k:] == state.y[:-k]).mean()) for k in (2, 3, 4)) / 3.0
 
 
-def rate_change(record: Record) -> Look | None:
-    """The sampling rate changes once. The record has means over an interval that both rates share."""
-    change = record.change
-    if change is None:
-        return None
-    rates = {"before_hz": change.before_hz, "after_hz": change.after_hz}
-    return Look(
-        "rate_change",
-        change.nats,
-        change.nats,
-        {
-            "time_s": interval(change.time_s, 0.5 / min(rates.values()), "s"),
-            **{key: interval(rate, 0.0, "Hz") for key, rate in rates.items()},
-        },
-        {},
-        when=(change.time_s, change.time_s),
-    )
+def rate_changes(record: Record) -> list[Look]:
+    """Changes of the sampling rate. The record has means over an interval that all rates share."""
+    return [
+        Look(
+            "rate_change",
+            change.nats,
+            change.nats,
+            {
+                "time_s": interval(change.time_s, 0.5 / min(change.before_hz, change.after_hz), "s"),
+                "before_hz": interval(change.before_hz, 0.0, "Hz"),
+                "after_hz": interval(change.after_hz, 0.0, "Hz"),
+            },
+            {},
+            when=(change.time_s, change.time_s),
+        )
+        for change in record.changes
+    ]
 
 
 def held_samples(record: Record, axis: str) -> Look | None:

@@ -150,11 +150,10 @@ def _integrity(
         moved, mask = integrity.motion(replace(record, axes=quiet), wild)
     for name in states if moved else ():
         states[name] = integrity.masked(states[name], mask).refit()
-    changed = integrity.rate_change(record)
+    changed = integrity.rate_changes(record)
     for name, one in found.items():
-        if changed is not None:
-            others = tuple(other for other in found if other != name)
-            one.findings.append(Finding(changed, 0, one.state, one.state, shared_with=others))
+        others = tuple(other for other in found if other != name)
+        one.findings.extend(Finding(look, 0, one.state, one.state, shared_with=others) for look in changed)
         for found_at in (look(record, name) for look in (integrity.held_samples, integrity.stuck, integrity.recurring)):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))

@@ -55,7 +55,7 @@ class Record:
     missing: Mapping[str, Missing] = field(default_factory=dict)
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
-    change: RateChange | None = None
+    changes: tuple[RateChange, ...] = ()
     unclipped: Mapping[str, Array] = field(default_factory=dict)
     start_s: float = 0.0
     roughness: Mapping[str, Array] = field(default_factory=dict)
@@ -97,7 +97,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
-    recording, change = evened(recording)
+    recording, changes = evened(recording)
     recording, held_hz = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
     clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
     base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
@@ -242,7 +242,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         gone,
         base.rate_hz,
         read,
-        change,
+        changes,
         unclipped,
         recording.start_s,
         roughness,

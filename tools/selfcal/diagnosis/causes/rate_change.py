@@ -1,4 +1,4 @@
-"""The sampling rate changes once. sampling.py finds the time."""
+"""The sampling rate changes. sampling.py finds the time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from selfcal.diagnosis.cause import Cause, Key, positive
 
 CAUSE = Cause(
     "rate_change",
-    "The sampling rate changes once.",
+    "The sampling rate changes.",
     "Look for what set the rate at that time; record at one rate.",
     no_gain="the record has one rate before and after",
     keys={
