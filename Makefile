@@ -23,6 +23,7 @@
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 #   make setup                  the set-up alone
+#   make setup-all              every reader of other programs' logs too (400 MB); `make test` runs it
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make lock [UPGRADE=1 | UPGRADE=name]
 #                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
@@ -109,12 +110,22 @@ lock:
 	cd tools && $(UV_COMPILE) --group dev --output-file requirements.txt pyproject.toml
 	cd tools && for group in $(OPTIONAL); do $(UV_COMPILE) --group $$group \
 	    --python-version 3.11 --constraint requirements.txt --output-file requirements-$$group.txt || exit 1; done
+	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --output-file requirements-all.txt pyproject.toml
 
 # Packages that few need, each group by itself: `make setup-rivals`, `make setup-cluster`.
 OPTIONAL := rivals cluster
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
 	$(PIP_INSTALL) --requirement tools/requirements-$*.txt
+
+# The readers of every form of log: all extras of tools/pyproject.toml.
+.PHONY: setup-all
+setup-all: setup
+	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 $(VENV)/all.stamp
+$(VENV)/all.stamp: tools/requirements-all.txt $(VENV)/requirements.stamp
+	@echo "readers of logs into $(VENV) (a minute)"
+	$(PIP_INSTALL) --requirement tools/requirements-all.txt
+	@touch $@
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
                           $(wildcard tools/selfcal/models/*.yaml)
@@ -144,7 +155,7 @@ TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
 TESTS_FIXED := $(foreach test,fixed block bank snapshot check intake,$(BUILD)/c/fixed/test_$(test))
 
-test: setup
+test: setup-all
 	@$(BIN)/python tests/run.py
 
 quick: setup
@@ -188,7 +199,7 @@ calibration: setup
 	    $(PYTEST) -s tests/py/test_calibration.py
 
 # Records of each kind of disturbed log; `make test` looks at a few.
-cases: setup
+cases: setup-all
 	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
 	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py tests/py/test_docs.py
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from selfcal.errors import UserError
+from selfcal.loaders import FORMATS, TEXT
 from selfcal.recording import load, parse_scales, save
-from selfcal.suffixes import ARRAYS, TEXT
 
 from conftest import shared_recording
 
@@ -536,5 +536,5 @@ def test_help_names_every_form_that_is_read() -> None:
 
     for verb in ("identify", "diagnose", "replay", "compare", "demo"):
         shown = " ".join(CliRunner().invoke(app, [verb, "--help"]).output.split())
-        for suffix in (*TEXT, *ARRAYS, ".gz of text"):
+        for suffix in (*TEXT, *(one for form in FORMATS for one in form.suffixes), ".gz of text"):
             assert suffix in shown, (verb, suffix)

@@ -15,7 +15,7 @@ from typer.exceptions import TyperException
 
 from selfcal.ending import Held, install, last_signal, leave
 from selfcal.errors import UserError, called, note, printable
-from selfcal.suffixes import READ, WRITTEN
+from selfcal.loaders import READ, WRITTEN
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
@@ -125,6 +125,11 @@ FailOn = Annotated[
 ]
 NoTime = Annotated[bool, typer.Option("--no-time", help="Leave the time column out; takes --rate")]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Skip lines of a text that are no rows, and count them")]
+Source = Annotated[
+    list[str] | None,
+    typer.Option("--source", metavar="NAME", help="Sensor to read of a log that has several (repeat for more)"),
+]
+Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE.dbc", help="Signals of a log of CAN frames")]
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
@@ -188,6 +193,8 @@ def identify(
     scale: Scale = None,
     no_time: NoTime = False,
     skip_bad: SkipBad = False,
+    source: Source = None,
+    dbc: Dbc = None,
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -217,6 +224,8 @@ def identify(
         scale=parse_scales(scale or ()),
         no_time=no_time,
         skip_bad=skip_bad,
+        source=source or (),
+        dbc=dbc,
     )
     show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
     _judge(result, fail_on)
@@ -255,6 +264,8 @@ def diagnose(
     scale: Scale = None,
     no_time: NoTime = False,
     skip_bad: SkipBad = False,
+    source: Source = None,
+    dbc: Dbc = None,
 ) -> None:
     """What the model gets wrong in a recording at rest, why, and what mending it gains."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -281,6 +292,8 @@ def diagnose(
         scale=parse_scales(scale or ()),
         no_time=no_time,
         skip_bad=skip_bad,
+        source=source or (),
+        dbc=dbc,
     )
     verb.show(result, to_stderr=str(json) == "-")
     _judge(result, fail_on)
@@ -305,6 +318,8 @@ def compare(
     start: Start = None,
     end: End = None,
     gate: Gate = False,
+    source: Source = None,
+    dbc: Dbc = None,
     json: Json = None,
 ) -> None:
     """What changed between recordings of one part, beyond what each leaves open."""
@@ -319,10 +334,46 @@ def compare(
         start_s=start,
         end_s=end,
         gate=gate,
+        source=source or (),
+        dbc=dbc,
         json=json,
     )
     verb.show(result, to_stderr=str(json) == "-")
     _judge(result, fail_on)
+
+
+@app.command()
+def convert(
+    log: Log,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help=f"Recording to write: {WRITTEN}", show_default=False)
+    ],
+    rate: Rate = None,
+    column: Column = None,
+    unit: Unit = None,
+    scale: Scale = None,
+    no_time: NoTime = False,
+    skip_bad: SkipBad = False,
+    source: Source = None,
+    dbc: Dbc = None,
+) -> None:
+    """Write a log of any form as a recording that every other program reads."""
+    from selfcal.recording import parse_pairs, parse_scales
+    from selfcal.verbs import convert as verb
+
+    result = verb.convert(
+        log,
+        output,
+        rate=rate,
+        columns=parse_pairs("--column", column or ()),
+        units=parse_pairs("--unit", unit or ()),
+        scale=parse_scales(scale or ()),
+        no_time=no_time,
+        skip_bad=skip_bad,
+        source=source or (),
+        dbc=dbc,
+    )
+    verb.show(result, output)
 
 
 @app.command()
@@ -358,6 +409,8 @@ def rivals(
     scale: Scale = None,
     no_time: NoTime = False,
     skip_bad: SkipBad = False,
+    source: Source = None,
+    dbc: Dbc = None,
 ) -> None:
     """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -394,6 +447,8 @@ def rivals(
         scale=parse_scales(scale or ()),
         no_time=no_time,
         skip_bad=skip_bad,
+        source=source or (),
+        dbc=dbc,
     )
     verb.show(result, to_stderr=str(json) == "-")
 
@@ -442,6 +497,8 @@ def replay(
     scale: Scale = None,
     no_time: NoTime = False,
     skip_bad: SkipBad = False,
+    source: Source = None,
+    dbc: Dbc = None,
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
     from selfcal.recording import parse_pairs, parse_scales
@@ -469,6 +526,8 @@ def replay(
         scale=parse_scales(scale or ()),
         no_time=no_time,
         skip_bad=skip_bad,
+        source=source or (),
+        dbc=dbc,
     )
     show(result, to_stderr=str(json) == "-")
 

@@ -1,4 +1,4 @@
-"""Recordings of a resting sensor: read, check, and write. `text_table.py` and `array_files.py` read the files.
+"""Recordings of a resting sensor: read, check, and write. The formats are read by `loaders/`.
 
 Text has one header row of `name[unit]`. An npz has one 1-D array a column, named like the header, or named plainly
 with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A text
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from copy import copy
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
@@ -22,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import units
-from selfcal.array_files import Members, mat, npz, parse_meta, r_data
 from selfcal.errors import UserError, note, short, shown
 from selfcal.limits import (
     LEAST_RATE_HZ,
@@ -34,9 +34,14 @@ from selfcal.limits import (
     read_text,
     reading,
 )
+from selfcal.loaders import WRITTEN, check_library, format_of
+from selfcal.loaders.child import tables_of
+from selfcal.loaders.headings import Meaning, Sensor, sensors_of, sides_of, split
+from selfcal.loaders.sources import Part, chosen
+from selfcal.loaders.table import Hints, Member, Table, parse_meta
+from selfcal.loaders.text_table import TextTable, is_clock, is_date
+from selfcal.loaders.texts import Text, texts_in
 from selfcal.output import together, whole
-from selfcal.suffixes import ARRAYS, READ, TEXT, WRITTEN
-from selfcal.text_table import TextTable, is_clock, is_date
 from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
 
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
@@ -49,24 +54,10 @@ SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Unit of a scaled LSB column where the scale states none, by the column's first letter.
 _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
-#: Headings of other programs, and name and unit here: EuRoC and Kalibr, PX4's ulog2csv.
-_FOREIGN: Mapping[str, tuple[str, str | None]] = {
-    **{f"w_RS_S_{axis}": (f"g{axis}", None) for axis in "xyz"},
-    **{f"a_RS_S_{axis}": (f"a{axis}", None) for axis in "xyz"},
-    **{f"gyro_rad[{place}]": (f"g{axis}", "rad/s") for place, axis in enumerate("xyz")},
-    **{f"accelerometer_m_s2[{place}]": (f"a{axis}", "m/s^2") for place, axis in enumerate("xyz")},
-}
-#: Characters of a known heading with its unit, at most.
-_LONGEST_KNOWN = 64
-#: Headings of a time column that states its unit, or holds dates.
-_TIMES = ("time", "timestamp")
 #: Where a sensor's axes stand at rest, 1 g is so long in these units; the share that it may be off, the share of the
 #: record that rests, and the seconds of a mean.
 _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
 _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
-
-#: What reads a file of arrays, by its suffix.
-_ARRAYS: Mapping[str, Callable[[Path], Members]] = dict(zip(ARRAYS, (npz, mat, r_data, r_data, r_data), strict=True))
 
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
@@ -318,8 +309,10 @@ def load(
     *,
     no_time: bool = False,
     skip_bad: bool = False,
+    source: Sequence[str] = (),
+    dbc: Path | str | None = None,
 ) -> Recording:
-    """Read a recording; of several files one, joined by their time stamps.
+    """Read a recording; of several files, or sensors of a log, one, joined by their time stamps.
 
     `rate`, Hz: needed without a `t` column; with one it must agree with it to 10 % and is taken as the true rate.
     `columns`: name here -> header in the file. `units`: name here -> unit; it takes the header's place.
@@ -327,6 +320,7 @@ def load(
     `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
     is left out if it cannot be read.
     `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
+    `source`: names of the sensors to read of a log that has several. `dbc`: what a log of CAN frames is decoded by.
     The recording's `notes` are printed on stderr.
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
@@ -337,11 +331,18 @@ def load(
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
     if len(paths) > 1 and (rate is not None or no_time):
         raise UserError("several files are joined by their time stamps: leave --rate and --no-time out")
-    headers = [_Header(one, columns, units, by_name, sensors, no_time, several=len(paths) > 1) for one in paths]
-    found = [_load(one, rate, header, skip_bad) for one, header in zip(paths, headers, strict=True)]
-    recording = found[0] if len(found) == 1 else _joined(found, headers)
+    hints = {} if dbc is None else {"dbc": str(dbc)}
+    headers = [_Header(one, columns, units, by_name, sensors, no_time) for one in paths]
+    for header in headers:
+        header.several = len(paths) > 1
+    found = [
+        part
+        for one, header in zip(paths, headers, strict=True)
+        for part in _load(one, rate, header, skip_bad, source, hints)
+    ]
+    recording = found[0] if len(found) == 1 else _joined(paths, found, headers[0])
     _check_gravity(recording, headers[0])
-    recording = replace(recording, options=_options(rate, columns, units, by_name, no_time, skip_bad))
+    recording = replace(recording, options=_options(rate, columns, units, by_name, no_time, skip_bad, source, dbc))
     for text in recording.notes:
         note(f"{recording.path}: {text}")
     return recording
@@ -354,6 +355,8 @@ def _options(
     scale: Mapping[str, Scale],
     no_time: bool,
     skip_bad: bool,
+    source: Sequence[str],
+    dbc: Path | str | None,
 ) -> tuple[tuple[str, str], ...]:
     """How a recording is read, as the command line says it."""
     given = [] if rate is None else [("--rate", f"{rate:.15g}")]
@@ -362,6 +365,8 @@ def _options(
     for name, (size, unit) in scale.items():
         text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
         given.append(("--scale", f"{name}={text}" if name else text))
+    given += [("--source", name) for name in source]
+    given += [] if dbc is None else [("--dbc", str(dbc))]
     given += [(option, "") for option, wanted in (("--no-time", no_time), ("--skip-bad", skip_bad)) if wanted]
     return tuple(given)
 
@@ -371,29 +376,54 @@ def list_of(paths: Path | str | Sequence[Path | str]) -> list[Path]:
     return [Path(paths)] if isinstance(paths, Path | str) else [Path(one) for one in paths]
 
 
-def _load(path: Path, rate: float | None, header: _Header, skip_bad: bool) -> Recording:
-    """One file."""
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
-    suffix = path.suffix.lower()
+def _load(
+    path: Path, rate: float | None, header: _Header, skip_bad: bool, wanted: Sequence[str], hints: Hints
+) -> list[Recording]:
+    """The sensors of one file that are meant, and the temperatures beside them, each by its own clock."""
     with reading(path, "not a sound recording"):
-        if suffix in _ARRAYS:
-            with path.open("rb") as stream:
-                if not stream.read(1):
-                    raise UserError(f"{path}: the file is empty")
-            return _load_arrays(path, rate, header, _ARRAYS[suffix](path))
-        if path.name.lower().removesuffix(".gz").endswith(TEXT):
-            return _load_text(path, rate, header, skip_bad)
-        path.open("rb").close()
-    raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
+        form = format_of(path)
+        if form is None:
+            parts = _text_parts(path, rate, header, skip_bad)
+        else:
+            check_library(path, form)
+            if form.library:
+                tables = tables_of(path, form, hints)
+            else:
+                tables = import_module(f"selfcal.loaders.{form.module}").read(path, hints)
+            parts = [part for table in tables for part in _table_parts(path, rate, header, table, len(tables) > 1)]
+        if not parts:
+            there = ", ".join(f"{one.source}: {', '.join(one.members)}" for one in tables)
+            raise UserError(
+                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}';"
+                " name yours with --column gx=NAME --unit gx=deg/s"
+            )
+        if wanted and not any(part.source for part in parts):
+            raise UserError(f"{path}: it has one source alone: leave --source out")
+        found, sides, notes = chosen(path, parts, wanted)
+        several = len(found) > 1
+        recordings = [part.read(several, part in sides) for part in found]
+    sound = [one for one in recordings if one is not None]
+    return [replace(sound[0], notes=(*notes, *sound[0].notes)), *sound[1:]]
 
 
-def _joined(found: Sequence[Recording], headers: Sequence[_Header]) -> Recording:
-    """Files of one recording as one: the columns of the fastest keep its clock, others have their own."""
-    main = max(found, key=lambda one: one.rate_hz)
-    paths = Path(" ".join(str(one.path) for one in found))
-    for header in headers:
-        header.check_options([name for one in found for name in one.columns])
+def _named(*names: str) -> str:
+    return "/".join(name for name in names if name)
+
+
+def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:
+    """Number of stamps, and the seconds that they span; of a foreign unit, 0."""
+    stamps = stamps[np.isfinite(stamps)] if stamps.dtype.kind == "f" else stamps
+    unit = units.plain(unit or "s")
+    size = units.factor(unit, "s") if units.known(unit) and units.same_kind(unit, "s") else 0.0
+    return stamps.size, float(int(stamps[-1]) - int(stamps[0]) if stamps.dtype.kind in "iu" else np.ptp(stamps)) * size
+
+
+def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) -> Recording:
+    """Parts of one recording as one: the columns of the fastest sensor keep its clock, others have their own."""
+    sensors = [one for one in found if not header.sensors or any(name in header.sensors for name in one.columns)]
+    main = max(sensors, key=lambda one: one.rate_hz)
+    paths = Path(" ".join(map(str, files)))
+    header.check_options([name for one in found for name in one.columns])
     for one in found:
         if one.started_s is None or main.started_s is None:
             raise UserError(f"{one.path}: there is no time column: several files are joined by their time stamps")
@@ -409,12 +439,14 @@ def _joined(found: Sequence[Recording], headers: Sequence[_Header]) -> Recording
         shift = one.started_s - main.started_s
         notes += one.notes
         for name, column in one.columns.items():
+            if name in columns and len(files) == 1 and name not in header.sensors:
+                continue  # each sensor's own temperature
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")
             clock = replace(one.clock_of(name), start_s=one.clock_of(name).start_s + shift)
             if clock.alike(main.clock):
                 columns[name] = replace(column, clock=None)
-            elif name in headers[0].sensors:
+            elif name in header.sensors:
                 columns[name] = replace(column, clock=clock)
             else:
                 columns[name] = replace(column, values=_bridged(clock, column.values, main.time_s), clock=None)
@@ -422,8 +454,8 @@ def _joined(found: Sequence[Recording], headers: Sequence[_Header]) -> Recording
         main,
         path=paths,
         columns=columns,
-        notes=(*notes, *_rates(columns, main.rate_hz)),
-        paths=tuple(one.path for one in found),
+        notes=(*dict.fromkeys(notes), *_rates(columns, main.rate_hz)),
+        paths=tuple(files) if len(files) > 1 else (),
     )
 
 
@@ -544,7 +576,7 @@ def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
     """`--scale` texts, `0.05`, `gx=0.05` or `gx=0.05[deg/s]`, as `load` takes them; the empty name is every column."""
     scales: dict[str, Scale] = {}
     for name, text in parse_pairs("--scale", [item if "=" in item else f"*={item}" for item in texts]).items():
-        number, unit = _split(text)
+        number, unit = split(text)
         try:
             scales["" if name == "*" else name] = (float(number), unit)
         except ValueError:
@@ -553,20 +585,13 @@ def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
     return scales
 
 
-def _split(text: str) -> tuple[str, str | None]:
-    """`name[unit]` or `name(unit)` in its parts; unit None without brackets."""
-    text = text.strip()
-    match = re.fullmatch(r"([^[]*)\[(.*)\]", text) or re.fullmatch(r"(.*?)\(((?:[^()]|\([^()]*\))*)\)", text)
-    return (match[1].strip(), match[2].strip()) if match else (text, None)
-
-
 def meta_place(path: Path) -> Path:
     """Where the metadata of a text recording stand: beside it. An npz holds its own."""
     return path.with_name(path.name + ".meta.json")
 
 
 class _Header:
-    """Works out from the keys of a file which columns to read, and in which unit."""
+    """Works out from the keys of a table which columns to read, and in which unit."""
 
     def __init__(
         self,
@@ -576,25 +601,46 @@ class _Header:
         scale: Mapping[str, Scale],
         sensors: Collection[str],
         no_time: bool,
-        *,
-        several: bool,
     ) -> None:
         self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
-        self.no_time, self.several = no_time, several
+        self.no_time = no_time
+        #: The table is not alone: a column may be in another.
+        self.several = False
         self.notes: list[str] = []
         #: Heading of a column of dates that is not taken for the time.
         self.dated = ""
         #: Columns whose unit the user states, or scales.
         self.decided = {*stated, *(scale if "" not in scale else sensors)}
 
-    def knows(self, keys: Sequence[str]) -> bool:
-        """Whether one of these headings is a sensor's."""
-        known = {*self.columns.values(), *self.sensors, *_FOREIGN}
-        return any(key in known or (len(key) <= _LONGEST_KNOWN and _split(key)[0] in known) for key in keys)
+    def of_part(self, several: bool) -> _Header:
+        """The same for one of the file's parts."""
+        one = copy(self)
+        one.several, one.notes = several, []
+        return one
 
-    def fields(self, keys: Sequence[str], where: str, described: Any, first: Sequence[str] = ()) -> list[_Field]:
+    def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
+        """Whether one of a line's headings is a sensor's, in a text."""
+        return lambda keys: any(key in self.columns.values() for key in keys) or bool(self.sensors_of(keys, text.name))
+
+    def sensors_of(self, keys: Sequence[str], file: str = "") -> list[Sensor]:
+        """The sensors of a table with these headings."""
+        taken = {}
+        for name, wanted in self.columns.items():
+            for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]:
+                taken[key] = name
+        return sensors_of(file or self.path.name, keys, self.sensors, taken)
+
+    def fields(
+        self,
+        keys: Sequence[str],
+        where: str,
+        described: Any,
+        first: Sequence[str] = (),
+        meant: Mapping[str, Meaning] | None = None,
+    ) -> list[_Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
-        what a meta text says of columns that are named plainly; `first`: the cells of the first row of a text."""
+        what a meta text says of columns that are named plainly; `first`: the cells of the first row of a text;
+        `meant`: what `sensors_of` found of the sensor."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
             raise UserError(f"{self.path}: meta: 'columns' must be a mapping of column names to unit and lsb")
         for key in keys:
@@ -603,8 +649,16 @@ class _Header:
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
         found: list[_Field] = []
-        for place, (key, (name, unit)) in enumerate(zip(keys, self._named(keys, renamed), strict=True)):
-            entry = described.get(_split(key)[0], {}) if unit is None else {}
+        for place, key in enumerate(keys):
+            name, unit = split(key)
+            size = 1.0
+            if key in renamed:
+                name = renamed[key]
+            elif meant is not None and key in meant:
+                name, unit, size = meant[key].name, meant[key].unit, meant[key].size
+            entry = described.get(split(key)[0], {}) if unit is None else {}
+            if unit is None and not entry:
+                entry = described.get(key, {})
             cell = first[place] if place < len(first) else ""
             dates = is_date(cell)
             if name == "t" and not self.no_time and not dates and is_clock(cell):
@@ -615,8 +669,9 @@ class _Header:
             if dates or is_clock(cell):
                 self.dated = self.dated or key
             if not (name == "t" and self.no_time):
+                lsb = entry.get("lsb", None if size == 1.0 else size)
                 found += self._field(
-                    key, name, entry.get("unit", unit), entry.get("lsb"), where, mapped=key in renamed, dates=dates
+                    key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates
                 )
         names = [field.name for field in found]
         fields = [field for field in found if not field.optional or names.count(field.name) == 1]
@@ -640,25 +695,10 @@ class _Header:
                 if name and name not in names and not (name == "t" and self.no_time):
                     raise UserError(f"{self.path}: {where}there is no column '{name}' for {option}")
 
-    def _named(self, keys: Sequence[str], renamed: Mapping[str, str]) -> list[tuple[str, str | None]]:
-        """Name here, and unit by the heading, of each column."""
-        split = [_FOREIGN[key] if key in _FOREIGN and key not in renamed else _split(key) for key in keys]
-        split = [
-            (_FOREIGN[name][0], unit) if name in _FOREIGN and key not in renamed else (name, unit)
-            for key, (name, unit) in zip(keys, split, strict=True)
-        ]
-        names = [renamed.get(key, name) for key, (name, _) in zip(keys, split, strict=True)]
-        times = [place for place, name in enumerate(names) if name.lower() in _TIMES]
-        if "t" not in names and len(times) == 1:
-            names[times[0]] = "t"
-            if split[times[0]][1] is None and any(key in _FOREIGN and "[" in key for key in keys):
-                split[times[0]] = ("t", "us")  # PX4's
-        return [(name, unit) for name, (_, unit) in zip(names, split, strict=True)]
-
     def _renamed(self, keys: Sequence[str], where: str) -> dict[str, str]:
         renamed: dict[str, str] = {}
         for name, wanted in self.columns.items():
-            matches = [key for key in keys if key == wanted] or [key for key in keys if _split(key)[0] == wanted]
+            matches = [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
             if not matches and self.several:
                 continue
             if not matches:
@@ -736,43 +776,155 @@ def _number(value: Any) -> float:
 # ----------------------------------------------------------------------------------------------------------- loaders
 
 
-def _load_text(path: Path, rate: float | None, header: _Header, skip_bad: bool) -> Recording:
-    with ExitStack() as files:
-        table = TextTable(path, files, header.knows, skip_bad=skip_bad)
-        meta = _meta_beside(path)
-        fields = header.fields(table.keys, table.where, {}, table.first)
-        dated = next((place for place, field in enumerate(fields) if field.dates), None)
-        read = table.columns([(field.key, field.name) for field in fields], [field.optional for field in fields], dated)
-    fields = [field for field, column in zip(fields, read, strict=True) if column is not None]
-    columns = [column for column in read if column is not None]
-    if meta.get("rows", columns[0].size) != columns[0].size:
-        what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
-        raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
-    if table.skipped:
-        header.notes.append(f"{table.skipped} lines are no rows and were skipped")
+def _text_parts(path: Path, rate: float | None, header: _Header, skip_bad: bool) -> list[Part]:
+    """The sensors of a text, or of the texts in a zip."""
+    found = []
+    for text in texts_in(path):
+        try:
+            with ExitStack() as files:
+                table = TextTable(text.path, files, header.knows_in(text), opened=text.open)
+        except UserError:
+            if text.optional:
+                continue
+            raise
+        sensors = header.sensors_of(table.keys, text.name)
+        if not sensors and text.optional:
+            continue
+        for sensor in sensors or [Sensor("", {})]:
+            others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
+            one = _Text(text, rate, header, skip_bad, sensor, others)
+            names = {meaning.name for meaning in sensor.meant.values()}
+            names |= {split(key)[0] for key in table.keys if key not in sensor.meant}
+            axes = frozenset(names & set(header.sensors))
+            found.append(Part(_named(text.source, sensor.source), axes, False, one.span, one.read))
+    return found
 
-    def fail(row: int, field: int | None, what: str) -> NoReturn:
-        table.fail(row, None if field is None else fields[field].name, what)
 
-    return _checked(path, rate, meta, fields, columns, fail, header, table.origin_s)
+@dataclass(frozen=True)
+class _Text:
+    """A sensor in a text. `others`: headings of other sensors."""
+
+    text: Text
+    rate: float | None
+    header: _Header
+    skip_bad: bool
+    sensor: Sensor
+    others: Collection[str]
+
+    def span(self) -> tuple[int, float]:
+        """Number of readings, and the seconds of them."""
+        one = self._read(True)
+        return one.samples, (one.samples - 1 + int(one.missing_before.sum())) / one.rate_hz
+
+    def read(self, several: bool, side: bool = False) -> Recording | None:
+        """The recording of this sensor; of the temperature only, None."""
+        return None if side else self._read(several)
+
+    def _read(self, several: bool) -> Recording:
+        header, path = self.header.of_part(several), self.text.path
+        with ExitStack() as files:
+            table = TextTable(
+                path, files, header.knows_in(self.text), skip_bad=self.skip_bad, opened=self.text.open
+            )
+            meta = dict(_meta_beside(path))
+            keys = [key for key in table.keys if key not in self.others]
+            first = [cell for key, cell in zip(table.keys, table.first, strict=False) if key not in self.others]
+            fields = header.fields(keys, table.where, {}, first, self.sensor.meant)
+            dated = next((place for place, field in enumerate(fields) if field.dates), None)
+            read = table.columns(
+                [(field.key, field.name) for field in fields], [field.optional for field in fields], dated
+            )
+        fields = [field for field, column in zip(fields, read, strict=True) if column is not None]
+        columns = [column for column in read if column is not None]
+        if meta.get("rows", columns[0].size) != columns[0].size:
+            what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
+            raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
+        if table.skipped:
+            header.notes.append(f"{table.skipped} lines are no rows and were skipped")
+        if "rate_hz" not in meta and (stated := table.stated_rate()) is not None:
+            meta["rate_hz"] = stated
+
+        def fail(row: int, field: int | None, what: str) -> NoReturn:
+            table.fail(row, None if field is None else fields[field].name, what)
+
+        return _checked(path, self.rate, meta, fields, columns, fail, header, table.origin_s)
 
 
 def _meta_beside(path: Path) -> Mapping[str, Any]:
     beside = meta_place(path)
     try:
         return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text"))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):  # the latter in a zip
         return {}
 
 
-def _load_arrays(path: Path, rate: float | None, header: _Header, members: Members) -> Recording:
-    arrays, meta = members
+def _table_parts(
+    path: Path, rate: float | None, header: _Header, table: Table, several: bool
+) -> list[Part]:
+    """The sensors of a table, and the temperature in one without any."""
+    sensors = header.sensors_of(list(table.members))
+    sides = sides_of(table.members) if several and not sensors else None
+    if several and not sensors and sides is None:
+        return []
+    found = []
+    for sensor in sensors or [sides or Sensor("", {})]:
+        others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
+        one = _Arrays(path, rate, header, replace(table, members=_without(table.members, others)), sensor, bool(sides))
+        names = {one._name(key) for key in one.table.members}
+        axes = frozenset(names & set(header.sensors))
+        found.append(Part(_named(table.source, sensor.source), axes, "temp" in names, one.span, one.read))
+    return found
+
+
+def _without(members: Mapping[str, Member], others: Collection[str]) -> dict[str, Member]:
+    return {key: member for key, member in members.items() if key not in others}
+
+
+@dataclass(frozen=True)
+class _Arrays:
+    """A sensor in a table of arrays; `side`: a temperature alone."""
+
+    path: Path
+    rate: float | None
+    header: _Header
+    table: Table
+    sensor: Sensor
+    side: bool
+
+    def _name(self, key: str) -> str:
+        return self.sensor.meant[key].name if key in self.sensor.meant else split(key)[0]
+
+    def span(self) -> tuple[int, float]:
+        """Number of readings, and the seconds of them."""
+        for key, member in self.table.members.items():
+            if self._name(key) == "t":
+                return _span(member.read(), self.sensor.meant.get(key, Meaning(*split(key))).unit)
+        return next((math.prod(one.shape) for one in self.table.members.values()), 0), 0.0
+
+    def read(self, several: bool, side: bool = False) -> Recording | None:
+        """The recording of this sensor, or of its temperature only; None for a temperature that cannot be read."""
+        header = self.header.of_part(several)
+        if not (self.side or side):
+            header.notes += self.table.notes
+            return _load_arrays(self.path, self.rate, header, self.table, self.sensor)
+        header.sensors, header.columns = [name for name, _ in SIDE_CHANNELS.values()], {}
+        members = {key: one for key, one in self.table.members.items() if self._name(key) in ("t", *header.sensors)}
+        try:
+            return _load_arrays(self.path, None, header, replace(self.table, members=members), self.sensor)
+        except UserError as error:
+            note(f"{error}; {self.table.source} is left out")
+            return None
+
+
+def _load_arrays(path: Path, rate: float | None, header: _Header, table: Table, sensor: Sensor) -> Recording:
+    arrays, meta = table.members, table.meta
     if not arrays:
         raise UserError(f"{path}: there are no columns")
-    fields = header.fields(list(arrays), "", meta.get("columns", {}))
+    where = f"{table.source}: " if table.source else ""
+    fields = header.fields(list(arrays), where, meta.get("columns", {}), (), sensor.meant)
     rows = math.prod(arrays[fields[0].key].shape)
     for field in fields:
-        member, column = arrays[field.key], f"{path}: column '{field.name}'"
+        member, column = arrays[field.key], f"{path}: {where}column '{field.name}'"
         if len(member.shape) != 1:
             raise UserError(f"{column} has {len(member.shape)} dimensions, not one")
         if member.dtype.kind not in "iuf":
@@ -780,13 +932,13 @@ def _load_arrays(path: Path, rate: float | None, header: _Header, members: Membe
         if member.shape[0] != rows:
             raise UserError(f"{column} has {member.shape[0]} rows, '{fields[0].name}' has {rows}")
     if rows < 2:
-        raise UserError(f"{path}: {'one row only' if rows else 'no rows'}, a recording needs two or more")
+        raise UserError(f"{path}: {where}{'one row only' if rows else 'no rows'}, a recording needs two or more")
     if rows * len(fields) > MOST_NUMBERS:
         raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns")
 
     def fail(row: int, field: int | None, what: str) -> NoReturn:
         column = "" if field is None else f"column '{fields[field].name}': "
-        raise UserError(f"{path}: row {row + 1}: {column}{what}")
+        raise UserError(f"{path}: {where}row {row + 1}: {column}{what}")
 
     started = 0.0
 

@@ -38,6 +38,8 @@ def compare(
     start_s: float | None = None,
     end_s: float | None = None,
     gate: bool = False,
+    source: Sequence[str] = (),
+    dbc: Path | str | None = None,
     json: Path | str | None = None,
 ) -> dict[str, Any]:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
@@ -45,8 +47,8 @@ def compare(
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; and the `verdicts` by recording and axis. An axis that two successive recordings do
     not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
-    `decimate`, `start_s`, `end_s`, `gate`: as `diagnose` has them, of each recording. `fail_on`: see fail_on.py; it is
-    only checked here.
+    `decimate`, `start_s`, `end_s`, `gate`, `source`, `dbc`: as `diagnose` has them, of each recording. `fail_on`: see
+    fail_on.py; it is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
@@ -56,6 +58,7 @@ def compare(
     seen = []
     verdicts: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
+    part |= {"source": source, "dbc": dbc}
     for log in logs:
         identified = identify(log, suspicion=False, **part)["axes"]
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]

@@ -60,6 +60,8 @@ def diagnose(
     scale: Mapping[str, Scale] | None = None,
     no_time: bool = False,
     skip_bad: bool = False,
+    source: Sequence[str] = (),
+    dbc: Path | str | None = None,
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
@@ -85,13 +87,17 @@ def diagnose(
     if write_model is not None:
         check_not_by_hand(write_model)
     loaded = Model.load(model)
-    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = load(
+        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
+    )
     recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     second = None
     if on is not None:
-        second = load(on, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+        second = load(
+            on, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
+        )
     first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)

@@ -111,6 +111,8 @@ def replay(
     scale: Mapping[str, Scale] | None = None,
     no_time: bool = False,
     skip_bad: bool = False,
+    source: Sequence[str] = (),
+    dbc: Path | str | None = None,
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
@@ -144,7 +146,9 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = load(
+        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
+    )
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))

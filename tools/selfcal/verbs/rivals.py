@@ -66,6 +66,8 @@ def rivals(
     scale: Mapping[str, Scale] | None = None,
     no_time: bool = False,
     skip_bad: bool = False,
+    source: Sequence[str] = (),
+    dbc: Path | str | None = None,
 ) -> dict[str, Any]:
     """Run the library and every other method of `selfcal.methods` on the same block means of each axis.
 
@@ -78,7 +80,9 @@ def rivals(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded = Model.load(model)
-    recording = load(log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad)
+    recording = load(
+        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
+    )
     names = chosen_axes(recording, loaded, axes)
     found: dict[str, Any] = {}
     console = Console(stderr=True)

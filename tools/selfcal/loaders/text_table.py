@@ -54,6 +54,13 @@ _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.AS
 _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
 
+#: A sampling rate in a comment, as Xsens writes it.
+_RATE = re.compile(r"(?:sampl\w+|update|output) ?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
+
+#: What opens a text in an archive: its bytes, and its packed size.
+Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
+
+
 class _Bad(Exception):
     """What is wrong with a row: the place of the column among those read (None: the whole row), and the text."""
 
@@ -65,12 +72,20 @@ class TextTable:
     """A table being read: `keys` are its headings, `first` the cells of its first row, `where` the header's line."""
 
     def __init__(
-        self, path: Path, files: ExitStack, knows: Callable[[Sequence[str]], bool], *, skip_bad: bool = False
+        self,
+        path: Path,
+        files: ExitStack,
+        knows: Callable[[Sequence[str]], bool],
+        *,
+        skip_bad: bool = False,
+        opened: Opened | None = None,
     ) -> None:
         """Read as far as the header. `files` closes the file. `knows`: whether a line of headings has a known one.
-        `skip_bad`: leave out lines that are no row, and count them as `skipped`. Raises UserError."""
+        `skip_bad`: leave out lines that are no row, and count them as `skipped`. `opened` opens a text in an archive.
+        Raises UserError."""
         self.path = path
-        self._lines = _Lines(path, _opened(path, files))
+        self._before: list[str] = []
+        self._lines = _Lines(path, *(_opened(path, files) if opened is None else opened(files)))
         header, number, self._row = self._header(knows)
         self._batch = self._lines.rest or self._lines.more()
         if not self._batch:
@@ -87,6 +102,11 @@ class TextTable:
     def skipped(self) -> int:
         """Lines that were left out."""
         return len(self._skipped)
+
+    def stated_rate(self) -> float | None:
+        """The rate, Hz, that a line before the header states."""
+        match = next(filter(None, (_RATE.search(line) for line in self._before)), None)
+        return float(match[1]) if match else None
 
     @property
     def origin_s(self) -> float:
@@ -175,6 +195,7 @@ class TextTable:
     def _begins(self, batch: list[str], header: int, row: int, text: str) -> tuple[str, int, int]:
         """The header `text` in line `header` of the first batch, the first row in line `row`, both from 0."""
         self._lines.rest = batch[row:]
+        self._before = batch[:header]
         return text, header + 1, row + 1
 
     def _separated(self, header: str, row: str, number: int) -> str:
@@ -388,8 +409,8 @@ def _unquoted(cell: str) -> str | None:
     return None if '"' in inner else inner
 
 
-def _opened(path: Path, files: ExitStack) -> BinaryIO:
-    """The text's bytes, unpacked; a large file shows how far it is read."""
+def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
+    """The text's bytes, unpacked, and its size if it is packed, else 0; a large file shows how far it is read."""
     raw: Any = files.enter_context(path.open("rb"))
     if not raw.peek(1):
         raise UserError(f"{path}: the file is empty")
@@ -398,22 +419,24 @@ def _opened(path: Path, files: ExitStack) -> BinaryIO:
     if size > _SLOW_BYTES and console.is_terminal:
         progress = wrap_file(raw, size, description="reading", console=console, transient=True)
         raw = files.enter_context(progress)
-    return cast(BinaryIO, files.enter_context(gzip.open(raw)) if path.suffix.lower() == ".gz" else raw)
+    if path.suffix.lower() == ".gz":
+        return cast(BinaryIO, files.enter_context(gzip.open(raw))), size
+    return cast(BinaryIO, raw), 0
 
 
 class _Lines:
     """The lines of a text, a block at a time. `number`: lines before the last block; `rest`: not used yet, of it."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
+    def __init__(self, path: Path, stream: BinaryIO, packed: int) -> None:
         self.path, self.stream = path, stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
-        self._packed, self._unpacked = path.stat().st_size if path.suffix.lower() == ".gz" else 0, 0
+        self._packed, self._unpacked = packed, 0
 
     def more(self) -> list[str]:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
         while not self.unfinished:
-            with reading(self.path, "not a whole gzip file"):
+            with reading(self.path, f"not a whole {'gzip' if self.path.suffix.lower() == '.gz' else 'zip'} file"):
                 block = self.stream.read(BLOCK_BYTES)
             data = self._carry + block
             end = data.rfind(b"\n") + 1 if block else len(data)

@@ -1,0 +1,387 @@
+"""Logs in the forms of other programs, of one drawn record, for `test_cases_logs.py`.
+
+A writer is `write_*(drawn, folder)`; it gives the path of its log. Where a format's library writes, it writes here.
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Numbers of a gyro, rad/s, and of an accelerometer, m/s^2: N, K, and the effect of a degree.
+N, K, PER_DEG = 2e-4, 1e-5, 2e-4
+N_A, K_A = 2e-3, 1e-4
+
+
+@dataclass
+class Drawn:
+    """A record at rest of six axes and a temperature: `gyro` [n, 3] rad/s, `accel` [n, 3] m/s^2, `t` s from 0.
+
+    White noise N and a random walk K; the temperature, by a cycle of 10 degrees, acts on gx by PER_DEG.
+    """
+
+    rate: float = 100.0
+    seconds: float = 1200.0
+    seed: int = 1
+    gyro: Array = field(init=False)
+    accel: Array = field(init=False)
+    temp: Array = field(init=False)
+    t: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng([44, self.seed])
+        n = round(self.rate * self.seconds)
+        self.t = np.arange(n) / self.rate
+        self.temp = 30.0 + 5.0 * np.sin(2.0 * np.pi * self.t / 300.0)
+
+        def drawn(white: float, walk: float) -> Array:
+            steps = walk / np.sqrt(self.rate) * random.standard_normal((n, 3))
+            return white * np.sqrt(self.rate) * random.standard_normal((n, 3)) + steps.cumsum(axis=0)
+
+        self.gyro = drawn(N, K) + np.array([0.01, -0.004, 0.002])
+        self.accel = drawn(N_A, K_A) + np.array([0.1, -0.2, 9.81])
+        self.gyro[:, 0] += PER_DEG * (self.temp - 30.0)
+
+    @property
+    def ns(self) -> NDArray[np.int64]:
+        """Stamps of the samples since 1970, ns."""
+        return 1_700_000_000_000_000_000 + np.rint(self.t * 1e9).astype(np.int64)
+
+    @property
+    def us(self) -> NDArray[np.int64]:
+        """Stamps since the part was switched on, us."""
+        return 5_000_000 + np.rint(self.t * 1e6).astype(np.int64)
+
+    def received(self) -> NDArray[np.int64]:
+        """When the messages reached a logger, ns: late, by a varying time, and by a clock of its own rate."""
+        late = np.random.default_rng(9).exponential(3e6, self.t.size)
+        return self.ns[0] + 40_000_000 + np.sort((1.003 * (self.ns - self.ns[0]) + late).astype(np.int64))
+
+
+# ----------------------------------------------------------------------------------------------------------------- text
+
+
+def _csv(path: Path, header: str, rows: list[list[str]], separator: str = ",") -> Path:
+    text = "\n".join(separator.join(row) for row in zip(*rows, strict=True))
+    path.write_text(f"{header}\n{text}\n", encoding="utf-8")
+    return path
+
+
+def _cells(values: Array, digits: int = 9) -> list[list[str]]:
+    return [[f"{value:.{digits}g}" for value in column] for column in values.T]
+
+
+def _ints(values: NDArray[np.int64]) -> list[str]:
+    return list(map(str, values.tolist()))
+
+
+def write_euroc(d: Drawn, folder: Path) -> Path:
+    header = "#timestamp [ns]," + ",".join(
+        [f"w_RS_S_{a} [rad s^-1]" for a in "xyz"] + [f"a_RS_S_{a} [m s^-2]" for a in "xyz"]
+    )
+    return _csv(folder / "data.csv", header, [_ints(d.ns), *_cells(d.gyro), *_cells(d.accel)])
+
+
+def write_ulog2csv(d: Drawn, folder: Path) -> Path:
+    header = "timestamp," + ",".join([f"gyro_rad[{k}]" for k in range(3)]) + ",gyro_integral_dt,"
+    header += ",".join([f"accelerometer_m_s2[{k}]" for k in range(3)])
+    rows = [_ints(d.us), *_cells(d.gyro), ["5000"] * d.t.size, *_cells(d.accel)]
+    return _csv(folder / "log_sensor_combined_0.csv", header, rows)
+
+
+def write_ulog2csv_gyro(d: Drawn, folder: Path) -> Path:
+    """Stamps of the message are late."""
+    header = "timestamp,timestamp_sample,device_id,x,y,z,temperature,error_count"
+    late = d.us + np.random.default_rng(3).integers(100, 4000, d.t.size)
+    rows = [_ints(late), _ints(d.us), ["2818058"] * d.t.size, *_cells(d.gyro), *_cells(d.temp[:, None], 6)]
+    return _csv(folder / "log_sensor_gyro_0.csv", header, [*rows, ["0"] * d.t.size])
+
+
+def write_rostopic(d: Drawn, folder: Path) -> Path:
+    names = ["orientation.x", "orientation.y", "orientation.z", "orientation.w"]
+    names += [f"orientation_covariance{k}" for k in range(9)]
+    fields = ["header.seq", "header.stamp", "header.frame_id", *names]
+    fields += [f"angular_velocity.{a}" for a in "xyz"] + [f"angular_velocity_covariance{k}" for k in range(9)]
+    fields += [f"linear_acceleration.{a}" for a in "xyz"] + [f"linear_acceleration_covariance{k}" for k in range(9)]
+    header = "%time," + ",".join(f"field.{one}" for one in fields)
+    n = d.t.size
+    rows = [_ints(d.received()), _ints(np.arange(n)), _ints(d.ns), ["imu_link"] * n, *([["0.0"] * n] * 13)]
+    rows += [*_cells(d.gyro), *([["0.0"] * n] * 9), *_cells(d.accel), *([["0.0"] * n] * 9)]
+    return _csv(folder / "imu.csv", header, rows)
+
+
+def write_plotjuggler(d: Drawn, folder: Path) -> Path:
+    """Joined by the time of receipt; a slower topic leaves its cells empty."""
+    names = [f"/imu/data/angular_velocity/{a}" for a in "xyz"]
+    names += ["/imu/data/header/stamp"] + [f"/imu/data/linear_acceleration/{a}" for a in "xyz"]
+    names += ["/imu/temperature/temperature"]
+    stamp = [f"{one // 10**9}.{one % 10**9:09d}" for one in d.ns.tolist()]
+    temp = [f"{value:.6g}" if k % 10 == 0 else "" for k, value in enumerate(d.temp)]
+    time = [f"{one / 1e9:.6f}" for one in d.received().tolist()]
+    rows = [time, *_cells(d.gyro), stamp, *_cells(d.accel), temp]
+    return _csv(folder / "plot.csv", ",".join(["__time", *names]), rows)
+
+
+def write_xsens(d: Drawn, folder: Path) -> Path:
+    names = [
+        "PacketCounter",
+        "SampleTimeFine",
+        *(f"Acc_{a}" for a in "XYZ"),
+        *(f"Gyr_{a}" for a in "XYZ"),
+        "Temperature",
+    ]
+    ticks = 123456 + np.rint(d.t * 1e4).astype(np.int64)
+    rows = [
+        _ints(np.arange(d.t.size) % 65536),
+        _ints(ticks),
+        *_cells(d.accel),
+        *_cells(d.gyro),
+        *_cells(d.temp[:, None]),
+    ]
+    comments = "// General information:\n//  MT Manager version: 2022.0\n// Update Rate: 100.0Hz\n"
+    return _csv(folder / "MT_0380-000.txt", comments + "\t".join(names), rows, "\t")
+
+
+def write_blackbox_csv(d: Drawn, folder: Path) -> Path:
+    """`blackbox_decode --unit-rotation deg/s`, which pads headings with a blank."""
+    names = ["loopIteration", "time (us)", *(f"gyroADC[{k}] (deg/s)" for k in range(3)), "motor[0]"]
+    rows = [_ints(np.arange(d.t.size) * 8), _ints(d.us), *_cells(np.degrees(d.gyro)), ["1000"] * d.t.size]
+    return _csv(folder / "LOG00001.01.csv", ", ".join(names), rows)
+
+
+def write_phyphox(d: Drawn, folder: Path) -> Path:
+    """Two sheets, the accelerometer slower, and what the app says of itself."""
+    path = folder / "phyphox.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, label, unit, values, step in (
+            ("Gyroscope", "Gyroscope {}", "rad/s", d.gyro, 1),
+            ("Accelerometer", "Acceleration {}", "m/s^2", d.accel, 2),
+        ):
+            header = ",".join([f'"{one}"' for one in ["Time (s)", *(f"{label.format(a)} ({unit})" for a in "xyz")]])
+            _csv(folder / "sheet.csv", header, [[f"{t:.9E}" for t in d.t[::step]], *_cells(values[::step])])
+            archive.write(folder / "sheet.csv", f"{name}.csv")
+        archive.writestr("meta/device.csv", '"property","value"\n"deviceModel","A phone"\n')
+        archive.writestr("meta/time.csv", '"event","experiment time"\n"START",0.0\n')
+    (folder / "sheet.csv").unlink()
+    return path
+
+
+def write_sensor_logger(d: Drawn, folder: Path) -> Path:
+    path = folder / "2024-01-01.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in (("Gyroscope", d.gyro), ("TotalAcceleration", d.accel), ("Accelerometer", 0.01 * d.accel)):
+            rows = [_ints(d.ns), _cells(d.t[:, None])[0], *_cells(values[:, ::-1])]
+            _csv(folder / "sheet.csv", "time,seconds_elapsed,z,y,x", rows)
+            archive.write(folder / "sheet.csv", f"{name}.csv")
+        archive.writestr("Metadata.csv", "version,device name\n3,a phone\n")
+        archive.writestr("Annotation.csv", "time,seconds_elapsed,text\n")
+    (folder / "sheet.csv").unlink()
+    return path
+
+
+# ------------------------------------------------------------------------------------------------------------------ ROS
+
+
+def _imu_messages(store: Any, d: Drawn, gyro: Array, accel: Array) -> Iterator[Any]:
+    types = store.types
+    Imu, Header, Time = (
+        types[name] for name in ("sensor_msgs/msg/Imu", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    Vector, Quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    cov = np.zeros(9)
+    first = {"seq": 0} if "seq" in Header.__dataclass_fields__ else {}
+    for ns, g, a in zip(d.ns.tolist(), gyro.tolist(), accel.tolist(), strict=True):
+        header = Header(**first, stamp=Time(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="imu_link")
+        yield Imu(header, Quaternion(0.0, 0.0, 0.0, 1.0), cov, Vector(*g), cov, Vector(*a), cov)
+
+
+def _temperatures(store: Any, d: Drawn, every: int) -> Iterator[tuple[int, Any]]:
+    types = store.types
+    Temperature, Header, Time = (
+        types[name] for name in ("sensor_msgs/msg/Temperature", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    first = {"seq": 0} if "seq" in Header.__dataclass_fields__ else {}
+    stamps = d.ns.tolist()
+    for k in range(0, d.t.size, every):
+        ns = stamps[k]
+        header = Header(**first, stamp=Time(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="imu_link")
+        yield k, Temperature(header, float(d.temp[k]), 0.0)
+
+
+def _bag(
+    bag: Any, store: Any, serialize: Callable[[Any, str], Any], d: Drawn, topics: dict[str, tuple[Array, Array]]
+) -> None:
+    """Topics of Imu, gyro and accelerometer each, and the temperature at a tenth of the rate."""
+    received = d.received().tolist()
+    kind = "sensor_msgs/msg/Imu"
+    opened = {name: bag.add_connection(name, kind, typestore=store) for name in topics}
+    temperature = bag.add_connection("/imu/temperature", "sensor_msgs/msg/Temperature", typestore=store)
+    streams = {name: _imu_messages(store, d, *values) for name, values in topics.items()}
+    late = dict(_temperatures(store, d, 10))
+    for k, when in enumerate(received):
+        for name, stream in streams.items():
+            bag.write(opened[name], when, serialize(next(stream), kind))
+        if k in late:
+            bag.write(temperature, when, serialize(late[k], "sensor_msgs/msg/Temperature"))
+
+
+def write_ros1(d: Drawn, folder: Path, topics: dict[str, tuple[Array, Array]] | None = None) -> Path:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    path = folder / "imu.bag"
+    bag = Writer(path)
+    bag.set_compression(Writer.CompressionFormat.LZ4)
+    with bag:
+        _bag(bag, store, store.serialize_ros1, d, topics or {"/imu/data": (d.gyro, d.accel)})
+    return path
+
+
+def write_ros2(
+    d: Drawn, folder: Path, topics: dict[str, tuple[Array, Array]] | None = None, mcap: bool = False
+) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    path = folder / ("ros2_mcap" if mcap else "ros2")
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    with Writer(path, version=9, storage_plugin=plugin) as bag:
+        _bag(bag, store, store.serialize_cdr, d, topics or {"/imu/data": (d.gyro, d.accel)})
+    return path
+
+
+def write_db3(d: Drawn, folder: Path) -> Path:
+    (found,) = write_ros2(d, folder).glob("*.db3")
+    return found
+
+
+def write_realsense(d: Drawn, folder: Path) -> Path:
+    """Gyro and accelerometer apart, the other's values 0."""
+    none = np.zeros_like(d.gyro)
+    return write_ros1(d, folder, {"/camera/gyro/sample": (d.gyro, none), "/camera/accel/sample": (none, d.accel)})
+
+
+# ----------------------------------------------------------------------------------------------------------------- ULog
+
+
+def ulog_of(
+    path: Path, topics: list[tuple[str, int, str, list[tuple[int, tuple[Any, ...]]]]], dropouts: int = 0
+) -> Path:
+    """A ULog file by PX4's description of the format: topics as (name, instance, fields, [(stamp, values)])."""
+    codes = {"uint64_t": "Q", "uint32_t": "I", "float": "f", "uint8_t": "B", "int16_t": "h"}
+
+    def message(kind: str, data: bytes) -> bytes:
+        return struct.pack("<HB", len(data), ord(kind)) + data
+
+    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
+    for name, fields in {name: fields for name, _, fields, _ in topics}.items():
+        out.append(message("F", f"{name}:{fields}".encode()))
+    layouts = []
+    for number, (name, instance, fields, _) in enumerate(topics):
+        out.append(message("A", struct.pack("<BH", instance, number) + name.encode()))
+        layout = ""
+        for part in fields.strip(";").split(";"):
+            kind = part.split(" ")[0]
+            count = int(kind[kind.index("[") + 1 : -1]) if "[" in kind else 1
+            layout += f"{count}{codes[kind.split('[')[0]]}"
+        layouts.append(struct.Struct(f"<H{layout}"))
+    items = [
+        (stamp, message("D", layouts[number].pack(number, stamp, *values)))
+        for number, topic in enumerate(topics)
+        for stamp, values in topic[3]
+    ]
+    items.sort(key=lambda one: one[0])
+    for _, data in items:
+        out.append(data)
+    out += [message("O", struct.pack("<H", 40))] * dropouts
+    path.write_bytes(b"".join(out))
+    return path
+
+
+GYRO = "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;float temperature;"
+ACCEL = GYRO
+COMBINED = (
+    "uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;float[3] accelerometer_m_s2;"
+    "uint32_t accelerometer_integral_dt;"
+)
+VEHICLE_IMU = (
+    "uint64_t timestamp;uint64_t timestamp_sample;float[3] delta_angle;float[3] delta_velocity;uint32_t delta_angle_dt;"
+    "uint32_t delta_velocity_dt;"
+)
+
+
+def of_sensor(d: Drawn, values: Array, every: int = 1, device: int = 7) -> list[tuple[int, tuple[Any, ...]]]:
+    """Messages of sensor_gyro or sensor_accel: written late."""
+    us = d.us
+    late = us + np.random.default_rng(5).integers(200, 3000, d.t.size).cumsum() % 3000 + 200
+    return [
+        (int(late[k]), (int(us[k]), device, *values[k].tolist(), float(d.temp[k])))
+        for k in range(0, d.t.size, every)
+    ]
+
+
+def write_ulog(d: Drawn, folder: Path) -> Path:
+    """`sensor_gyro` and `sensor_accel` of one instance."""
+    topics = [("sensor_gyro", 0, GYRO, of_sensor(d, d.gyro)), ("sensor_accel", 0, ACCEL, of_sensor(d, d.accel))]
+    return ulog_of(folder / "log.ulg", topics)
+
+
+def write_ulog_default(d: Drawn, folder: Path) -> Path:
+    """PX4's default set: `sensor_combined` in full, each sensor at a low rate, and drop-outs."""
+    combined = [
+        (int(us), (*g, 5000, *a, 5000)) for us, g, a in zip(d.us, d.gyro.tolist(), d.accel.tolist(), strict=True)
+    ]
+    topics = [("sensor_combined", 0, COMBINED, combined), ("sensor_gyro", 0, GYRO, of_sensor(d, d.gyro, 100))]
+    topics.append(("sensor_accel", 0, ACCEL, of_sensor(d, d.accel, 100)))
+    return ulog_of(folder / "flight.ulg", topics, dropouts=3)
+
+
+def write_vehicle_imu(d: Drawn, folder: Path) -> Path:
+    dt = 1.0 / d.rate
+    messages = [
+        (int(us) + 300, (int(us), *(dt * g).tolist(), *(dt * a).tolist(), round(dt * 1e6), round(dt * 1e6)))
+        for us, g, a in zip(d.us, d.gyro, d.accel, strict=True)
+    ]
+    return ulog_of(folder / "vehicle.ulg", [("vehicle_imu", 0, VEHICLE_IMU, messages)])
+
+
+def write_ulog_rewritten(d: Drawn, folder: Path) -> Path:
+    """As pyulog writes it."""
+    from pyulog import ULog
+
+    path = folder / "again.ulg"
+    ULog(str(write_ulog(d, folder))).write_ulog(str(path))
+    return path
+
+
+#: Writers by format, of logs that open without an option.
+WRITERS: dict[str, Callable[[Drawn, Path], Path]] = {
+    "euroc": write_euroc,
+    "ulog2csv": write_ulog2csv,
+    "ulog2csv_gyro": write_ulog2csv_gyro,
+    "rostopic": write_rostopic,
+    "plotjuggler": write_plotjuggler,
+    "xsens": write_xsens,
+    "blackbox_csv": write_blackbox_csv,
+    "phyphox": write_phyphox,
+    "sensor_logger": write_sensor_logger,
+    "ros1": write_ros1,
+    "ros2": write_ros2,
+    "db3": write_db3,
+    "realsense": write_realsense,
+    "ulog": write_ulog,
+    "ulog_default": write_ulog_default,
+    "vehicle_imu": write_vehicle_imu,
+    "ulog_rewritten": write_ulog_rewritten,
+}

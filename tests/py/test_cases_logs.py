@@ -1,0 +1,310 @@
+"""Logs of other programs open as they are: `selfcal identify FILE`, without an option.
+
+Truth: one record, drawn by `logs.py`, that every writer puts into its own form. Formats with a library that writes are
+written by it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import logs
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from selfcal.errors import UserError
+from selfcal.loaders import FORMATS, Format, child, format_of
+from selfcal.loaders.table import Hints
+from selfcal.recording import Recording, load
+from selfcal.verbs.convert import convert
+from selfcal.verbs.identify import identify
+
+from conftest import case_records, run
+
+#: Interval of the writers' least exact stamps against a clock: the rate is asked for to 1e-4.
+RATE = 1e-4
+#: Writers whose logs have no accelerometer, and no temperature.
+NO_ACCEL = ("ulog2csv_gyro", "blackbox_csv")
+WARM = (
+    "ulog2csv_gyro",
+    "plotjuggler",
+    "xsens",
+    "ros1",
+    "ros2",
+    "db3",
+    "realsense",
+    "ulog",
+    "ulog_default",
+    "ulog_rewritten",
+)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> logs.Drawn:
+    return logs.Drawn(seconds=20.0, seed=2)
+
+
+def in_si(recording: Recording, name: str) -> np.ndarray:
+    return recording.in_unit(name, "rad/s" if name[0] == "g" else "m/s^2")
+
+
+@pytest.mark.parametrize("name", logs.WRITERS)
+def test_a_log_opens_as_it_is(name: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Every reading of every axis, to the digits of the form (float32 at the worst), on a clock of the true rate; the
+    temperature to the steps that a slower channel is bridged by."""
+    recording = load(logs.WRITERS[name](drawn, tmp_path))
+    assert recording.rate_hz == pytest.approx(drawn.rate, rel=RATE)
+    assert recording.samples == drawn.t.size
+    assert recording.lost == 0
+    for letter, truth in (("g", drawn.gyro), ("a", drawn.accel)):
+        if letter == "a" and name in NO_ACCEL:
+            assert "ax" not in recording.columns
+            continue
+        for place, axis in enumerate("xyz"):
+            one = recording.columns[letter + axis]
+            step = round(drawn.rate / recording.clock_of(letter + axis).rate_hz)
+            expected = truth[::step, place]
+            # Steps of a float32 at 9.81 m/s^2, and nine digits.
+            assert in_si(recording, letter + axis) == pytest.approx(expected, rel=3e-7, abs=1e-9), one.name
+    if name in WARM:
+        # A degree takes 9.5 s at its fastest; thinned out a hundred times, the last second is held.
+        assert np.abs(recording.columns["temp"].values - drawn.temp).max() < 0.11
+    else:
+        assert "temp" not in recording.columns
+
+
+@pytest.mark.parametrize("name", logs.WRITERS)
+def test_numbers_of_a_log(name: str, tmp_path: Path) -> None:
+    """20 min: N and K of gy lie in their 90 % intervals as often as these state. In `make test` one log of each kind of
+    reader, and no count."""
+    records = case_records(0, 20)
+    if not records and name not in ("ulog", "euroc"):
+        pytest.skip("in make cases")
+    held = dict.fromkeys(("N", "K"), 0)
+    for seed in range(max(1, records)):
+        log = logs.WRITERS[name](logs.Drawn(seed=100 + seed), tmp_path)
+        axis = identify(log, axes=("gy",), suspicion=False)["axes"]["gy"]
+        for key, truth in (("N", logs.N), ("K", logs.K)):
+            found = axis["parameters"]["random_walk"][key]
+            size = np.radians(1.0) if found["unit"].startswith("deg") else 1.0
+            assert abs(found["median"] * size - truth) < 5.0 * found["sd"] * size
+            held[key] += found["q05"] * size <= truth <= found["q95"] * size
+    if records:
+        print(name, held, "of", records)
+        assert all(binom.cdf(count, records, 0.9) > 1e-3 for count in held.values())
+
+
+@pytest.mark.parametrize("form", ["ros1", "ros2"])
+def test_several_imus_are_listed(form: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """One line with rate and length, and what to type for each; what it says to type works."""
+    write = {"ros1": logs.write_ros1, "ros2": logs.write_ros2}[form]
+    log = write(drawn, tmp_path, {"/left/imu": (drawn.gyro, drawn.accel), "/right/imu": (-drawn.gyro, drawn.accel)})
+    done = run("identify", log)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    for source in ("/left/imu", "/right/imu"):
+        assert f"--source '{source}' (gx gy gz ax ay az; 100 Hz, 19.99 s)" in line
+    recording = load(log, source=["/right/imu"])
+    assert in_si(recording, "gy") == pytest.approx(-drawn.gyro[:, 1])
+    assert ("--source", "/right/imu") in recording.options
+    with pytest.raises(UserError, match=r"there is no source '/up/imu'; give --source '/left/imu'"):
+        load(log, source=["/up/imu"])
+    with pytest.raises(UserError, match=r"axis '..' is in more than one of the sources"):
+        load(log, source=["/left/imu", "/right/imu"])
+
+
+def test_instances_of_a_ulog_are_not_mixed(drawn: logs.Drawn, tmp_path: Path) -> None:
+    topics = []
+    for instance, sign in ((0, 1.0), (1, -1.0)):
+        topics.append(("sensor_gyro", instance, logs.GYRO, logs.of_sensor(drawn, sign * drawn.gyro)))
+        topics.append(("sensor_accel", instance, logs.ACCEL, logs.of_sensor(drawn, sign * drawn.accel)))
+    log = logs.ulog_of(tmp_path / "two.ulg", topics)
+    with pytest.raises(UserError, match=r"--source 'sensor.0'.*--source 'sensor.1'"):
+        load(log)
+    recording = load(log, source=["sensor.1"])
+    for name, truth in (("gx", -drawn.gyro[:, 0]), ("az", -drawn.accel[:, 2])):
+        assert in_si(recording, name) == pytest.approx(truth, rel=3e-7)
+
+
+def test_samples_of_a_fifo(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Eight samples a message, the stamp that of the last; counts times `scale`."""
+    fields = "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float dt;float scale;uint8_t samples;"
+    fields += "".join(f"int16_t[32] {axis};" for axis in "xyz")
+    scale, dt = 1e-4, 1e6 / drawn.rate
+    counts = np.rint(drawn.gyro / scale).astype(int)
+    messages = []
+    for k in range(0, drawn.t.size - 7, 8):
+        padded = np.zeros((32, 3), int)
+        padded[:8] = counts[k : k + 8]
+        last = int(drawn.us[k + 7])
+        messages.append((last + 150, (last, 7, dt, scale, 8, *padded.T.ravel().tolist())))
+    recording = load(logs.ulog_of(tmp_path / "fifo.ulg", [("sensor_gyro_fifo", 0, fields, messages)]))
+    assert recording.rate_hz == pytest.approx(drawn.rate, rel=RATE)
+    assert in_si(recording, "gz") == pytest.approx(scale * counts[:, 2], rel=1e-6)
+
+
+def test_a_topic_without_stamps_is_refused(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """The bag's own times are when messages came: they are no stamps."""
+
+    class Unstamped(logs.Drawn):
+        @property
+        def ns(self) -> np.ndarray:
+            return np.zeros(self.t.size, np.int64)
+
+    log = logs.write_ros1(Unstamped(seconds=3.0), tmp_path)
+    with pytest.raises(UserError, match=r"there is no time column: .*give --rate HZ"):
+        load(log)
+    assert load(log, rate=100.0).samples == 300
+
+
+def test_a_driver_that_takes_turns(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """One topic with the gyro and the accelerometer in turn, the other's values 0: zeros are no readings."""
+    gyro, accel = drawn.gyro.copy(), drawn.accel.copy()
+    gyro[1::2], accel[::2] = 0.0, 0.0
+    recording = load(logs.write_ros1(drawn, tmp_path, {"/imu": (gyro, accel)}))
+    for name, truth in (("gx", gyro[::2, 0]), ("az", accel[1::2, 2])):
+        values = in_si(recording, name)
+        assert values[np.isfinite(values)] == pytest.approx(truth)
+
+
+def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = logs.write_ulog(drawn, tmp_path)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install 'selfcal\[px4\]'"):
+        load(log)
+
+
+@pytest.mark.parametrize("output", ["x.npz", "x.csv"])
+@pytest.mark.parametrize("name", ["ros2", "phyphox"])
+def test_convert(name: str, output: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """What is written reads back: the same axes at the same rates."""
+    log = logs.WRITERS[name](drawn, tmp_path)
+    done = run("convert", log, "-o", tmp_path / output)
+    assert done.returncode == 0, done.stderr
+    assert "2,000 rows, 100 Hz, 20 s" in done.stdout
+    before, after = load(log), load(tmp_path / output)
+    assert list(before.columns) == list(after.columns)
+    for column in before.columns:
+        assert after.clock_of(column).rate_hz == pytest.approx(before.clock_of(column).rate_hz, rel=1e-9)
+        assert after.columns[column].values == pytest.approx(before.columns[column].values, rel=1e-8)
+    with pytest.raises(UserError, match="is the log itself"):
+        convert(log, log)
+
+
+# -------------------------------------------------------------------------------------------------------------- hostile
+
+
+def forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
+    """As the product's child, without the start of a new Python for each file."""
+    number = os.fork()
+    if number == 0:
+        code = 70
+        try:
+            for stream in (1, 2):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+            child.answer(one.module, path, place, hints)
+            code = 0
+        finally:
+            os._exit(code)
+    status = os.waitpid(number, 0)[1]
+    return os.waitstatus_to_exitcode(status)
+
+
+def mutated(random: np.random.Generator, whole: bytes) -> bytes:
+    """A copy that is cut, has bytes changed, a piece twice or left out, or 0xff in a place."""
+    data = bytearray(whole)
+    at = int(random.integers(len(data)))
+    length = int(random.integers(1, 200))
+    match int(random.integers(6)):
+        case 0:
+            del data[at:]
+        case 1:
+            for where in random.integers(0, len(data), 1 + int(random.integers(20))):
+                data[where] = int(random.integers(256))
+        case 2:
+            data[at:at] = data[at : at + length]
+        case 3:
+            del data[at : at + length]
+        case 4:
+            data[at : at + 8] = b"\xff" * 8
+        case _:  # most of what a reader believes is at the begin
+            for where in random.integers(0, min(len(data), 400), 3):
+                data[where] = int(random.integers(256))
+    return bytes(data)
+
+
+#: Writers of binary logs, one a format and storage.
+BINARY = ("ros1", "db3", "ulog", "phyphox")
+
+
+@pytest.mark.parametrize("name", BINARY)
+def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording, or a line that the user can read; in seconds."""
+    random = np.random.default_rng([7, len(name)])
+    log = logs.WRITERS[name](logs.Drawn(seconds=0.5, seed=3), tmp_path)
+    monkeypatch.setattr(child, "_spawned", forked)
+    whole = log.read_bytes()
+    one = format_of(log)
+    if one is not None:
+        import_module(f"selfcal.loaders.{one.module}").read(log, {})  # so that each child has the library
+    refused, copies = 0, case_records(20, 1000)
+    for _ in range(copies):
+        log.write_bytes(mutated(random, whole))
+        begun = time.monotonic()
+        try:
+            load(log)
+        except UserError as error:
+            refused += 1
+            assert "\n" not in str(error)
+            assert str(log) in str(error)
+        assert time.monotonic() - begun < 20.0
+    assert refused > 0
+    print(f"{name}: {refused} of {copies} refused")
+
+
+@pytest.mark.parametrize(
+    ("does", "line"),
+    [
+        ("while True: pass", "reading it takes more than"),
+        ("bytearray(64 << 30)", "too large for this machine's memory"),
+        ("import os; os.kill(os.getpid(), 9)", "not a sound ULog file: pyulog fails at it (signal 9)"),
+        ("raise ValueError('of no kind')", "of no kind"),
+    ],
+)
+def test_a_reader_is_bounded(does: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child, "_spawned", forked)
+    monkeypatch.setattr(child, "_LEAST_S", 1.0)
+
+    def read(path: Path, hints: Hints) -> list[object]:
+        exec(does)
+        return []
+
+    monkeypatch.setattr("selfcal.loaders.ulog.read", read)
+    log = tmp_path / "log.ulg"
+    log.write_bytes(b"ULog\x01\x12\x35")
+    with pytest.raises(UserError) as found:
+        load(log)
+    assert line in str(found.value)
+
+
+def test_the_child_is_a_process_of_its_own(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """The library of a format is not in this process: `identify` of a ULog imports no pyulog."""
+    log = logs.write_ulog(drawn, tmp_path)
+    code = f"import sys; from selfcal.recording import load; load({str(log)!r}); print('pyulog' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "False"
+
+
+def test_formats_are_rows() -> None:
+    """Suffixes belong to one format, and each format's module reads."""
+    suffixes = [suffix for one in FORMATS for suffix in one.suffixes]
+    assert len(set(suffixes)) == len(suffixes)
+    for one in FORMATS:
+        assert callable(import_module(f"selfcal.loaders.{one.module}").read)
+        assert bool(one.library) == bool(one.extra)

@@ -1,0 +1,93 @@
+"""Formats of recordings: a row each. The library that reads a format is imported only for a file of it.
+
+A format is a module of this folder with `read(path, hints)`, which gives the tables of a file. One that reads by a
+library of others runs in a child process (`child.py`). Text is read by `text_table.py`. `headings.py` knows what other
+programs call their columns, `sources.py` chooses among several sensors of a log.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from selfcal.errors import UserError
+
+#: Text, each with .gz too.
+TEXT = (".csv", ".tsv", ".txt", ".log")
+#: Texts of a phone's app together.
+ZIP = ".zip"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
+
+    `module` reads it. `library` is its import name, and `extra` the group of `pip install` that brings it; both are
+    empty where the light installation reads it, in this process.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    module: str
+    magic: tuple[tuple[int, bytes], ...] = ()
+    library: str = ""
+    extra: str = ""
+
+
+FORMATS = (
+    Format("an npz file", (".npz",), "npz"),
+    Format("a MATLAB file", (".mat",), "matlab"),
+    Format("an R file", (".rda", ".rdata", ".rds"), "r_data"),
+    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags", "ros"),
+    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog", "px4"),
+)
+
+#: How a message lists what is read, and what is written.
+READ = (
+    f"{', '.join((*TEXT, ZIP, *(suffix for one in FORMATS for suffix in one.suffixes)))}; .gz of text; a ROS 2 folder"
+)
+WRITTEN = ".csv, .csv.gz or .npz"
+
+#: Bytes from a file's begin that tell its format.
+_HEAD = 520
+#: What a ROS 2 folder holds.
+_ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file's name is a text recording's."""
+    return path.name.lower().removesuffix(".gz").endswith(TEXT)
+
+
+def format_of(path: Path) -> Format | None:
+    """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. Raises UserError,
+    and OSError."""
+    if path.is_dir():
+        if any(True for pattern in _ROS_FOLDER for _ in path.glob(pattern)):
+            return next(one for one in FORMATS if one.module == "ros")
+        raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    suffix = path.suffix.lower()
+    for one in FORMATS:
+        if any(head[at : at + len(sign)] == sign for at, sign in one.magic):
+            return one
+    for one in FORMATS:
+        if suffix in one.suffixes:
+            if not head:
+                raise UserError(f"{path}: the file is empty")
+            return one
+    if is_text(path) or suffix == ZIP:
+        if not head:
+            raise UserError(f"{path}: the file is empty")
+        return None
+    raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
+
+
+def check_library(path: Path, one: Format) -> None:
+    """Raise UserError, with the line to type, where the library of a format is not installed."""
+    if one.library and importlib.util.find_spec(one.library) is None:
+        typed = f"{sys.executable} -m pip install 'selfcal[{one.extra}]'"
+        raise UserError(f"{path}: is {one.name}, and {one.library} is not installed: {typed}")
