@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
 from scipy.stats import binom
 
@@ -18,7 +20,11 @@ from selfcal.diagnosis.causes import turn_on
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.state import Look
 from selfcal.diagnosis.statemodel import Array
+from selfcal.errors import UserError
+from selfcal.model import DEFAULT
 from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify
+from selfcal.verbs.replay import replay
 
 from conftest import case_records, shared_case
 
@@ -98,6 +104,50 @@ def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:
         (look,) = (one.measured() for one in turn_on.looks(state, its))
         assert abs(look.estimate["amplitude"]["mean"] - 0.8) < 3.0 * look.estimate["amplitude"]["sd"]
         assert look.estimate["amplitude"]["sd"] < 0.03
+
+
+def coefficient(document: dict[str, Any]) -> dict[str, float]:
+    entry = document["axes"]["gx"]["regressors"]["settling"]
+    return {key: float(value) for key, value in entry["coefficients"]["settling"].items() if key != "unit"}
+
+
+def test_a_recording_may_begin_later_than_the_part(tmp_path: Path) -> None:
+    """--since-power-on with a file that begins 75.5 s late, or with one that is looked at from there on: the
+    coefficient is the amplitude at power-on, on host and module. Without it, what is left of it at the first row."""
+    random = np.random.default_rng(426)
+    rate, amplitude, tau, late_s = 2.0, 0.8, 120.0, 75.5
+    t = np.arange(round(1500 * rate)) / rate
+    y = amplitude * np.exp(-t / tau) + 0.04 * math.sqrt(rate) * random.standard_normal(t.size)
+    tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    tree["regressors"] = [{"name": "settling", "kind": "turn_on", "tau_s": tau, "sd": {"gyro": 2.0}}]
+    model = tmp_path / "model.yaml"
+    model.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    for name, rows in (("whole", y), ("late", y[round(late_s * rate) :])):
+        lines = [f"{k / rate!r},{value!r}" for k, value in enumerate(rows.tolist())]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t[s],gx[deg/s]", *lines]) + "\n", encoding="utf-8")
+    whole, late = tmp_path / "whole.csv", tmp_path / "late.csv"
+    cut, stated = identify(whole, model=model, start_s=late_s), identify(late, model=model, since_power_on_s=late_s)
+    assert coefficient(stated) == pytest.approx(coefficient(cut), rel=1e-4)
+    assert abs(coefficient(stated)["mean"] - amplitude) < 4.0 * coefficient(stated)["sd"]
+    # The prior of the coefficient weighs more where the amplitude is the larger.
+    assert coefficient(identify(late, model=model))["mean"] == pytest.approx(
+        coefficient(stated)["mean"] * math.exp(-late_s / tau), rel=1e-2
+    )
+    module = replay(late, model=model, since_power_on_s=late_s)
+    assert module["recording"]["since_power_on_s"] == late_s
+    close = 0.02 * coefficient(stated)["sd"]
+    assert coefficient(module)["mean"] == pytest.approx(coefficient(stated)["mean"], abs=close)
+    (finding,) = diagnose(late, since_power_on_s=late_s)["axes"]["gx"]["findings"]
+    assert finding["cause"] == "turn_on"
+    assert abs(finding["estimate"]["amplitude"]["mean"] - amplitude) < 4.0 * finding["estimate"]["amplitude"]["sd"]
+
+
+@pytest.mark.parametrize("seconds", [-1.0, math.nan, math.inf])
+def test_no_time_since_power_on_is_an_error(seconds: float, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("t[s],gx[deg/s]\n" + "".join(f"{k},{k % 3}\n" for k in range(50)), encoding="utf-8")
+    with pytest.raises(UserError, match=r"--since-power-on .*: takes the seconds from power-on"):
+        identify(log, since_power_on_s=seconds)
 
 
 @pytest.mark.parametrize(

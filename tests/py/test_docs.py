@@ -41,7 +41,10 @@ UNTRIED = {
     "monitor ": "a module on a port, or its log; test_monitor.py",
     "demo": "runs until it is stopped; test_monitor_hostile.py and test_replay_can.py start it",
     "command ": "a module with a key; test_firmware_commands.py",
-    "replay ": "QEMU; test_firmware.py",
+    "replay leak.npz": "QEMU; test_firmware.py",
+    "replay next.csv": "QEMU; test_warm.py",
+    "replay log.csv": "QEMU; test_firmware.py",
+    "replay tests/data": "QEMU; test_firmware.py",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
     "navigate": "minutes; test_navigate.py",
@@ -51,6 +54,7 @@ SLOW = ("montecarlo", "identify ../shared/data", "diagnose ../shared/data")
 #: Columns of a document.
 WIDTH = 120
 COMMAND = "    .venv/bin/selfcal "
+COMMANDS = (COMMAND, "    cp ", "    cut ")
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -70,18 +74,19 @@ def checkout(folder: Path) -> Path:
 def excused(command: str) -> bool:
     """Whether a command, without the program's name, is not run here."""
     slow = command.startswith(SLOW) and not (CASE_RECORDS and SHARED_DATA.exists())
-    return slow or command.startswith(tuple(UNTRIED))
+    emulated = "--target cortex" in command and shutil.which("qemu-system-arm") is None
+    return slow or emulated or command.startswith(tuple(UNTRIED))
 
 
 def executed(text: str, folder: Path) -> str:
     """A document whose indented commands are run in `folder`, one after the other, each with its output below it, long
-    lines wrapped. A command that has no output in the document gets none. `cp` is run as well."""
+    lines wrapped. A command that has no output in the document gets none. `cp` and `cut` are run as well."""
     checkout(folder)
     lines, found, at = text.splitlines(), list[str](), 0
     while at < len(lines):
         found.append(lines[at])
         at += 1
-        if not found[-1].startswith((COMMAND, "    cp ")):
+        if not found[-1].startswith(COMMANDS):
             continue
         command = found[-1]
         while command.endswith("\\"):
@@ -89,7 +94,7 @@ def executed(text: str, folder: Path) -> str:
             found.append(lines[at])
             at += 1
         end = at
-        while end < len(lines) and not lines[end].startswith((COMMAND, "    cp ", "    make ")):
+        while end < len(lines) and not lines[end].startswith((*COMMANDS, "    make ")):
             if lines[end] and lines[end][:4] != "    ":
                 break
             end += 1

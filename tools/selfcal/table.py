@@ -148,7 +148,17 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
         failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
-    return table, [*kept, *failed]
+    return table, [*kept, *_ahead(axes), *failed]
+
+
+def _ahead(axes: Mapping[str, Any]) -> list[str]:
+    """What the module's calibration is worth some time after a report, of `replay`."""
+    told = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
+    return [
+        f"corrected output {one['horizon_s']:g} s after a report: {name}: rms error {one['rmse']:.3g} {one['unit']} "
+        f"({one['reports']} reports, means of {one['mean_s']:g} s)"
+        for name, one in told.items()
+    ]
 
 
 def _regressor_table(axes: Mapping[str, Any]) -> Table:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from selfcal.ahead import error_ahead
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_readings
 from selfcal.dbc_file import HYPOTHESES
@@ -479,6 +480,7 @@ def _document(
         if "error" not in axis:
             told = history[name][-1].adequacy
             axis["module_says"] = asdict(told) if told is not None else None
+            axis["ahead"] = None if gate else error_ahead(recording, model, name, history[name])
             axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
             if told is not None and told.change is not None and told.state != "inadequate":
                 note(f"{name}: the module says {told.change}; the checks here look at the record as one")

@@ -1,0 +1,61 @@
+"""How far the corrected output is off some time after a report: what a calibration is worth until the next one.
+
+The bias that a module reports, with its coefficients' part of what the columns do meanwhile, against the readings then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.model import Model
+from selfcal.recording import Recording
+from selfcal.regressors import columns_of, offered
+from selfcal.units import factor
+from selfcal.wire import AxisReport, names_of
+
+#: s from a report to the middle of the readings that it is held against; their length, s: white noise averages out.
+AHEAD_S, MEAN_S = 300.0, 60.0
+#: Reports that make a figure.
+LEAST = 3
+
+
+def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[AxisReport]) -> dict[str, Any] | None:
+    """Rms error of the corrected output AHEAD_S after a report, means of MEAN_S, in the recording's unit; None where
+    too few reports have readings so long after them.
+
+    The bias is taken to stay: a Gauss-Markov drift returns to its mean meanwhile, which the module's own corrected
+    samples know."""
+    recording = recording.along(name)
+    regressors, group, unit = offered(model, name), model.group_of(name), recording.columns[name].unit
+    time, readings = recording.time_s, recording.in_unit(name, group.unit)
+    columns = columns_of(regressors, recording)
+    errors = []
+    for report in reports:
+        then = np.abs(time - report.time_s - AHEAD_S) <= 0.5 * MEAN_S
+        now = np.flatnonzero(time <= report.time_s)
+        if not now.size or 2 * int(then.sum()) < MEAN_S * recording.rate_hz or time[-1] < report.time_s + AHEAD_S:
+            continue
+        change = _mean(columns[then]) - columns[now[-1]]
+        bias = report.value("bias_mean") + float(_coefficients(report, model, columns.shape[1]) @ change)
+        errors.append(float(np.nanmean(readings[then])) - bias)
+    if len(errors) < LEAST or not all(map(math.isfinite, errors)):
+        return None
+    rmse = math.sqrt(float(np.mean(np.square(errors)))) * factor(group.unit, unit)
+    return {"horizon_s": AHEAD_S, "mean_s": MEAN_S, "rmse": rmse, "reports": len(errors), "unit": unit}
+
+
+def _mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.nanmean(rows, axis=0) if rows.shape[1] else np.zeros(0))
+
+
+def _coefficients(report: AxisReport, model: Model, columns: int) -> NDArray[np.float64]:
+    """Of each column where the report has them in use, else 0."""
+    told = report.coefficients(names_of(model))
+    sent = [told.get(column, (0.0, 0.0, 0.0)) for one in offered(model, report.axis) for column in one.columns]
+    assert len(sent) == columns
+    return np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
