@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,24 @@ from selfcal.regressors import columns_of, offered
 from selfcal.units import factor
 from selfcal.wire import AxisReport, names_of
 
+Array = NDArray[np.float64]
+
 #: s from a report to the middle of the readings that it is held against; their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0
 #: Reports that make a figure.
 LEAST = 3
 
 
-def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[AxisReport]) -> dict[str, Any] | None:
+@dataclass(frozen=True)
+class Known:
+    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 of one not in use."""
+
+    time_s: float
+    bias: float
+    coefficients: Array
+
+
+def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[Known]) -> dict[str, Any] | None:
     """Rms error of the corrected output AHEAD_S after a report, means of MEAN_S, in the recording's unit; None where
     too few reports have readings so long after them.
 
@@ -40,22 +52,17 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
         now = np.flatnonzero(time <= report.time_s)
         if not now.size or 2 * int(then.sum()) < MEAN_S * recording.rate_hz or time[-1] < report.time_s + AHEAD_S:
             continue
-        change = _mean(columns[then]) - columns[now[-1]]
-        bias = report.value("bias_mean") + float(_coefficients(report, model, columns.shape[1]) @ change)
-        errors.append(float(np.nanmean(readings[then])) - bias)
+        change = columns[then].mean(axis=0) - columns[now[-1]]
+        errors.append(float(np.nanmean(readings[then])) - report.bias - float(report.coefficients @ change))
     if len(errors) < LEAST or not all(map(math.isfinite, errors)):
         return None
     rmse = math.sqrt(float(np.mean(np.square(errors)))) * factor(group.unit, unit)
     return {"horizon_s": AHEAD_S, "mean_s": MEAN_S, "rmse": rmse, "reports": len(errors), "unit": unit}
 
 
-def _mean(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.nanmean(rows, axis=0) if rows.shape[1] else np.zeros(0))
-
-
-def _coefficients(report: AxisReport, model: Model, columns: int) -> NDArray[np.float64]:
-    """Of each column where the report has them in use, else 0."""
+def of_report(report: AxisReport, model: Model) -> Known:
+    """What a module's report says of its axis: a column is in use where that is the likelier."""
     told = report.coefficients(names_of(model))
     sent = [told.get(column, (0.0, 0.0, 0.0)) for one in offered(model, report.axis) for column in one.columns]
-    assert len(sent) == columns
-    return np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
+    coefficients = np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
+    return Known(report.time_s, report.value("bias_mean"), coefficients)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.ahead import error_ahead
+from selfcal.ahead import error_ahead, of_report
 from selfcal.blocks import usable_blocks
 from selfcal.checks import Judged, judge, with_readings
 from selfcal.dbc_file import HYPOTHESES
@@ -480,7 +480,7 @@ def _document(
         if "error" not in axis:
             told = history[name][-1].adequacy
             axis["module_says"] = asdict(told) if told is not None else None
-            axis["ahead"] = None if gate else error_ahead(recording, model, name, history[name])
+            axis["ahead"] = None if gate else _ahead(recording, model, name, history[name])
             axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
             if told is not None and told.change is not None and told.state != "inadequate":
                 note(f"{name}: the module says {told.change}; the checks here look at the record as one")
@@ -490,6 +490,10 @@ def _document(
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
     return document
+
+
+def _ahead(recording: Recording, model: Model, name: str, history: Sequence[AxisReport]) -> dict[str, Any] | None:
+    return error_ahead(recording, model, name, [of_report(report, model) for report in history])
 
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
