@@ -172,7 +172,23 @@ std::vector<double> drift_curve(const Scene &scene, std::size_t index, const Axi
     Random random = stream(scene.seed, index, drift);
     std::vector<double> out(scene.samples, 0.0);
     for (const Term &term : axis.law.terms) {
-        if (term.walk) {
+        if (term.kind == Kind::damping) {
+            continue;
+        }
+        if (term.kind == Kind::oscillation) {
+            const double sd = deviation(axis.law, term, axis.drift, axis.second);
+            const Term &damping = *(&term + 1);
+            const Eigen::Matrix2d F = swing(term, damping, dt_s);
+            const Eigen::Matrix2d Q = Eigen::Matrix2d::Identity() - F * F.transpose();
+            const double across = std::sqrt(Q(1, 1)), first = Q(0, 1) / across;
+            const double rest = std::sqrt(std::max(Q(0, 0) - first * first, 0.0));
+            Eigen::Vector2d x(random.normal(), random.normal());
+            for (double &value : out) {
+                value += sd * x(0);
+                const double a = random.normal(), b = random.normal();
+                x = F * x + Eigen::Vector2d(first * b + rest * a, across * b);
+            }
+        } else if (term.kind == Kind::walk) {
             double x = 0.0;
             for (double &value : out) {
                 value += x += term.deviation * axis.drift * std::sqrt(dt_s) * random.normal();

@@ -41,6 +41,39 @@ Block block_of(double phi, double step, std::size_t block) {
     return {sum.phi, sum.mean / m, sum.var, sum.covariance / m, sum.of_mean / (m * m)};
 }
 
+// An oscillation at the states i, i + 1, and the mean of its reading over `block` samples.
+void put_swing(Drift &drift, const Law &law, const Node &node, Eigen::Index i, double sample_s, std::size_t block) {
+    const Term &term = law.terms[static_cast<std::size_t>(i)];
+    const double sd = deviation(law, term, node.drift, node.second);
+    const Eigen::Matrix2d F = swing(term, law.terms[static_cast<std::size_t>(i) + 1], sample_s);
+    const Eigen::Matrix2d all = sd * sd * Eigen::Matrix2d::Identity(), Q = all - F * F.transpose() * sd * sd;
+    Eigen::Matrix2d over = Eigen::Matrix2d::Identity(), noise = Eigen::Matrix2d::Zero();
+    Eigen::RowVector2d sum = Eigen::RowVector2d::Zero(), both = sum;
+    double of_sum = 0.0;
+    for (std::size_t k = 0; k < block; ++k) {
+        over = F * over;
+        noise = F * noise * F.transpose() + Q;
+        both = both * F.transpose();
+        of_sum += 2.0 * both(0) + noise(0, 0);
+        both += noise.row(0);
+        sum += over.row(0);
+    }
+    const auto m = static_cast<double>(block);
+    drift.transition.block<2, 2>(i, i) = over;
+    drift.step.block<2, 2>(i, i) = noise;
+    drift.start.block<2, 2>(i, i) = all;
+    drift.output(i + 1) = drift.level(i + 1) = 0.0;
+    if (block > 1) {
+        const Eigen::Index mean = i + static_cast<Eigen::Index>(law.terms.size());
+        drift.transition.block<2, 2>(mean, mean).setZero();
+        drift.transition.block<1, 2>(mean, i) = sum / m;
+        drift.step.block<1, 2>(mean, i) = both / m;
+        drift.step.block<2, 1>(i, mean) = both.transpose() / m;
+        drift.step(mean, mean) = of_sum / (m * m);
+        drift.output(i) = drift.output(mean + 1) = drift.level(mean) = drift.level(mean + 1) = 0.0;
+    }
+}
+
 Drift drift_of(const Law &law, const Node &node, double dt_s, std::size_t block) {
     const auto n = static_cast<Eigen::Index>(order(law, block));
     const auto m = static_cast<double>(block);
@@ -53,7 +86,16 @@ Drift drift_of(const Law &law, const Node &node, double dt_s, std::size_t block)
     Eigen::Index i = 0;
     for (const Term &term : law.terms) {
         double phi = 1.0, step = 0.0;
-        if (term.walk) { // (23), x_0 = 0
+        if (term.kind == Kind::damping) { // the oscillation before has put its state
+            ++i;
+            continue;
+        }
+        if (term.kind == Kind::oscillation) {
+            put_swing(drift, law, node, i, sample_s, block);
+            ++i;
+            continue;
+        }
+        if (term.kind == Kind::walk) { // (23), x_0 = 0
             const double density = term.deviation * node.drift;
             step = density * density * sample_s;
             drift.start(i, i) = step * (m - 1.0) / 2.0;
@@ -242,9 +284,20 @@ double bandwidth(const Term &term, double second) { return term.stated ? term.ba
 
 double deviation(const Law &law, const Term &term, double drift, double second) {
     const double own = term.deviation * drift * (term.by_ratio ? second : 1.0);
-    const auto walks = [](const Term &other) { return other.walk; };
+    const auto walks = [](const Term &other) { return other.kind == Kind::walk; };
     const bool beside_walk = std::any_of(law.terms.begin(), law.terms.end(), walks);
     return beside_walk ? own / std::sqrt(bandwidth(term, second)) : own;
+}
+
+Eigen::Matrix2d swing(const Term &oscillation, const Term &damping, double time_s) { // the matrix's exponential
+    const double w = oscillation.bandwidth;
+    Eigen::Matrix2d rate, term = Eigen::Matrix2d::Identity(), sum = term;
+    rate << 0.0, w, -w, -2.0 * damping.bandwidth;
+    for (int k = 1; k < 40; ++k) { // turns by less than 1
+        term = term * rate * (time_s / k);
+        sum += term;
+    }
+    return sum;
 }
 
 std::size_t order(const Law &law, std::size_t block) {

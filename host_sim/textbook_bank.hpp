@@ -22,17 +22,20 @@
 
 namespace selfcal_reference {
 
-// The law of x_i: a sum of terms, each a random walk or a Gauss-Markov process, with the drift parameter d (K, sigma_m
+// The law of x_i: a sum of terms, each a random walk, a Gauss-Markov process or an oscillator, with the drift parameter d (K, sigma_m
 // or B) of the node. The paper's laws have one term or none; its filter takes any linear law.
 //   walk:   x_i = x_(i-1) + deviation d sqrt(dt) w_i
 //   markov: its standard deviation is deviation d, its bandwidth `bandwidth` times the node's alpha (if stated: 1/s).
 //           Beside a walk, where d is a K, its standard deviation is deviation d / sqrt(bandwidth).
+//   oscillation, then damping: x'' + 2 rate x' + w^2 x = white noise, of two states, x and x'/w. `bandwidth` of the first
+//           is w, of the second the rate. Its standard deviation is that of a Gauss-Markov term of the bandwidth w.
 //   by_ratio: the node's second parameter multiplies the deviation.
 // Coloured noise: (e_i + theta e_(i-1)) / (1 + theta) instead of v_i, e_i ~ N(0, r_i sigma_v^2), r = 1 where a sample
 // is missing. The second parameter is (1 + theta) / (1 - theta): the spectrum's amplitude at 0 Hz over its amplitude at
 // 1/(2 dt).
+enum class Kind { walk, markov, oscillation, damping }; // as selfcal_term_kind_t
 struct Term {
-    bool walk = true;
+    Kind kind = Kind::walk;
     double deviation = 1.0;
     double bandwidth = 1.0;
     bool stated = false;
@@ -49,6 +52,9 @@ constexpr std::size_t regressors_max = 6;
 // Of a term at one value of the law's parameters: bandwidth, 1/s, and standard deviation of a Gauss-Markov process.
 double bandwidth(const Term &term, double second);
 double deviation(const Law &law, const Term &term, double drift, double second);
+
+// Of an oscillation over a time: transition of x and x'/w.
+Eigen::Matrix2d swing(const Term &oscillation, const Term &damping, double time_s);
 
 // One value theta^kj of the parameters of hypothesis k.
 struct Node {

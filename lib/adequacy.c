@@ -115,11 +115,12 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
     const selfcal_wide_t second = decays ? (selfcal_wide_t)parameter[SELFCAL_ALPHA].median : 1.0;
     const points_t points = points_of(model, law, (selfcal_wide_t)parameter[SELFCAL_N].median, drift, second);
     const selfcal_wide_t variance = points.variance, square = points.square;
-    watch->known = !law->coloured_noise && isfinite(square) && isfinite(second) && variance > 0.0 && second > 0.0;
+    const bool watched = !law->coloured_noise && !has_oscillation(law);
+    watch->known = watched && isfinite(square) && isfinite(second) && variance > 0.0 && second > 0.0;
     if (self->changes != NULL) {
         watch->likely = likely_place(model, report);
     }
-    watch->reason = law->coloured_noise ? SELFCAL_REASON_LAW_NOT_WATCHED : SELFCAL_REASON_OUTSIDE_PRIORS;
+    watch->reason = watched ? SELFCAL_REASON_OUTSIDE_PRIORS : SELFCAL_REASON_LAW_NOT_WATCHED;
     if (!watch->known) {
         return;
     }

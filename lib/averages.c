@@ -38,7 +38,7 @@ selfcal_wide_t selfcal_white_left_out(const selfcal_law_t *law, selfcal_wide_t s
         const selfcal_term_t *term = &law->term[a];
         if (term->kind == SELFCAL_WALK) {
             sum += averaged_walk(block) / 6.0 * (selfcal_wide_t)term->deviation * (selfcal_wide_t)term->deviation;
-        } else {
+        } else if (term->kind == SELFCAL_MARKOV) { /* an oscillation turns little within a block */
             sum += averaged_rest(bandwidth_of(term, second) * dt_s, block) *
                    markov_variance(law, term, 1.0, second, dt_s);
         }

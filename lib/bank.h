@@ -241,6 +241,8 @@ struct selfcal_states_code {
     void (*spread)(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]);
     /* The drift of each term at the last interval over one series, see series_of_readings(). */
     void (*drift)(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
+    /* Of the two states of an oscillation from `first` on: 1 - what is read of each after a time. */
+    void (*fall)(const selfcal_term_t *first, selfcal_real_t elapsed_s, selfcal_real_t psi[2]);
 };
 
 /* Series of such a node: "1" is 0, regressor k is 1 + k, and the readings of an axis. */

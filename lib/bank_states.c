@@ -9,6 +9,9 @@
  * theta)^2 in the last place and else 0:
  *   nu = y - sum x_j    s = r/(1 + theta)^2 + sum P    kappa = (phi_j sum_i P_ij + S_j)/s
  *   x_j' = phi_j x_j + kappa_j nu                      P' = phi P phi + Q - kappa kappa' s
+ * An oscillation is x'' + 2 d w x' + w^2 x = noise. Its states are (x + x'/w)/2 and (x - x'/w)/2: they add to x, do not
+ * correlate, and each has half of its variance. With e = exp(-d w t), s = sqrt(1 - d^2), over a time t
+ *   x_1' = m x_1 + (n - b) x_2   x_2' = (n + b) x_1 + m x_2   m = e cos(w s t)   b = e sin(w s t)/s   n = d b
  * P and the gains are in selfcal_wide_t, until P has converged; a sample then costs the filter alone. The bias and
  * sigma_v are integrated out from the same sums as for every node (bank.c), which are here taken to twice the digits,
  * the regressors' columns among them (regressors.c says why). */
@@ -64,14 +67,113 @@ static void init_states(selfcal_t *self, unsigned char *memory) {
 /* -------------------------------------------------------------------------------------------------------------
  * gains */
 
+/* Both states of an oscillation have one: the first one's. */
+static selfcal_real_t beta_of(const selfcal_term_node_t *node, size_t a) {
+    return node->beta[node->pair != 0U && a == node->pair ? a - 1U : a];
+}
+
 static selfcal_wide_t phi_of(const selfcal_term_node_t *node, size_t a) {
-    return 1.0 - (selfcal_wide_t)node->beta[a];
+    return 1.0 - (selfcal_wide_t)beta_of(node, a);
 }
 
 /* 1/(1 + theta)^2. */
 static selfcal_wide_t white_of(const selfcal_term_node_t *node) {
     const selfcal_wide_t whole = 1.0 + (selfcal_wide_t)node->theta;
     return 1.0 / (whole * whole);
+}
+
+/* Transition of an oscillation's two states over a time, see above. */
+typedef struct {
+    selfcal_wide_t m, up, down;
+} swing_t;
+
+static swing_t swing_of(const selfcal_term_t *first, selfcal_wide_t time_s) {
+    const selfcal_wide_t w = (selfcal_wide_t)first[0].bandwidth, rate = (selfcal_wide_t)first[1].bandwidth;
+    const selfcal_wide_t d = rate / w, s = sqrt(1.0 - d * d), e = exp(-rate * time_s);
+    const selfcal_wide_t b = e * sin(w * s * time_s) / s;
+    const swing_t swing = {e * cos(w * s * time_s), (d - 1.0) * b, (d + 1.0) * b};
+    return swing;
+}
+
+/* All transitions of one oscillation commute. */
+static swing_t after(swing_t x, swing_t y) {
+    const swing_t both = {x.m * y.m + x.up * y.down, x.m * y.up + x.up * y.m, x.down * y.m + x.m * y.down};
+    return both;
+}
+
+/* The stationary variance of each state is the first one's q. */
+static swing_t turn_of(const selfcal_term_node_t *node) {
+    const swing_t turn = {phi_of(node, node->pair), -(selfcal_wide_t)node->beta[node->pair],
+        (selfcal_wide_t)node->q[node->pair]};
+    return turn;
+}
+
+/* How the states go into another moment: a row for each. */
+typedef struct {
+    selfcal_wide_t of[SELFCAL_TERMS_MAX][SELFCAL_TERMS_MAX];
+} matrix_t;
+
+static void put_swing(matrix_t *matrix, size_t pair, swing_t swing) {
+    matrix->of[pair - 1U][pair - 1U] = matrix->of[pair][pair] = swing.m;
+    matrix->of[pair - 1U][pair] = swing.up;
+    matrix->of[pair][pair - 1U] = swing.down;
+}
+
+/* Variance that an oscillation gains as it turns so, v the stationary one of each state. */
+static selfcal_wide_t gained(swing_t swing, selfcal_wide_t v, bool first) {
+    const selfcal_wide_t off = first ? swing.up : swing.down;
+    return v * (1.0 - swing.m * swing.m - off * off);
+}
+
+static selfcal_wide_t gained_both(swing_t swing, selfcal_wide_t v) {
+    return -v * swing.m * (swing.up + swing.down);
+}
+
+/* P goes to A P A'. */
+static void transform(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t order, const matrix_t *a) {
+    selfcal_wide_t half[SELFCAL_TERMS_MAX][SELFCAL_TERMS_MAX];
+    for (size_t i = 0; i < order; i++) {
+        for (size_t j = 0; j < order; j++) {
+            half[i][j] = 0.0;
+            for (size_t k = 0; k < order; k++) {
+                half[i][j] += a->of[i][k] * p[k >= j ? term_pair(k, j) : term_pair(j, k)];
+            }
+        }
+    }
+    for (size_t i = 0; i < order; i++) {
+        for (size_t j = 0; j <= i; j++) {
+            selfcal_wide_t sum = 0.0;
+            for (size_t k = 0; k < order; k++) {
+                sum += half[i][k] * a->of[j][k];
+            }
+            p[term_pair(i, j)] = sum;
+        }
+    }
+}
+
+/* Adds to P what the states gain as an oscillation turns. */
+static void add_gained(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t pair, swing_t swing, selfcal_wide_t v) {
+    p[term_pair(pair - 1U, pair - 1U)] += gained(swing, v, true);
+    p[term_pair(pair, pair)] += gained(swing, v, false);
+    p[term_pair(pair, pair - 1U)] += gained_both(swing, v);
+}
+
+/* The mean of a block over that of a point, for its slow turn w: right to (w dt)^4. */
+static selfcal_wide_t mean_of_swing(const selfcal_term_t *first, selfcal_wide_t dt_s, uint32_t block) {
+    const selfcal_wide_t turn = (selfcal_wide_t)first->bandwidth * dt_s, m = (selfcal_wide_t)block;
+    return 1.0 - turn * turn * (1.0 - 1.0 / (m * m)) / 24.0;
+}
+
+static void start_swing(const selfcal_model_t *model, selfcal_term_node_t *node, size_t a, const selfcal_term_t *first,
+                        selfcal_wide_t variance) {
+    const selfcal_wide_t dt_s = (selfcal_wide_t)model->dt_s, mean = mean_of_swing(first, dt_s, model->block);
+    const swing_t swing = swing_of(first, dt_s);
+    node->pair = (uint8_t)(a + 1U);
+    node->beta[a] = (selfcal_real_t)(1.0 - swing.m);
+    node->beta[a + 1U] = (selfcal_real_t)-swing.up;
+    node->q[a] = (selfcal_real_t)(mean * mean * variance);
+    node->q[a + 1U] = (selfcal_real_t)swing.down;
+    node->p[term_pair(a, a)] = node->p[term_pair(a + 1U, a + 1U)] = (selfcal_wide_t)node->q[a];
 }
 
 static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
@@ -86,7 +188,9 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
             const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation;
             node->q[a] = (selfcal_real_t)(deviation * deviation * square);
             node->p[term_pair(a, a)] = deviation * deviation * square; /* x_0 = 0 */
-        } else {
+        } else if (term->kind == SELFCAL_OSCILLATION) {
+            start_swing(self->model, node, a, term, markov_variance(law, term, square, second, dt_s));
+        } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_wide_t rate = bandwidth_of(term, second) * dt_s; /* of an interval */
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)rate, self->model->block);
             const selfcal_wide_t variance = (selfcal_wide_t)of.gain *
@@ -131,6 +235,14 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
         }
         gain.s += gain.kappa[a];
     }
+    if (node->pair != 0U) { /* m is the phi below */
+        const swing_t turn = turn_of(node);
+        selfcal_wide_t *x = &gain.kappa[node->pair - 1U];
+        const selfcal_wide_t more[2] = {turn.up * x[1], turn.down * x[0]};
+        for (size_t a = 0; a < 2U; a++) {
+            x[a] += more[a] / turn.m;
+        }
+    }
     for (size_t a = 0; a < order; a++) {
         gain.kappa[a] = (phi_of(node, a) * gain.kappa[a] +
                          (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
@@ -138,17 +250,40 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
     return gain;
 }
 
+static bool in_pair(const selfcal_term_node_t *node, size_t a) {
+    return node->pair != 0U && (a == node->pair || a + 1U == node->pair);
+}
+
+/* P of the next sample before its reading, less the noise of plain terms: the states go through an interval. */
+static void carry(const selfcal_term_node_t *node, size_t order, selfcal_wide_t p[SELFCAL_TERM_PAIRS]) {
+    matrix_t whole;
+    memset(&whole, 0, sizeof whole);
+    for (size_t a = 0; a < order; a++) {
+        whole.of[a][a] = phi_of(node, a);
+    }
+    put_swing(&whole, node->pair, turn_of(node));
+    memcpy(p, node->p, sizeof node->p);
+    transform(p, order, &whole);
+    add_gained(p, node->pair, turn_of(node), (selfcal_wide_t)node->q[node->pair - 1U]);
+}
+
 /* Whether P has come to rest. */
 static bool step(selfcal_term_node_t *node, size_t order, selfcal_wide_t r, const gain_t *gain) {
     const selfcal_wide_t theta = (selfcal_wide_t)node->theta;
     bool rests = true;
+    selfcal_wide_t carried[SELFCAL_TERM_PAIRS] = {0.0};
+    if (node->pair != 0U) {
+        carry(node, order, carried);
+    }
     for (size_t a = 0; a < order; a++) {
         for (size_t b = 0; b <= a; b++) {
             selfcal_wide_t *p = &node->p[term_pair(a, b)];
             const selfcal_wide_t before = *p;
-            *p = phi_of(node, a) * phi_of(node, b) * before - gain->kappa[a] * gain->kappa[b] * gain->s;
+            *p = (node->pair != 0U ? carried[term_pair(a, b)] : phi_of(node, a) * phi_of(node, b) * before) -
+                 gain->kappa[a] * gain->kappa[b] * gain->s;
             if (a == b) {
-                *p += (selfcal_wide_t)node->q[a] + (a + 1U == order ? theta * theta * r * white_of(node) : 0.0);
+                *p += (in_pair(node, a) ? 0.0 : (selfcal_wide_t)node->q[a]) +
+                      (a + 1U == order ? theta * theta * r * white_of(node) : 0.0);
                 *p = fmax(*p, 0.0); /* a moving average's, once its e_(i-1) is known */
                 /* a moving average's is what is left of two numbers of the size of the last term */
                 const selfcal_wide_t rounding = a + 1U == order ? 1e-15 * theta * theta * white_of(node) : 0.0;
@@ -257,9 +392,16 @@ static void filter_states(const selfcal_term_node_t *term, size_t order, const t
         out->nu[i] = nu;
         out->weighted[i] = nu * inv_s;
         out->low[i] = r_fma_exact(nu, inv_s, -out->weighted[i]);
+        selfcal_real_t turned[2] = {R(0.0), R(0.0)};
+        if (term->pair != 0U) {
+            const selfcal_sum_t *first = &x[term->pair - 1U], *second = &x[term->pair];
+            turned[0] = -term->beta[term->pair] * (second->hi + second->lo);
+            turned[1] = term->q[term->pair] * (first->hi + first->lo);
+        }
         for (size_t a = 0; a < order; a++) {
-            const selfcal_real_t beta = term->beta[a];
-            const selfcal_real_t change = r_fma_exact(gains->kappa[a][from + i], nu, -beta * x[a].hi);
+            const selfcal_real_t beta = beta_of(term, a);
+            selfcal_real_t change = r_fma_exact(gains->kappa[a][from + i], nu, -beta * x[a].hi);
+            change += in_pair(term, a) ? turned[a + 1U - term->pair] : R(0.0);
             x[a] = two_sum(x[a].hi, change + (R(1.0) - beta) * x[a].lo);
         }
     }
@@ -305,6 +447,15 @@ static void run_states(selfcal_t *self, size_t j, const span_t *span) {
     }
 }
 
+static swing_t power(swing_t swing, uint32_t count) {
+    swing_t all = {1.0, 0.0, 0.0};
+    for (; count != 0U; count >>= 1U) {
+        all = (count & 1U) != 0U ? after(all, swing) : all;
+        swing = after(swing, swing);
+    }
+    return all;
+}
+
 static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     const term_t at_node = term_of(self, j);
     const size_t order = at_node.order;
@@ -316,19 +467,39 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t a = 0; a < order; a++) {
         less[a] = term->beta[a] < R(1.0) ? -expm1(intervals * log1p(-(selfcal_wide_t)term->beta[a])) : 1.0;
     }
+    matrix_t whole;
+    memset(&whole, 0, sizeof whole);
+    for (size_t a = 0; a < order; a++) {
+        whole.of[a][a] = 1.0 - less[a];
+    }
+    if (term->pair != 0U) {
+        put_swing(&whole, term->pair, power(turn_of(term), count));
+    }
+    transform(term->p, order, &whole);
+    if (term->pair != 0U) {
+        add_gained(term->p, term->pair, power(turn_of(term), count), (selfcal_wide_t)term->q[term->pair - 1U]);
+    }
     for (size_t a = 0; a < order; a++) {
         const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a],
             theta = (selfcal_wide_t)term->theta;
-        for (size_t b = 0; b <= a; b++) {
-            term->p[term_pair(a, b)] *= (1.0 - less[a]) * (1.0 - less[b]);
+        if (!in_pair(term, a)) {
+            term->p[term_pair(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a])
+                                                   : intervals * q;
         }
-        term->p[term_pair(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a]) : intervals * q;
         term->p[term_pair(a, a)] += a + 1U == order ? theta * theta * white_of(term) : 0.0;
     }
     for (size_t series = 0; series < series_of(self); series++) {
         selfcal_sum_t *x = states(self, at_node.index, series);
+        selfcal_wide_t before[SELFCAL_TERMS_MAX];
         for (size_t a = 0; a < order; a++) {
-            x[a] = make_sum(sum_value(x[a]) * (1.0 - less[a]));
+            before[a] = sum_value(x[a]);
+        }
+        for (size_t a = 0; a < order; a++) {
+            selfcal_wide_t now = 0.0;
+            for (size_t b = 0; b < order; b++) {
+                now += whole.of[a][b] * before[b];
+            }
+            x[a] = make_sum(now);
         }
     }
 }
@@ -336,53 +507,76 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
 /* --------------------------------------------------------------------------------------------------------------
  * views */
 
-/* A term now, from the filter's prediction for the next interval: over that, and variance beside it. */
+/* The terms now, from the filter's prediction for the next interval: over that, and covariance beside it. */
 typedef struct {
-    selfcal_wide_t per_prediction, after;
-} term_now_t;
+    matrix_t per_prediction;
+    selfcal_wide_t after[SELFCAL_TERM_PAIRS];
+} terms_now_t;
+
+/* The end of a block is so much later than its middle, over its interval, whose prediction is for the next middle. */
+static void swing_now(const selfcal_model_t *model, const selfcal_term_t *first, size_t a, selfcal_wide_t variance,
+                      terms_now_t *now) {
+    const selfcal_wide_t dt_s = (selfcal_wide_t)model->dt_s, mean = mean_of_swing(first, dt_s, model->block);
+    const selfcal_wide_t late_s = 0.5 * dt_s * (1.0 - 1.0 / (selfcal_wide_t)model->block);
+    const swing_t back = swing_of(first, late_s - dt_s);
+    const swing_t of_point = {back.m / mean, back.up / mean, back.down / mean};
+    put_swing(&now->per_prediction, a + 1U, of_point);
+    add_gained(now->after, a + 1U, swing_of(first, late_s), variance);
+}
 
 /* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
-static void terms_now(const selfcal_t *self, size_t j, term_now_t now[SELFCAL_TERMS_MAX]) {
+static void terms_now(const selfcal_t *self, size_t j, terms_now_t *now) {
     const selfcal_place_t place = selfcal_bank_place(self, (uint16_t)j);
     const selfcal_law_t *law = self->model->hypothesis[place.hypothesis].law;
     const selfcal_term_node_t *node = &self->terms->node[term_of(self, j).index];
     const selfcal_wide_t dt_s = (selfcal_wide_t)self->model->dt_s, second = exp((selfcal_wide_t)place.ln_alpha);
+    const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
     const uint32_t block = self->model->block;
-    memset(now, 0, SELFCAL_TERMS_MAX * sizeof now[0]);
+    memset(now, 0, sizeof *now);
     for (size_t a = 0; a < terms_of(law); a++) {
         const selfcal_term_t *term = &law->term[a];
         if (term->kind == SELFCAL_WALK) {
-            now[a].per_prediction = 1.0;
-            now[a].after = (selfcal_wide_t)(node->q[a] * averaged_walk_after(block));
-        } else {
-            const selfcal_wide_t square = exp(2.0 * (selfcal_wide_t)place.ln_rho);
+            now->per_prediction.of[a][a] = 1.0;
+            now->after[term_pair(a, a)] = (selfcal_wide_t)(node->q[a] * averaged_walk_after(block));
+        } else if (term->kind == SELFCAL_OSCILLATION) {
+            swing_now(self->model, term, a, markov_variance(law, term, square, second, dt_s), now);
+        } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
-            now[a].per_prediction = (selfcal_wide_t)of.now / phi_of(node, a);
-            now[a].after = markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
+            now->per_prediction.of[a][a] = (selfcal_wide_t)of.now / phi_of(node, a);
+            now->after[term_pair(a, a)] =
+                markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
         }
     }
 }
 
 static void drift_of(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]) {
     const size_t index = term_of(self, j).index;
-    term_now_t now[SELFCAL_TERMS_MAX];
-    terms_now(self, j, now);
+    terms_now_t now;
+    terms_now(self, j, &now);
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
-        drift[a] = sum_value(states(self, index, series)[a]) * now[a].per_prediction;
+        drift[a] = 0.0;
+        for (size_t b = 0; b < SELFCAL_TERMS_MAX; b++) {
+            drift[a] += now.per_prediction.of[a][b] * sum_value(states(self, index, series)[b]);
+        }
     }
 }
 
 static void spread_of(const selfcal_t *self, size_t j, selfcal_wide_t spread[SELFCAL_TERM_PAIRS]) {
     const term_t at_node = term_of(self, j);
     const selfcal_term_node_t *term = &self->terms->node[at_node.index];
-    term_now_t now[SELFCAL_TERMS_MAX];
-    terms_now(self, j, now);
+    terms_now_t now;
+    terms_now(self, j, &now);
+    /* P' = phi P(now) phi + Q */
+    memcpy(spread, term->p, sizeof term->p);
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
-        for (size_t b = 0; b <= a; b++) {
-            /* P' = phi P(now) phi + Q */
-            const selfcal_wide_t p = term->p[term_pair(a, b)] - (a == b ? (selfcal_wide_t)term->q[a] : 0.0);
-            spread[term_pair(a, b)] = p * now[a].per_prediction * now[b].per_prediction + (a == b ? now[a].after : 0.0);
-        }
+        spread[term_pair(a, a)] -= in_pair(term, a) ? 0.0 : (selfcal_wide_t)term->q[a];
+    }
+    if (term->pair != 0U) {
+        add_gained(spread, term->pair, turn_of(term), -(selfcal_wide_t)term->q[term->pair - 1U]);
+    }
+    transform(spread, SELFCAL_TERMS_MAX, &now.per_prediction);
+    for (size_t k = 0; k < SELFCAL_TERM_PAIRS; k++) {
+        spread[k] += now.after[k];
     }
 }
 
@@ -441,7 +635,7 @@ static bool states_sound(const selfcal_t *self) {
     }
     for (size_t k = 0; k < nodes; k++) {
         const selfcal_term_node_t *node = &terms->node[k];
-        if (!is_bool(&node->steady) || !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
+        if (!is_bool(&node->steady) || node->pair >= SELFCAL_TERMS_MAX || !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
             return false;
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
@@ -470,21 +664,43 @@ static bool states_sound(const selfcal_t *self) {
 /* Bank intervals that a stated correlation time lasts at most: 1 - phi keeps its digits. */
 #define TIME_MAX 1e6F
 
+/* w of an oscillation, over dt_s, at most: eight bank intervals a period; and its damping. */
+#define SWING_MAX 0.7854
+#define DAMPING_MIN 1e-3
+#define DAMPING_MAX 0.7
+
+/* The two terms of an oscillation. */
+static bool valid_swing(const selfcal_term_t *term, size_t count, float dt_s) {
+    const selfcal_term_t *second = &term[1];
+    if (count < 2U || second->kind != SELFCAL_DAMPING || second->deviation != term->deviation ||
+        second->by_ratio != term->by_ratio || !term->stated || !second->stated) {
+        return false;
+    }
+    const selfcal_wide_t turn = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
+    const selfcal_wide_t damping = (selfcal_wide_t)second->bandwidth / (selfcal_wide_t)term->bandwidth;
+    return turn <= SWING_MAX * (1.0 + 1e-6) && turn * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6 &&
+           damping >= DAMPING_MIN * (1.0 - 1e-6) && damping <= DAMPING_MAX * (1.0 + 1e-6);
+}
+
 static bool valid_term(const selfcal_term_t *term, float dt_s) {
+    const bool swing = term->kind == SELFCAL_OSCILLATION || term->kind == SELFCAL_DAMPING;
     const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
     const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
     const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
     const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
     return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN &&
         term->deviation <= FACTOR_MAX &&
-           (walk || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
+           (walk || swing || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
 }
 
 /* A sum that there are filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */
 static bool valid_sum(const selfcal_law_t *law, float dt_s) {
     unsigned by_ratio = 0;
     for (uint8_t a = 0; a < law->terms; a++) {
-        if (!valid_term(&law->term[a], dt_s)) {
+        const selfcal_term_t *term = &law->term[a];
+        const size_t left = (size_t)law->terms - a;
+        if (!valid_term(term, dt_s) || (term->kind == SELFCAL_OSCILLATION && !valid_swing(term, left, dt_s)) ||
+            (term->kind == SELFCAL_DAMPING && (a == 0U || term[-1].kind != SELFCAL_OSCILLATION))) {
             return false;
         }
         by_ratio += law->term[a].by_ratio ? 1U : 0U;
@@ -493,7 +709,13 @@ static bool valid_sum(const selfcal_law_t *law, float dt_s) {
            !(has_ratio(law) && has_alpha(law)) && (by_ratio == 0U || (by_ratio < law->terms && !law->coloured_noise));
 }
 
+static void fall_of(const selfcal_term_t *first, selfcal_real_t elapsed_s, selfcal_real_t psi[2]) {
+    const swing_t swing = swing_of(first, (selfcal_wide_t)elapsed_s);
+    psi[0] = (selfcal_real_t)(1.0 - swing.m - swing.down);
+    psi[1] = (selfcal_real_t)(1.0 - swing.m - swing.up);
+}
+
 const selfcal_states_code_t selfcal_states_code = {
     valid_sum, init_states, states_sound, start_node, run_states, run_states_gap,
-    settle_node, fade_states, restart_states, view_states, spread_of, drift_of,
+    settle_node, fade_states, restart_states, view_states, spread_of, drift_of, fall_of,
 };

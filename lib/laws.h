@@ -41,8 +41,12 @@ static inline selfcal_parameter_t drift_parameter(const selfcal_law_t *law) {
     return has_deviation(law) ? SELFCAL_SIGMA_M : SELFCAL_K;
 }
 
+static inline bool has_oscillation(const selfcal_law_t *law) {
+    return has_term(law, SELFCAL_OSCILLATION);
+}
+
 static inline bool has_decay(const selfcal_law_t *law) {
-    return has_term(law, SELFCAL_MARKOV);
+    return has_term(law, SELFCAL_MARKOV) || has_oscillation(law);
 }
 
 static inline bool has_alpha(const selfcal_law_t *law) {
@@ -82,13 +86,15 @@ static inline selfcal_wide_t bandwidth_of(const selfcal_term_t *term, selfcal_wi
 }
 
 /* Stationary variance of a Gauss-Markov term over sigma_v^2, at a node of rho^2 = `square` and of the law's second
- * parameter. */
+ * parameter. Of an oscillation half of it, for each of its two states. */
 static inline selfcal_wide_t markov_variance(const selfcal_law_t *law, const selfcal_term_t *term,
                                              selfcal_wide_t square,
                                              selfcal_wide_t second, selfcal_wide_t dt_s) {
     const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation * (term->by_ratio ? second : 1.0);
-    const selfcal_wide_t variance = deviation * deviation * square;
-    return has_walk(law) ? variance / (bandwidth_of(term, second) * dt_s) : variance; /* rho^2 = K^2 dt / sigma_v^2 */
+    const bool markov = term->kind == SELFCAL_MARKOV;
+    const selfcal_wide_t variance = (markov ? 1.0 : 0.5) * deviation * deviation * square;
+    const selfcal_term_t *first = term->kind == SELFCAL_DAMPING ? term - 1 : term;
+    return has_walk(law) ? variance / (bandwidth_of(first, second) * dt_s) : variance; /* rho^2 = K^2 dt / sigma_v^2 */
 }
 
 /* ln of 1e3: beyond, 1 + theta or 1 - theta of coloured noise is no longer a float. */

@@ -5,7 +5,8 @@ typedef struct {
     selfcal_real_t mean, var;
 } moments_t;
 
-static moments_t predict_law(const selfcal_law_t *law, const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
+static moments_t predict_law(const selfcal_model_t *model, const selfcal_law_t *law,
+                             const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
     moments_t now = {(selfcal_real_t)posterior->bias_mean,
         (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
     for (uint8_t a = 0; a < law->terms; a++) {
@@ -25,7 +26,11 @@ static moments_t predict_law(const selfcal_law_t *law, const selfcal_posterior_t
             for (unsigned a = 0; a < terms_of(law); a++) {
                 const selfcal_term_t *term = &law->term[a]; /* a walk's bandwidth is 0 */
                 const selfcal_real_t alpha = term->stated ? R(1.0) : (selfcal_real_t)decay->alpha;
-                psi[a] = -r_expm1(-(selfcal_real_t)term->bandwidth * alpha * elapsed_s);
+                if (term->kind == SELFCAL_OSCILLATION) { /* and of the state behind it */
+                    model->states->fall(term, elapsed_s, &psi[a]);
+                } else if (term->kind != SELFCAL_DAMPING) {
+                    psi[a] = -r_expm1(-(selfcal_real_t)term->bandwidth * alpha * elapsed_s);
+                }
                 fall = r_fma(psi[a], (selfcal_real_t)decay->mean[a], fall);
                 selfcal_real_t with = (selfcal_real_t)decay->var[a];
                 for (unsigned b = 0; b <= a; b++) {
@@ -53,7 +58,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         const selfcal_real_t p = (selfcal_real_t)report->hypothesis[h].probability;
         if (p != R(0.0)) { /* else its moments may be NaN */
-            law[h] = predict_law(model->hypothesis[h].law, &report->hypothesis[h], (selfcal_real_t)elapsed_s);
+            law[h] = predict_law(model, model->hypothesis[h].law, &report->hypothesis[h], (selfcal_real_t)elapsed_s);
             law[h].mean -= now;
             mean = r_fma(p, law[h].mean, mean);
         }

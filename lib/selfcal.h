@@ -102,19 +102,28 @@ typedef double selfcal_wide_t;
 /* A law is data: the terms of its drift, and the kind of its white noise.
  *   SELFCAL_WALK:   x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                                             (23)
  *   SELFCAL_MARKOV: x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-bandwidth dt), stationary
+ *   SELFCAL_OSCILLATION, then SELFCAL_DAMPING: x'' + 2 damping w x' + w^2 x = white noise, stationary, of one term for
+ *     each of two states. The first one's bandwidth is w, the second one's damping w. They share the deviation.
  * That holds at each sample; a bank sample is the mean of a block of samples. A model of one sample a block takes the
  * drift for a point, whatever the sensor averaged before.
  * A law has at most three parameters: N, the drift parameter, and a second one.
  * The drift parameter is K if a term is a walk, else sigma_m (B for flicker).
  * The second one is alpha, which scales the bandwidths that are not stated, or a ratio. No law has both. */
-typedef enum { SELFCAL_WALK = 0, SELFCAL_MARKOV = 1 } selfcal_term_kind_t;
+typedef enum {
+    SELFCAL_WALK = 0,
+    SELFCAL_MARKOV = 1,
+    SELFCAL_OSCILLATION = 2,
+    SELFCAL_DAMPING = 3
+} selfcal_term_kind_t;
 
 typedef struct {
     selfcal_term_kind_t kind;
     float deviation; /* times the drift parameter: this term's K or sigma_m; 1e-3 to 1e3.
-                        Beside a walk, a Gauss-Markov term has sigma_m = deviation K / sqrt(bandwidth). */
+                        Beside a walk, a Gauss-Markov term has sigma_m = deviation K / sqrt(bandwidth),
+                        and an oscillation's standard deviation is deviation K / sqrt(w). */
     float bandwidth; /* of a Gauss-Markov term: times alpha, 1e-3 to 1e3; if stated, 1/s. 0 of a walk */
-    bool stated;     /* the model states the bandwidth: 1e-6 to 6.9 over dt_s */
+    bool stated;     /* the model states the bandwidth: 1e-6 to 6.9 over dt_s. Always of an oscillation, whose w is
+                        1e-6 to 0.79 over dt_s, and whose damping is 1e-3 to 0.7 */
     bool by_ratio;   /* the law's ratio multiplies the deviation */
 } selfcal_term_t;
 

@@ -163,7 +163,8 @@ typedef struct {
     selfcal_wide_t p[SELFCAL_TERM_PAIRS];                         /* predicted covariance of the states, lower half */
     selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX]; /* 1 - pole, and variance added per interval */
     selfcal_real_t theta; /* of a moving average, whose part e_(i-1) is the last state */
-    bool steady;          /* p has converged */
+    uint8_t pair; /* the second state of an oscillation; 0: the law has none. Its beta and q are turn_of()'s */
+    bool steady;  /* p has converged */
 } selfcal_term_node_t;
 
 typedef struct {

@@ -45,6 +45,7 @@ EFFECTS = {
     "pulse": ("time_s=900,duration_s=300,amplitude=0.3", 1.0),
     "turn_on": ("amplitude=0.6,tau_s=60", 1.0),
     "periodic": ("frequency_hz=0.05,amplitude=0.02", 1.0),
+    "oscillation": ("period_s=120,damping=0.1,sd=0.03", 1.0),
     "flicker": ("B=0.05", 10.0),
     "colored_noise": ("lag1=0.4", 1.0),
     "quantization": ("lsb=0.3", 10.0),

@@ -352,6 +352,7 @@ def test_csv_and_npz_hold_the_same_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "effect",
     ["temperature", "supply", "cross_axis", "ramp", "step", "pulse", "two_level", "turn_on", "periodic", "flicker",
+     "oscillation",
      "colored_noise", "quantization", "outliers", "variance_change", "saturation", "motion", "missing_samples", "stuck",
      "held_samples", "rate_change"],
 )  # fmt: skip

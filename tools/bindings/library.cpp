@@ -22,7 +22,7 @@ namespace nb = nanobind;
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
 using PriorTuple = std::tuple<double, double, bool, bool>; // ln_min, ln_max, uniform, measured
-using TermTuple = std::tuple<bool, double, double, bool, bool>; // walk, deviation, bandwidth, stated, by_ratio
+using TermTuple = std::tuple<int, double, double, bool, bool>; // kind, deviation, bandwidth, stated, by_ratio
 using LawTuple = std::tuple<std::vector<TermTuple>, bool>;      // terms, coloured_noise
 using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
                                    std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none
@@ -353,9 +353,9 @@ private:
             throw std::invalid_argument("a law has at most " + std::to_string(SELFCAL_LAW_TERMS) + " terms");
         selfcal_law_t &law = *laws_.emplace_back(std::make_unique<selfcal_law_t>());
         law.coloured_noise = coloured_noise;
-        for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : terms)
+        for (const auto &[kind, deviation, bandwidth, stated, by_ratio] : terms)
             law.term[law.terms++] =
-                {walk ? SELFCAL_WALK : SELFCAL_MARKOV, static_cast<float>(deviation), static_cast<float>(bandwidth),
+                {static_cast<selfcal_term_kind_t>(kind), static_cast<float>(deviation), static_cast<float>(bandwidth),
                                      stated, by_ratio};
         return &law;
     }

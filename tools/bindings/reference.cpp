@@ -79,18 +79,24 @@ sr::Record record(const Vector &y, const std::optional<Vector> &r, double dt_s, 
     return out;
 }
 
-// (walk, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured.
-using LawTuple = std::tuple<std::vector<std::tuple<bool, double, double, bool, bool>>, bool>;
+// (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured.
+using LawTuple = std::tuple<std::vector<std::tuple<int, double, double, bool, bool>>, bool>;
 
 sr::Law law_of(const LawTuple &t) {
     sr::Law law;
     law.coloured_noise = std::get<1>(t);
-    for (const auto &[walk, deviation, bandwidth, stated, by_ratio] : std::get<0>(t)) {
-        const bool has_bandwidth = walk || (bandwidth > 0.0 && std::isfinite(bandwidth));
+    for (const auto &[number, deviation, bandwidth, stated, by_ratio] : std::get<0>(t)) {
+        const auto kind = static_cast<sr::Kind>(number);
+        const bool after = !law.terms.empty() && law.terms.back().kind == sr::Kind::oscillation;
+        if (number < 0 || number > 3 || after != (kind == sr::Kind::damping))
+            throw std::invalid_argument("an oscillation has a damping behind it, and no other term has");
+        const bool has_bandwidth = kind == sr::Kind::walk || (bandwidth > 0.0 && std::isfinite(bandwidth));
         if (!(deviation > 0.0) || !std::isfinite(deviation) || !has_bandwidth)
             throw std::invalid_argument("deviations and bandwidths of a law must be positive");
-        law.terms.push_back({walk, deviation, bandwidth, stated, by_ratio});
+        law.terms.push_back({kind, deviation, bandwidth, stated, by_ratio});
     }
+    if (!law.terms.empty() && law.terms.back().kind == sr::Kind::oscillation)
+        throw std::invalid_argument("an oscillation has a damping behind it, and no other term has");
     if (law.terms.size() > sr::terms_max)
         throw std::invalid_argument("a law has at most " + std::to_string(sr::terms_max) + " terms");
     return law;
@@ -100,7 +106,7 @@ LawTuple tuple_of(const sr::Law &law) {
     LawTuple t;
     std::get<1>(t) = law.coloured_noise;
     for (const sr::Term &term : law.terms)
-        std::get<0>(t).emplace_back(term.walk, term.deviation, term.bandwidth, term.stated, term.by_ratio);
+        std::get<0>(t).emplace_back(static_cast<int>(term.kind), term.deviation, term.bandwidth, term.stated, term.by_ratio);
     return t;
 }
 
@@ -116,7 +122,7 @@ sr::Node node(const std::vector<sr::Law> &laws, int hypothesis, double drift, do
                                     ", an index into the laws");
     const sr::Node out{static_cast<std::size_t>(hypothesis), drift, second, sigma_v};
     const sr::Law &law = laws[out.hypothesis];
-    const auto takes_second = [](const sr::Term &term) { return term.by_ratio || (!term.walk && !term.stated); };
+    const auto takes_second = [](const sr::Term &term) { return term.by_ratio || (term.kind != sr::Kind::walk && !term.stated); };
     const bool has_second =
         law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), takes_second);
     if (!(sigma_v > 0.0) || (!law.terms.empty() && !(drift >= 0.0)) || (has_second && !(second > 0.0)))

@@ -48,13 +48,13 @@ _MOST_STRETCHES = 200
 class Terms:
     """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
     the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
-    times the interval between readings. `lacking`: variance of white noise that the drift's averages lack
-    (laws.averaged)."""
+    times the interval between readings. An oscillation is the real part of one whose numbers are complex. `lacking`:
+    variance of white noise that the drift's averages lack (laws.averaged)."""
 
     variance: float
     lag1: float = 0.0
     step: float = 0.0
-    markov: tuple[tuple[float, float], ...] = ()
+    markov: tuple[tuple[complex, complex], ...] = ()
     lacking: float = 0.0
 
     def sums(self, j: _Floats) -> _Floats:
@@ -64,8 +64,8 @@ class Terms:
         if self.lag1:
             found = found - self.variance * self.lag1 * np.maximum(j, 1.0)
         for variance, alpha in self.markov:
-            phi, left = math.exp(-alpha), -math.expm1(-alpha)
-            found = found - variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)
+            phi, left = np.exp(-alpha), -np.expm1(-alpha)
+            found = found - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
         return np.asarray(found)
 
     def allan_variance(self, m: _Floats) -> _Floats:
@@ -80,8 +80,8 @@ class Terms:
         far = np.zeros(lags - near.size)
         for variance, alpha in self.markov:  # farther than 2 m the others have none
             j = np.arange(near.size, lags, dtype=float)
-            scale = variance * math.exp(-alpha) / math.expm1(-alpha) ** 2 * math.expm1(-alpha * m) ** 4 / m**2
-            far -= scale * np.exp(-alpha * (j - 2 * m))
+            scale = variance * np.exp(-alpha) / np.expm1(-alpha) ** 2 * np.expm1(-alpha * m) ** 4 / m**2
+            far -= (scale * np.exp(-alpha * (j - 2 * m))).real
         return np.concatenate([found, far])
 
     def spectrum(self, omega: _Floats) -> _Floats:
@@ -89,7 +89,7 @@ class Terms:
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
         found = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
         for variance, alpha in self.markov:
-            found = found - variance * math.expm1(-2.0 * alpha) / (math.expm1(-alpha) ** 2 + math.exp(-alpha) * step)
+            found = found - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
         return np.asarray(found)
 
 
@@ -102,12 +102,18 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
         variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
     step = sum((term.deviation * drift) ** 2 * dt_s for term in law.terms if term.kind == "walk")
     lacking = (1.0 - 1.0 / block**2) * step / 6.0
-    markov = []
+    markov: list[tuple[complex, complex]] = []
     for term in law.terms:
-        if term.kind == "markov":
+        if term.kind != "walk":
             alpha = term.bandwidth * (1.0 if term.stated else second)
             sigma = term.deviation * drift * (second if term.by_ratio else 1.0)
             own = sigma**2 / (alpha if law.has_walk else 1.0)
+            if term.kind == "oscillation":  # alpha is 2 pi over its period
+                share = math.sqrt(1.0 - term.damping**2)
+                mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
+                pole = complex(term.damping, -share)
+                markov.append((own * mean * complex(1.0, -term.damping / share), alpha * dt_s * pole))
+                continue
             gain, without = averaged(alpha * dt_s, block)
             markov.append((own * gain, alpha * dt_s))
             lacking += own * without
@@ -129,7 +135,7 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
     """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
     readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
     count = int(whole.sum())
-    memory = max((_FORGOTTEN / alpha for _, alpha in terms.markov), default=0.0)
+    memory = max((_FORGOTTEN / alpha.real for _, alpha in terms.markov), default=0.0)
     lags = min(whole.size, 2 * m + 2 + math.ceil(memory))
     if whole.all():
         pairs = count - np.arange(lags, dtype=float)

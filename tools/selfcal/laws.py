@@ -25,22 +25,29 @@ RATIO_LIMITS = (1e-3, 1e3)
 #: Correlation times in an interval beyond which the means of a drift count as white: neighbours' correlate by 0.02.
 FORGOTTEN = 20.0
 
-#: (walk, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
-LawTuple = tuple[list[tuple[bool, float, float, bool, bool]], bool]
+#: Kinds of `selfcal_term_kind_t`. An oscillation is followed by its damping.
+KINDS = ("walk", "markov", "oscillation", "damping")
+#: Bank intervals in a period at least, damping ratios, and intervals that a period lasts at most over 2 pi (SWING_MAX,
+#: DAMPING_MIN, DAMPING_MAX, TIME_MAX in lib/bank_states.c).
+SWING_LEAST, DAMPING_LIMITS, SWING_MOST = 8.0, (1e-3, 0.7), 1e6
+#: (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
+LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 
 
 @dataclass(frozen=True)
 class Term:
     """One term of a drift. `deviation` multiplies the law's drift parameter, with `by_ratio` the law's ratio does too.
 
-    `bandwidth` of a Gauss-Markov term multiplies alpha; if `stated` it is the bandwidth itself, 1/s.
+    `bandwidth` of a Gauss-Markov term multiplies alpha; if `stated` it is the bandwidth itself, 1/s. Of an oscillation
+    it is 2 pi / period, always stated, and `damping` the damping ratio.
     """
 
-    kind: str  # "walk" or "markov"
+    kind: str  # "walk", "markov" or "oscillation"
     deviation: float = 1.0
     bandwidth: float = 1.0
     stated: bool = False
     by_ratio: bool = False
+    damping: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,16 @@ class Law:
     def has_walk(self) -> bool:
         """Its drift parameter is K."""
         return any(term.kind == "walk" for term in self.terms)
+
+    @property
+    def has_oscillation(self) -> bool:
+        """The module's own watch does not know it (SELFCAL_REASON_LAW_NOT_WATCHED)."""
+        return any(term.kind == "oscillation" for term in self.terms)
+
+    @property
+    def read(self) -> tuple[float, ...]:
+        """What a reading takes of each state of the drift: an oscillation has a second one, of which it takes none."""
+        return tuple(share for t in self.terms for share in ((1.0, 0.0) if t.kind == "oscillation" else (1.0,)))
 
     @property
     def has_alpha(self) -> bool:
@@ -85,7 +102,11 @@ class Law:
     @cached_property
     def as_tuple(self) -> LawTuple:
         """For the bindings."""
-        terms = [(t.kind == "walk", t.deviation, self.bandwidth(t), t.stated, t.by_ratio) for t in self.terms]
+        terms = []
+        for t in self.terms:
+            terms.append((KINDS.index(t.kind), t.deviation, self.bandwidth(t), t.stated, t.by_ratio))
+            if t.kind == "oscillation":
+                terms.append((KINDS.index("damping"), t.deviation, t.damping * t.bandwidth, t.stated, t.by_ratio))
         return terms, self.coloured_noise
 
     @staticmethod

@@ -16,7 +16,18 @@ import yaml
 from selfcal import units
 from selfcal.errors import UserError, short, shown
 from selfcal.forms import FORMS, INPUTS, NUMBER, POWER
-from selfcal.laws import FACTORS, MOST_TERMS, NAMED, PARAMETERS, PLACES, RATIO_LIMITS, RATIOS, Law, Term
+from selfcal.laws import (
+    DAMPING_LIMITS,
+    FACTORS,
+    MOST_TERMS,
+    NAMED,
+    PARAMETERS,
+    PLACES,
+    RATIO_LIMITS,
+    RATIOS,
+    Law,
+    Term,
+)
 from selfcal.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 
 SCHEMA = "selfcal.model/1"
@@ -48,6 +59,8 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
 }
 #: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
+#: What a term of a law may state beside its kind and deviation.
+KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
 #: Columns of all regressors together: SELFCAL_REGRESSORS_MAX.
 MOST_COLUMNS = 6
 
@@ -521,17 +534,26 @@ class _Reader:
 
     def term(self, tree: Any, where: str) -> Term:
         fields = {"kind": tree} if isinstance(tree, str) else tree
-        if not isinstance(fields, dict) or fields.get("kind") not in ("walk", "markov"):
-            raise self.fail(where, f"must be walk, markov, or a mapping with one of these as kind, not {shown(tree)}")
-        walk = fields["kind"] == "walk"
-        self.only(fields, ("kind", "deviation", *(() if walk else ("bandwidth", "correlation_time_s"))), where)
+        if not isinstance(fields, dict) or fields.get("kind") not in KEYS_OF_TERM:
+            raise self.fail(
+                where, f"must be walk, markov, or a mapping with one of these or oscillation as kind, not {shown(tree)}"
+            )
+        walk, swings = (fields["kind"] == kind for kind in ("walk", "oscillation"))
+        self.only(fields, ("kind", "deviation", *KEYS_OF_TERM[fields["kind"]]), where)
         if "bandwidth" in fields and "correlation_time_s" in fields:
             raise self.fail(where, "states bandwidth (times alpha) or correlation_time_s, not both")
         by_ratio = fields.get("deviation") == "ratio"
         if by_ratio and walk:
             raise self.fail(f"{where}.deviation", "of a walk must be a number")
-        stated = "correlation_time_s" in fields
-        time_s = self.number(fields["correlation_time_s"], f"{where}.correlation_time_s") if stated else 1.0
+        stated = swings or "correlation_time_s" in fields
+        damping = self.number(self.entry(fields, "damping", where), f"{where}.damping") if swings else 0.0
+        if swings and not DAMPING_LIMITS[0] <= damping <= DAMPING_LIMITS[1]:
+            limits = " to ".join(f"{limit:g}" for limit in DAMPING_LIMITS)
+            raise self.fail(f"{where}.damping", f"must be {limits}, not {damping:g}")
+        if swings:
+            time_s = self.number(self.entry(fields, "period_s", where), f"{where}.period_s") / (2.0 * math.pi)
+        else:
+            time_s = self.number(fields["correlation_time_s"], f"{where}.correlation_time_s") if stated else 1.0
         numbers = {
             key: self.number(fields.get(key, 1.0), f"{where}.{key}")
             for key in ("deviation", "bandwidth")
@@ -541,7 +563,7 @@ class _Reader:
             if not FACTORS[0] <= value <= FACTORS[1]:
                 raise self.fail(f"{where}.{key}", f"must be {FACTORS[0]:g} to {FACTORS[1]:g}, not {value:g}")
         bandwidth = 1.0 / time_s if stated else numbers["bandwidth"]
-        return Term(fields["kind"], numbers.get("deviation", 1.0), bandwidth, stated, by_ratio)
+        return Term(fields["kind"], numbers.get("deviation", 1.0), bandwidth, stated, by_ratio, damping)
 
     def law(self, tree: Any, where: str) -> Law:
         terms = self.entry(tree, "terms", where)
@@ -551,11 +573,10 @@ class _Reader:
         if not isinstance(terms, list):
             raise self.fail(f"{where}.terms", f"must be a list of terms, not {shown(terms)}")
         most = MOST_TERMS - (1 if coloured else 0)
-        if len(terms) > most:
-            raise self.fail(
-                f"{where}.terms", f"has {len(terms)}, {most} are the most{' beside coloured noise' * coloured}"
-            )
         law = Law(tuple(self.term(one, f"{where}.terms[{i}]") for i, one in enumerate(terms)), coloured)
+        if len(law.read) > most:
+            beside = " beside coloured noise" * coloured + ", an oscillation counts as two" * law.has_oscillation
+            raise self.fail(f"{where}.terms", f"has {len(law.read)}, {most} are the most{beside}")
         by_ratio = sum(term.by_ratio for term in law.terms)
         if coloured and not terms:
             raise self.fail(where, "coloured noise needs a drift: give at least one term")

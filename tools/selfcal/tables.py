@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.errors import UserError
-from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
+from selfcal.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
 from selfcal.model import NOT_HANDLED, Group, Handling, Model, Regressor
 from selfcal.regressors import channels_of, sources_of
 from selfcal.units import same_kind
@@ -247,7 +247,13 @@ def make_tables(
         )
     dt = block / rate_hz
     for name, law in model.laws.items():
-        for time_s in (1.0 / term.bandwidth for term in law.terms if term.stated):
+        for period_s in (2.0 * math.pi / term.bandwidth for term in law.terms if term.kind == "oscillation"):
+            if not SWING_LEAST * dt <= period_s <= 2.0 * math.pi * SWING_MOST * dt:
+                raise UserError(
+                    f"{model.path}: hypotheses.{name}: period_s: must be from {SWING_LEAST * dt:.3g} to "
+                    f"{2.0 * math.pi * SWING_MOST * dt:.3g} s at bank intervals of {dt:g} s, not {period_s:g}"
+                )
+        for time_s in (1.0 / term.bandwidth for term in law.terms if term.stated and term.kind == "markov"):
             if not dt / ALPHA_DT_MAX <= time_s <= TIME_MAX * dt:
                 where = "correlation_time_s" if name in NAMED else f"hypotheses.{name}: correlation_time_s"
                 raise UserError(

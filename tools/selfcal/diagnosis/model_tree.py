@@ -14,9 +14,10 @@ NODES = [24, 20]
 SMALL_NODES = [12, 8]
 
 
-def add_law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any]) -> None:
-    """Have the model one law more, with a prior of its parameter in every group and nodes on every target."""
-    tree["hypotheses"].setdefault(law, 1)
+def add_law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any], entry: Any = 1) -> None:
+    """Have the model one law more, with a prior of its parameter in every group and nodes on every target. `entry`: its
+    odds, or the mapping that states its terms."""
+    tree["hypotheses"].setdefault(law, entry)
     for target, nodes in tree["nodes"].items():
         own = {"host": NODES, "cortex-m0": SMALL_NODES}.get(target, nodes["gauss_markov"])
         nodes.setdefault(law, list(own))

@@ -96,7 +96,7 @@ class State:
         """The state with `changes`, fitted. UserError where no model has a likelihood."""
         state = replace(self, **changes)
         series = state.series
-        fits = tuple(_fit_from(series, terms, self.fits) for terms in state.bases())
+        fits = tuple(_fit_from(series, terms, state.fits) for terms in state.bases())
         if not math.isfinite(best(fits).ln_likelihood):
             raise UserError(
                 f"{self.axis}: no noise model fits these readings: leave out the time in which the sensor did not rest"

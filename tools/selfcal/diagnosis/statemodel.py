@@ -21,14 +21,17 @@ Mask = NDArray[np.bool_]
 ALPHA_LIMITS = (2e-4, 0.2)
 #: Sizes relative to the white noise of one sample.
 SIZE_LIMITS = (1e-5, 1e2)
+#: A drift that oscillates keeps within these periods, s, and samples a period at least: faster ones are a band.
+#: ... and within these damping ratios: above, no turn shows.
+PERIOD_LIMITS, SAMPLES_LEAST, DAMPING_LIMITS = (20.0, 3000.0), 8.0, (0.003, 0.7)
 #: Parameters that size a term of the drift.
 DRIFT_SIZES = ("ln_rho", "ln_markov", "ln_flicker")
 
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of a noise model beside white noise: the drift's, 1/f noise, the colour of the white noise, and narrow
-    bands (oscillators driven by noise).
+    """The terms of a noise model beside white noise: the drift's, 1/f noise, a damped oscillator that white noise
+    drives, the colour of the white noise, and narrow bands (rotations driven by noise).
 
     `bands`: those found, each with its frequency in Hz, half width in Hz and ln of its size, all fixed: refitting them
     with every later cause would cost much and change little. `trial`, Hz: one more, whose numbers are fitted."""
@@ -36,6 +39,7 @@ class Terms:
     walk: bool = False
     markov: bool = False
     flicker: bool = False
+    oscillation: bool = False
     color: Literal["", "ma", "ar"] = ""
     bands: tuple[tuple[float, float, float], ...] = ()
     trial: float | None = None
@@ -47,6 +51,7 @@ class Terms:
         names += ["ln_rho"] if self.walk else []
         names += ["ln_markov", "ln_alpha"] if self.markov else []
         names += ["ln_flicker"] if self.flicker else []
+        names += ["ln_swing", "ln_period", "ln_damping"] if self.oscillation else []
         names += ["color"] if self.color else []
         names += ["ln_band", "ln_width", "shift"] if self.trial is not None else []
         return tuple(names)
@@ -58,6 +63,11 @@ class Terms:
         for name in self.names:
             if name == "ln_alpha":
                 found.append((math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])))
+            elif name == "ln_period":
+                low, high = max(PERIOD_LIMITS[0], SAMPLES_LEAST * dt), PERIOD_LIMITS[1]
+                found.append((math.log(low), math.log(max(high, 2.0 * low))))
+            elif name == "ln_damping":
+                found.append((math.log(DAMPING_LIMITS[0]), math.log(DAMPING_LIMITS[1])))
             elif name == "color":
                 found.append((-2.6, 2.6))
             elif name == "ln_width":
@@ -83,6 +93,17 @@ class Matrices:
     driver: int = -1
 
 
+def swing(period_s: float, damping: float, time_s: float) -> Array:
+    """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
+
+    The states are x and x' / w: both have the stationary variance of x, and do not correlate."""
+    w = 2.0 * math.pi / period_s
+    share = math.sqrt(1.0 - damping * damping)
+    decay, turn = math.exp(-damping * w * time_s), w * share * time_s
+    c, s = decay * math.cos(turn), decay * math.sin(turn) / share
+    return np.array([[c + damping * s, s], [-s, c - damping * s]])
+
+
 @lru_cache(maxsize=64)
 def flicker_rates(duration_s: float, dt: float) -> tuple[float, ...]:
     """Correlation rates, 1/s, of the Gauss-Markov terms that together make 1/f noise over a record: a decade apart or a
@@ -104,7 +125,7 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
     if terms.trial is not None:
         bands.append((terms.trial * math.exp(value["shift"]), math.exp(value["ln_width"]), value["ln_band"]))
     rates = flicker_rates(duration_s, dt) if terms.flicker else ()
-    pairs = len(bands) + (terms.color == "ma")
+    pairs = len(bands) + terms.oscillation + (terms.color == "ma")
     single = terms.walk + terms.markov + len(rates) + (terms.color == "ar")
     size = max(1, single + 2 * pairs)
     F, Q, P0, h = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
@@ -139,6 +160,14 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         Q[k, k] = P0[k, k] = P0[k + 1, k + 1] = unit
         h[k], h[k + 1] = 1.0, m
         R, driver, k = 1e-9, k, k + 2
+    if terms.oscillation:
+        turn_of = swing(math.exp(value["ln_period"]), math.exp(value["ln_damping"]), dt)
+        variance = math.exp(2.0 * value["ln_swing"])
+        F[k : k + 2, k : k + 2] = turn_of
+        Q[k : k + 2, k : k + 2] = variance * (np.eye(2) - turn_of @ turn_of.T)
+        P0[k, k] = P0[k + 1, k + 1] = variance
+        h[k] = 1.0
+        k += 2
     for frequency, width, ln_size in bands:
         variance = math.exp(2.0 * ln_size)
         turn = 2.0 * math.pi * frequency * dt

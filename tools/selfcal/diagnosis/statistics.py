@@ -333,13 +333,29 @@ def _states(m: Matrices, level: Array, random: np.random.Generator) -> Array:
         if f[0, 0] == 0.0:  # the moving average: e_i and e_(i-1)
             e = math.sqrt(Q[k, k]) * random.standard_normal(n + 1) * np.append(level[0], level)
             out += h[k] * e[1:] + h[k + 1] * e[:-1]
-        else:  # an oscillator, as a complex first-order process
-            pole = complex(f[0, 0], -f[0, 1])
-            e = math.sqrt(Q[k, k]) * (random.standard_normal(n) + 1j * random.standard_normal(n))
-            e[0] = math.sqrt(P0[k, k]) * (random.standard_normal() + 1j * random.standard_normal())
-            out += h[k] * lfilter([1.0], [1.0, -pole], e).real
+        else:
+            pair = slice(k, k + 2)
+            out += h[k] * swinging(f, Q[pair, pair], P0[pair, pair], n, random)
         k += 2
     return out
+
+
+def swinging(F: Array, Q: Array, P0: Array, n: int, random: np.random.Generator) -> Array:
+    """[n]: the first of two states that turn, [2, 2] each. In the coordinates of F they are two conjugate processes of
+    the first order: one is filtered."""
+    from scipy.signal import lfilter
+
+    poles, vectors = np.linalg.eig(F)
+    first = np.linalg.inv(vectors)[0]
+    e = np.asarray((first @ _half(Q)) @ random.standard_normal((2, n)))
+    e[0] = (first @ _half(P0)) @ random.standard_normal(2)
+    return np.asarray(2.0 * (vectors[0, 0] * lfilter([1.0], [1.0, -poles[0]], e)).real)
+
+
+def _half(covariance: Array) -> Array:
+    """[2, 2]: a root of a covariance, which may be nearly singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def whitened_of(state: State, y: Array) -> Array:

@@ -115,8 +115,8 @@ def _posterior(
 ) -> _Posterior:
     z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
-    means = len(of.terms) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
-    drift = [*[1.0] * max(1, len(of.terms)), *[0.0] * (means + (2 if of.coloured_noise else 0))]
+    means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
+    drift = [*(of.read or (1.0,)), *[0.0] * (means + (2 if of.coloured_noise else 0))]
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     now = np.concatenate([drift, [1.0], columns_now])
     names = of.parameters

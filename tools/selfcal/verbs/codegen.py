@@ -10,6 +10,7 @@ from rich.console import Console
 
 from selfcal.errors import UserError, remark
 from selfcal.forms import COLUMN_KINDS
+from selfcal.laws import KINDS
 from selfcal.model import NOT_HANDLED, Model
 from selfcal.output import whole
 from selfcal.recording import SIDE_CHANNELS
@@ -357,9 +358,9 @@ def _law(hypothesis: HypothesisTable) -> list[str]:
     terms, coloured = hypothesis.law.as_tuple
     flag = ("false", "true")
     rows = [
-        f"    {{{'SELFCAL_WALK' if walk else 'SELFCAL_MARKOV'}, {_f(deviation)}, {_f(bandwidth)}, {flag[stated]}, "
+        f"    {{SELFCAL_{KINDS[kind].upper()}, {_f(deviation)}, {_f(bandwidth)}, {flag[stated]}, "
         f"{flag[by_ratio]}}},"
-        for walk, deviation, bandwidth, stated, by_ratio in terms
+        for kind, deviation, bandwidth, stated, by_ratio in terms
     ]
     head = f"static const selfcal_law_t law_{hypothesis.name} = {{{len(terms)}U, {flag[coloured]}, {{"
     return [head, *rows, "}};", ""] if rows else [f"{head}{{SELFCAL_WALK, 0.0F, 0.0F, false, false}}}}}};", ""]

@@ -196,7 +196,7 @@ def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
             if parameter not in drawn:
                 raise UserError(f"{model.path}: simulate.{where}: '{parameter}' is missing and has no prior")
             truth[name][parameter] = drawn[parameter]
-        times = [1.0 / term.bandwidth for term in of.terms if term.stated]
+        times = [1.0 / term.bandwidth for term in of.terms if term.stated and term.kind == "markov"]
         if times:
             truth[name]["correlation_time_s"] = times[0] if len(times) == 1 else times
     return truth

@@ -122,10 +122,10 @@ def _of_step(state: State, steps: Scan) -> list[tuple[int, int]]:
     return [(place, int(np.argmax(ahead))), (int(np.argmax(behind)), place)]
 
 
-def blocks(state: State) -> tuple[Series, int]:
-    """Means of blocks, NaN where half of one is missing, and the samples of a block."""
+def blocks(state: State, longest_s: float = math.inf) -> tuple[Series, int]:
+    """Means of blocks of `longest_s` at most, NaN where half of one is missing, and the samples of a block."""
     n = state.y.size
-    block = max(1, n // BLOCKS)
+    block = max(1, int(min(n // BLOCKS, longest_s / state.dt)))
     m = n // block
 
     def cut(values: Array) -> Array:

@@ -21,7 +21,7 @@ from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import SCREEN, Look, State, mixture, net
+from selfcal.diagnosis.state import NONE, SCREEN, Look, State, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
 
 #: Tried first: amplitudes over the white noise of a block, dwell times in blocks, ln of the drift over the fitted one.
@@ -85,7 +85,7 @@ def looks(state: State, record: Record) -> list[Look]:
     """The likeliest levels and dwell times, where they jump often enough."""
     # The filter knows a walk and white noise of one level alone.
     uneven = float((state.r != np.median(state.r)).mean()) > UNEVEN_MOST
-    if state.y.size < 200 or uneven or state.extras.color or state.extras.bands or state.extras.flicker:
+    if state.y.size < 200 or uneven or state.extras != NONE:
         return []
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0:
         return []

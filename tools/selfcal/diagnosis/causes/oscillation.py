@@ -1,0 +1,208 @@
+"""The bias oscillates: a damped oscillator that white noise drives, as a term of the drift.
+
+x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s, of the stationary standard deviation `sd`. The drift
+swallows the swings: at the drift fitted without them, the innovations hardly show one. Periods are ranked at drifts of
+several sizes on means, then the drift is fitted with the best. A line of constant phase has a damping of 0: its column
+needs no evidence for each turn, so `periodic` gains more there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, medians, positive, shown
+from selfcal.diagnosis.causes.pulse import blocks, of_blocks
+from selfcal.diagnosis.fit import Fit, Series, best, fit, ln_likelihood, run
+from selfcal.diagnosis.model_tree import add_law, digits
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import Look, State, net
+from selfcal.diagnosis.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms, swing
+from selfcal.diagnosis.statistics import swinging
+from selfcal.laws import RATIO_LIMITS
+from selfcal.result import HALF_90
+
+#: Periods in a record at least.
+TURNS_LEAST = 3.0
+#: Tried first: periods per octave at one damping, sizes over the white noise of a mean, drifts smaller by exp(-these).
+PER_OCTAVE, DAMPING, SWINGS, SIZES = 3.0, 0.15, (0.12, 0.35, 1.0), (0.0, 1.5, 4.0)
+#: ... then dampings, and factors of the period, about the best.
+DAMPINGS, NEAR = (0.02, 0.05, 0.15, 0.4), tuple(float(2.0 ** (k / 12.0)) for k in range(-3, 4))
+#: The prior of the size in the model file, over the size found.
+RATIOS = (0.1, 10.0)
+#: Gains of the search below this are not worth a fit.
+LEAST = 1.0
+#: Price of the search over periods beside three degrees of freedom. At 1.8 more, 3 of 800 clean hours at 1 Hz showed
+#: 3 nats, where 40 were due.
+LN_LOOKS = 1.0
+
+
+def looks(state: State, record: Record) -> list[Look]:
+    """The oscillator that gains most, the drift fitted with it."""
+    if state.extras.oscillation:
+        return []
+    found = _search(state)
+    if found is None:
+        return []
+    extras = replace(state.extras, oscillation=True)
+    fits = [
+        fit(state.series, replace(one.terms, oscillation=True), start)
+        for one, start in ((one, _start(one, found)) for one in state.fits if one.terms in state.near())
+    ]
+    chosen = best(fits)
+    # A poor drift model makes some nats of any slow term.
+    none = max(state.best.ln_likelihood, 0.0 if state.extras.flicker else state.rich.ln_likelihood)
+    gain = chosen.ln_likelihood - none
+    worth = net(gain, 3, LN_LOOKS)
+    period = math.exp(chosen.value("ln_period"))
+    if worth < 1.0 or period * TURNS_LEAST > state.y.size * state.dt:
+        return []
+    estimate = {
+        "period_s": _interval(chosen, "ln_period", 1.0, "s"),
+        "damping": _interval(chosen, "ln_damping", 1.0, "1"),
+        "sd": _interval(chosen, "ln_swing", chosen.sigma, state.unit),
+    }
+    return [Look("oscillation", gain, worth, estimate, {"extras": extras, "fits": tuple(fits)})]
+
+
+def _search(state: State) -> dict[str, float] | None:
+    """ln of period, damping, and size over the white noise of a sample; `less`: of the drift beside it."""
+    series, block = blocks(state, PERIOD_LIMITS[0] / SAMPLES_LEAST)
+    low = max(PERIOD_LIMITS[0], SAMPLES_LEAST * series.dt)
+    high = min(PERIOD_LIMITS[1], series.duration_s / TURNS_LEAST)
+    if high < low:
+        return None
+    count = 1 + math.ceil(PER_OCTAVE * math.log2(high / low))
+    periods = np.geomspace(low, high, count)
+    first = [(p, DAMPING, s, less) for p in periods for s in SWINGS for less in SIZES]
+    at, value = _best_of(state, series, block, first)
+    period, _, size, less = at
+    second = [(period * by, damping, size, less) for by in NEAR for damping in DAMPINGS if low <= period * by <= high]
+    at, value = _best_of(state, series, block, second)
+    none = ln_likelihood(run(series, state.best.terms, of_blocks(state.best, block, 0.0))[0][0])
+    if value - none < LEAST:
+        return None
+    period, damping, size, less = at
+    return {
+        "ln_period": math.log(period),
+        "ln_damping": math.log(damping),
+        "ln_swing": math.log(size) - 0.5 * math.log(block),
+        "less": less,
+    }
+
+
+def _best_of(
+    state: State, series: Series, block: int, tried: list[tuple[float, float, float, float]]
+) -> tuple[tuple[float, float, float, float], float]:
+    """The likeliest of period, damping, size and smallness of the drift, and its ln likelihood."""
+    terms = replace(state.best.terms, oscillation=True)
+    drift = {less: of_blocks(state.best, block, -less) for less in {one[3] for one in tried}}
+    values = [
+        ln_likelihood(run(series, terms, _theta(terms, state.best.terms, drift[less], p, d, s))[0][0])
+        for p, d, s, less in tried
+    ]
+    k = int(np.argmax(values))
+    return tried[k], values[k]
+
+
+def _theta(terms: Terms, without: Terms, drift: Array, period: float, damping: float, size: float) -> Array:
+    known = dict(zip(without.names, drift, strict=True))
+    own = {"ln_swing": math.log(size), "ln_period": math.log(period), "ln_damping": math.log(damping)}
+    return np.array([own[name] if name in own else known[name] for name in terms.names])
+
+
+def _start(one: Fit, found: Mapping[str, float]) -> Array:
+    """Where the fit begins, in the order of its parameters."""
+    terms = replace(one.terms, oscillation=True)
+    small = one.shrunk(found["less"])
+    return np.array([found[name] if name in found else small.value(name) for name in terms.names])
+
+
+def _interval(chosen: Fit, name: str, unit_size: float, unit: str) -> dict[str, Any]:
+    """Of a parameter whose logarithm is normal."""
+    k = chosen.terms.names.index(name)
+    sd = float(np.linalg.norm(chosen.spread[k]))
+    median = unit_size * math.exp(float(chosen.theta[k]))
+    mean = median * math.exp(0.5 * min(sd, 1.0) ** 2)
+    return {
+        "mean": mean,
+        "median": median,
+        "sd": mean * math.sqrt(math.expm1(min(sd, 1.0) ** 2)),
+        "q05": median * math.exp(-HALF_90 * sd),
+        "q95": median * math.exp(HALF_90 * sd),
+        "unit": unit,
+    }
+
+
+def _alike(a: Look, b: Look) -> bool:
+    """Whether each period lies in the other's interval."""
+    one, two = a.estimate["period_s"], b.estimate["period_s"]
+    return bool(one["q05"] <= two["median"] <= one["q95"] and two["q05"] <= one["median"] <= two["q95"])
+
+
+def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
+    """From sample to sample by the exact transition."""
+    t = channels.time_s
+    F = swing(keys["period_s"], keys["damping"], float(t[1] - t[0]))
+    return float(keys["sd"]) * swinging(F, np.eye(2) - F @ F.T, np.eye(2), t.size, channels.random)
+
+
+def _extend(at: Extension) -> None:
+    """A law of a walk beside the oscillation, whose size is free. One that states the same period already serves."""
+    estimate, one = at.finding.look.estimate, at.finding.after.best
+    period = estimate["period_s"]
+    if any(period["q05"] <= other <= period["q95"] for other in _periods(at.tree)):
+        return
+    w = 2.0 * math.pi / period["median"]
+    walk = next(fit for fit in at.finding.after.fits if fit.terms.walk)
+    K = max(walk.K, 2.0 * float(at.group["priors"]["K"]["min"]))
+    ratio = estimate["sd"]["median"] * math.sqrt(w) / K
+    low, high = (min(max(by * ratio, RATIO_LIMITS[0]), RATIO_LIMITS[1]) for by in RATIOS)
+    term = {
+        "kind": "oscillation",
+        "period_s": digits(period["median"]),
+        "damping": digits(min(max(math.exp(one.value("ln_damping")), DAMPING_LIMITS[0]), DAMPING_LIMITS[1])),
+        "deviation": "ratio",
+    }
+    add_law(
+        at.tree,
+        f"oscillation_{period['median']:.0f}s",
+        "markov_ratio",
+        {"law": "log_uniform", "min": digits(min(low, 0.1 * high)), "max": digits(high)},
+        {"probability": 1, "terms": ["walk", term]},
+    )
+
+
+def _periods(tree: Mapping[str, Any]) -> list[float]:
+    """Of the oscillations that a model states."""
+    laws = [law["terms"] for law in tree["hypotheses"].values() if isinstance(law, Mapping)]
+    terms = [term for terms in laws for term in terms if isinstance(term, Mapping)]
+    return [float(term["period_s"]) for term in terms if term["kind"] == "oscillation"]
+
+
+CAUSE = Cause(
+    "oscillation",
+    "The bias oscillates: a damped swing of one period that noise drives.",
+    "Look for a control loop or a table of this period. Record 20 periods.",
+    looks=looks,
+    most=1,
+    slow=True,
+    alike=_alike,
+    pictures=shown("allan", "spectrum"),
+    extend=_extend,
+    of_estimate=medians,
+    add=_add,
+    keys={
+        "period_s": positive(lambda s: s.duration_s / 20.0),
+        "damping": Key(
+            lambda s: 0.1,
+            fits=lambda value: DAMPING_LIMITS[0] <= value <= DAMPING_LIMITS[1],
+            limits=f"{DAMPING_LIMITS[0]:g} to {DAMPING_LIMITS[1]:g}",
+        ),
+        "sd": positive(lambda s: 0.5 * s.n),
+    },
+)
