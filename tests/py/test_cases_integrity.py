@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
+from selfcal.held import held as held_rows
 from selfcal.model import Model
 from selfcal.readings import evened, look
 from selfcal.recording import Column, Recording, load, save
@@ -322,6 +324,85 @@ def test_held_readings_are_taken_once(ratio: float) -> None:
         assert look(recording, "gx", GYRO).held_hz == pytest.approx(100.0, rel=1e-3)
     assert inadequate <= case_records(3, 120) // 50
     held.check()
+
+
+@pytest.mark.parametrize(
+    ("ratio", "q", "jitter", "stamped", "lost"),
+    [(1.25, 0.0, 0.0, False, 0.0), (1.0 / 0.9, 1e-3, 0.1, False, 0.0), (1.0 / 0.7, 0.2, 0.1, True, 0.0),
+     (1.25, 0.4, 0.4, False, 0.0), (1.0 / 0.9, 0.4, 0.2, True, 0.01), (1.05, 0.2, 0.1, False, 0.0),
+     (1.6, 0.6, 0.1, False, 0.0), (1.85, 0.1, 0.2, True, 0.0)],
+)  # fmt: skip
+def test_a_logger_a_little_faster_than_the_part(
+    ratio: float, q: float, jitter: float, stamped: bool, lost: float
+) -> None:
+    """The repeats come at the beat of two clocks that wander by 20 ppm, on a lattice of up to 1.5 times the noise or
+    none, at polls that jitter with stamps or without."""
+    held, inadequate, records = Held(), 0, case_records(3, 120)
+    for seed in range(records):
+        random = np.random.default_rng([18, seed, round(100 * ratio)])
+        y, bias = noise(random, 24_000, 100.0, 4e-3)
+        y = np.rint(y / q) * q if q else y
+        count = int(y.size * ratio) - 10
+        asked = np.arange(count) + random.uniform() + jitter * random.uniform(-0.5, 0.5, count)
+        asked += 2e-5 * np.cumsum(np.sin(np.arange(count) / 5000.0))
+        row = (asked / ratio).astype(np.int64)
+        kept = random.random(count) >= lost
+        time = np.round(asked[kept] / (100.0 * ratio), 6)
+        recording = a_recording(y[row[kept]], 100.0 * ratio, time - time[0] if stamped else None)
+        inadequate += bool(held.add(recording, float(bias[row[-1]]), math.sqrt(0.04**2 + q * q / 12.0 / 100.0), 4e-3))
+        found = look(recording, "gx", GYRO)
+        assert found.held_hz == pytest.approx(100.0, rel=2e-3)
+        # The polls that were lost are one reading each, or a repeat; late polls that miss a reading are fewer.
+        assert found.recording.missing_before.sum() <= (lost + 0.1 * jitter + 0.001) * y.size
+        if seed == 0:
+            both = (of_recording(one, MODEL, 1.0) for one in (recording, a_recording(y, 100.0)))
+            logged, own = ([f.look.cause for f in diagnose_record(one, ["gx"])["gx"].findings] for one in both)
+            unread = 1.0 - np.unique(row[kept]).size / (row[-1] - row[0] + 1.0)
+            if unread > 5e-4:  # `missing_samples` is from 1e-3 on
+                logged = [cause for cause in logged if cause != "missing_samples"]
+            assert logged == ["held_samples", *own]
+    assert inadequate <= max(1, records // 50)
+    held.check()
+
+
+@pytest.mark.parametrize("ratio", [1.1, 1.4])
+def test_repeats_at_no_beat_are_not_adequate_without_a_word(ratio: float) -> None:
+    """Polls at random intervals: some readings are never seen, so the rate of the part is not known."""
+    for seed in range(case_records(2, 50)):
+        random = np.random.default_rng([19, seed])
+        y, _ = noise(random, 24_000, 100.0, 4e-3)
+        row = (np.cumsum(random.gamma(4.0, 0.25, round(y.size * ratio * 0.9))) / ratio).astype(np.int64)
+        recording = a_recording(y[row], 100.0 * ratio)
+        assert "held_samples" in Held().add(recording, 0.0, 0.04, 4e-3)
+        found = look(recording, "gx", GYRO).held_hz
+        assert found is not None and found < 100.0
+
+
+@pytest.mark.parametrize("kind", ["white", "slow noise", "line", "dead band", "walk", "stuck", "means"])
+def test_readings_that_are_equal_by_chance_are_not_held(kind: str) -> None:
+    """On lattices up to 2.5 times the noise: at most 1 of 200 records."""
+    records, fired = case_records(12, 400), 0
+    for seed in range(records):
+        random = np.random.default_rng([20, seed])
+        n, q = int(random.choice([3000, 20_000, 80_000])), float(random.choice([0.0, 0.1, 0.5, 1.0, 1.5, 2.5]))
+        y = random.uniform(-5.0, 5.0) + random.normal(size=n)
+        if kind == "slow noise":
+            a = float(random.choice([0.5, 0.9, 0.98]))
+            y = lfilter([math.sqrt(1.0 - a * a)], [1.0, -a], y)
+        elif kind == "line":
+            y += random.choice([0.5, 2.0, 10.0]) * np.sin(2.0 * np.pi * random.uniform(0.01, 0.5) * np.arange(n))
+        elif kind == "walk":
+            y += np.cumsum(random.normal(size=n)) * random.choice([0.01, 0.1])
+        elif kind == "stuck":
+            for begin in random.integers(0, n, 5):
+                y[begin : begin + random.integers(3, n // 10)] = y[begin]
+        y = np.rint(y / q) * q if q else y
+        if kind == "dead band":
+            y = np.where(np.abs(y) < 1.2, 0.0, y)
+        elif kind == "means":
+            y = y[: n // 5 * 5].reshape(-1, 5).mean(axis=1)
+        fired += held_rows([y], np.arange(y.size), None) is not None
+    assert fired <= records // 200
 
 
 def test_one_slow_axis_leaves_the_others_at_their_rate() -> None:

@@ -67,6 +67,7 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
     recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if far ones recur at one value: their share, and the value `at` which.
+    `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
     `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
     `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
     change of the sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
@@ -83,6 +84,8 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     if readings.recurring is not None:
         share = float(readings.recurring.mask.mean())
         checks["outliers"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.recurring.value * factor}
+    if readings.held is not None and not readings.held.even:
+        checks["held_samples"] = {"value": 1.0 - 1.0 / readings.held.ratio, "limit": 0.0, "passed": False}
     if readings.moved is not None:
         share, start_s = float(readings.moving.mean()), readings.recording.start_s
         times = [[a + start_s, b + start_s] for a, b in readings.moved.intervals]

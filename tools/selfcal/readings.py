@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
+from selfcal.held import Held, held
 from selfcal.lattice import Lattice, lattice_of
 from selfcal.model import Group
 from selfcal.motion import Moved, loud
@@ -34,8 +35,6 @@ SLOPES, SLOPES_LEAST = 10, 8.0
 COMMON_S, COMMON_OFF = 0.5, 3e-3
 #: Longest gap that motion is looked for across, s.
 GAP_MOST_S = 240.0
-#: Runs of equal readings that show held ones at least.
-RUNS_LEAST = 50
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = math.log(1e-9)
 #: Samples on either side that make the level of one.
@@ -99,7 +98,7 @@ class Readings:
     others (see `_unclipped`). In `drawn` [n] a clipped one is drawn by chance beyond its limit. `kept_out` counts the
     stuck, the recurring and the clipped ones.
 
-    `recording`: of the part's own readings, [n] rows. `held_hz`: the rate of the part, where the logger asked oftener.
+    `recording`: of the part's own readings, [n] rows, where the logger `held` each.
     """
 
     recording: Recording
@@ -114,8 +113,13 @@ class Readings:
     recurring: Recurring | None = None
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
-    held_hz: float | None = None
+    held: Held | None = None
     changes: tuple[RateChange, ...] = ()
+
+    @property
+    def held_hz(self) -> float | None:
+        """The rate of the part, where the logger asked oftener."""
+        return None if self.held is None else self.recording.rate_hz
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
         """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
@@ -140,8 +144,8 @@ class Readings:
 def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
     even, changes = evened(recording)
-    own, held_hz = thinned(even, (axis,))
-    return replace(readings_of(own, axis, group), held_hz=held_hz, changes=changes)
+    own, found = thinned(even, (axis,))
+    return replace(readings_of(own, axis, group), held=found, changes=changes)
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
@@ -313,64 +317,37 @@ def _common(intervals: Sequence[float]) -> tuple[int, ...]:
 # -------------------------------------------------------------------------------------------------------- held readings
 
 
-def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, float | None]:
-    """The recording with each reading of the part once, where all of `axes` hold every reading for as long; its rate
-    in Hz. Else the recording as it is, and None."""
-    holds = [_held(recording, name) for name in axes]
-    if not holds or any(one is None for one in holds):
+def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, Held | None]:
+    """The recording with each reading of the part once, where all of `axes` hold every reading for as long. Else the
+    recording as it is, and None."""
+    each = [_held(recording, (name,)) for name in axes]
+    if not axes or any(one is None for one in each):
         return recording, None
-    ratios = [one[0] for one in holds if one is not None]
-    if max(ratios) > 1.01 * min(ratios):
+    ratios = [one.ratio for one in each if one is not None]
+    found = each[0] if len(axes) == 1 else _held(recording, axes)
+    if found is None or max(ratios) > 1.01 * min(ratios):
         return recording, None
-    first = holds[0]
-    assert first is not None
-    ratio, rows = first
-    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
-    missing = np.maximum(0, np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64) - 1)
     columns = {
-        name: one if one.clock is not None else Column(name, one.unit, one.values[rows])
+        name: one if one.clock is not None else Column(name, one.unit, one.values[found.rows])
         for name, one in recording.columns.items()
     }
-    rate = recording.rate_hz / ratio
-    moved = _with_moving(recording, rows, missing, ratio)
-    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved), rate
+    rate, missing = recording.rate_hz / found.ratio, found.missing
+    moved = _with_moving(recording, found.rows, missing, found.ratio)
+    own = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+    return own, found
 
 
 def own_rows(recording: Recording, axis: str) -> Rows | None:
     """The rows that hold a new reading of an axis, where it holds each for several rows; else None."""
-    found = _held(recording, axis)
-    return None if found is None else found[1]
+    found = _held(recording, (axis,))
+    return None if found is None else found.rows
 
 
-def _held(recording: Recording, axis: str) -> tuple[float, Rows] | None:
-    """Rows a reading, and the rows at which readings begin, where a logger asks a part oftener than it measures.
-
-    Readings that repeat by chance make runs of any length, most of them of one. Held ones make few shorter than half
-    of the usual run. A run of several lengths is of as many readings that are equal by chance.
-    """
-    values = recording.columns[axis].values
-    n = values.size
-    changes = np.flatnonzero(np.diff(values) != 0.0) + 1
-    if not RUNS_LEAST <= changes.size < 0.55 * n:
-        return None
-    starts = np.concatenate([[0], changes])
-    lengths = np.diff(starts, append=n)
-    inner = lengths[1:-1]
-    low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
-    if usual < 2 or low <= 0.5 * usual:
-        return None
-    ratio = float(inner[inner <= 1.5 * usual].mean())
-    for _ in range(20):
-        times = np.maximum(1, np.rint(inner / ratio))
-        single = times <= 3
-        again = float(inner[single].sum() / times[single].sum())
-        if abs(again - ratio) < 1e-9 * ratio:
-            break
-        ratio = again
-    times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
-    run = np.repeat(np.arange(starts.size), times)
-    place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
-    return ratio, starts[run] + place * lengths[run] // times[run]
+def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
+    off = recording.off_grid_s
+    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    values = [recording.columns[name].values for name in axes]
+    return held(values, at, None if off is None else off * recording.rate_hz)
 
 
 # ------------------------------------------------------------------------------------------------------- stuck readings

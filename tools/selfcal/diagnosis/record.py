@@ -98,7 +98,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
     recording, changes = evened(recording)
-    recording, held_hz = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
+    recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
     clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
     base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
     block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
@@ -175,15 +175,15 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         if _beyond(values[np.isfinite(values)], group) or clock.rate_hz * dt < SLOWEST:
             continue
         whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
-        rows = own_rows(recording, name) if whole and held_hz is None else None
+        rows = own_rows(recording, name) if whole and held is None else None
         if rows is not None:
             one = look(recording, name, group)
         else:
             one = readings_of(recording if whole else recording.along(name), name, group)
             if not whole:
                 rows, clock = None, replace(one.recording.clock, start_s=clock.start_s)
-        if held_hz is not None and recording.columns[name].clock is None:
-            one = replace(one, held_hz=held_hz)
+        if held is not None and recording.columns[name].clock is None:
+            one = replace(one, held=held)
         each = round(clock.rate_hz * dt)
 
         def spread(values: Array, rows: Rows | None = rows, each: int = each) -> Array:

@@ -131,7 +131,7 @@ def identify(
             for name, cause in suspicions(recording, loaded_model, doubtful).items():
                 document["axes"][name]["suspicion"] = cause
             for name in doubtful:
-                for cause in ("outliers", "saturation", "motion"):  # shown by the readings themselves
+                for cause in ("held_samples", "outliers", "saturation", "motion"):  # shown by the readings themselves
                     if cause in document["axes"][name]["checks"]:
                         document["axes"][name]["suspicion"] = cause
             if model is None:

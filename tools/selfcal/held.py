@@ -1,0 +1,185 @@
+"""Readings that a logger asks for oftener than the part measures: each repeats until the next one.
+
+Asked twice as often and more, most rows repeat: the runs of equal rows show the part. Asked less often, a row repeats
+only now and then: at the beat of the two rates. The phase of that beat tells the repeats from readings that are equal
+by chance. Where the rows come at random the beat is lost. Repeats on a fine lattice are no chance even then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+
+#: Runs of equal readings that show held ones at least.
+RUNS_LEAST = 50
+#: Of a beat: repeats beyond those by chance, their share of the rows and their standard deviations, at least.
+REPEATS_LEAST, SHARE_LEAST, SURE = 50, 0.008, 6.0
+#: Rows that show its line, the power of a line over the mean beyond the largest by chance, and that over the mean in
+#: the blocks that follow its phase.
+HEAD, LINE, IN_BLOCK = 1 << 17, 12.0, 60.0
+#: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
+ONE_EACH = 0.75
+#: Share of the rows in whose phase none repeats, at least, and of the repeats that those phases have, at most.
+SMEARED, LEFT = 0.25, 0.35
+#: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
+CHANCE, RUN_MOST = 0.01, 5
+#: Rows in a bin of the phase, and bins at most.
+IN_BIN, BINS = 50, 100
+
+
+@dataclass(frozen=True)
+class Held:
+    """`rows` [m] at which a new reading of the part begins, `missing` [m]: how many it made unasked before each, and
+    the `ratio` of rows to readings. `even`: the rows show when the readings were made; else their mean rate is known,
+    but for those never asked for."""
+
+    ratio: float
+    rows: Rows
+    missing: Rows
+    even: bool = True
+
+
+def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
+    """The part's own readings among rows [n], where the values of all columns [n] are held; None where they are not.
+
+    `at` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
+    """
+
+    def equal(lag: int) -> Mask:
+        """Whether a row repeats the one so many before, [n]."""
+        found = np.zeros(at.size, bool)
+        found[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
+        return found
+
+    if at.size < 4 * RUNS_LEAST:
+        return None
+    same, again = equal(1), equal(2)
+    return _in_runs(same, at) or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
+
+
+def _in_runs(same: Mask, at: Rows) -> Held | None:
+    """Readings that repeat by chance make runs of any length, most of them of one. Held ones make few shorter than half
+    of the usual run. A run of several lengths is of as many readings that are equal by chance."""
+    n = same.size
+    starts = np.flatnonzero(~same)
+    if not RUNS_LEAST < starts.size < 0.55 * n:
+        return None
+    lengths = np.diff(starts, append=n)
+    inner = lengths[1:-1]
+    low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
+    if usual < 2 or low <= 0.5 * usual:
+        return None
+    ratio = float(inner[inner <= 1.5 * usual].mean())
+    for _ in range(20):
+        times = np.maximum(1, np.rint(inner / ratio))
+        single = times <= 3
+        again = float(inner[single].sum() / times[single].sum())
+        if abs(again - ratio) < 1e-9 * ratio:
+            break
+        ratio = again
+    times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
+    run = np.repeat(np.arange(starts.size), times)
+    place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
+    rows = starts[run] + place * lengths[run] // times[run]
+    apart = np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64)
+    return Held(ratio, rows, np.maximum(0, apart - 1))
+
+
+def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | None:
+    """Rows that repeat the one before at the beat of two rates. `again` [n]: a row equals the one two before, which a
+    held reading does by chance alone."""
+    n = same.size
+    next_one = np.diff(at, prepend=at[0] - 2) == 1
+    share, chance = float(same[next_one].mean()), float(again[next_one].mean())
+    excess, sd = share - chance, math.sqrt((share + chance) / n)
+    if excess < max(SHARE_LEAST, REPEATS_LEAST / n, SURE * sd):
+        return None
+    x = np.where(next_one, same - share, 0.0)
+    size = min(n, HEAD)
+    place = at[:size] - at[0]
+    if place[-1] > 4 * HEAD:
+        return None
+    grid = np.zeros(next_fast_len(4 * (int(place[-1]) + 1), real=True))
+    grid[place] = x[:size]
+    power = np.abs(rfft(grid)) ** 2
+    mean = float(np.median(power)) / math.log(2.0)
+    least = round(SHARE_LEAST * grid.size)
+    most = round(min(0.5, (excess + 3.0 * sd) / (1.0 - chance) / ONE_EACH) * grid.size)
+    top = least + int(np.argmax(power[least : most + 1]))
+    if power[top] < (math.log(size) + LINE) * mean:
+        return None
+    frequency = top / grid.size
+    block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))
+    even = (at - at[0]).astype(np.float64)
+    phase, size_of_line = _phase(x, even, frequency, block)
+    if off is not None:
+        stamped = _phase(x, even + off, frequency, block)
+        phase = stamped[0] if stamped[1] > size_of_line else phase
+    # The share that repeats at each phase: where it is no more than chance the row is a new reading.
+    bins = max(8, min(BINS, n // IN_BIN))
+    bin_of = np.floor((phase % 1.0) * bins).astype(np.int64) % bins
+    count = np.bincount(bin_of[next_one], minlength=bins)
+    there = np.bincount(bin_of[next_one & same], minlength=bins) / np.maximum(count, 1)
+    held_there = (there - chance) > 0.5 * (1.0 - chance) * there
+    # Elsewhere rows are equal by chance alone. A line, or two levels, in the readings changes that chance.
+    elsewhere = next_one & ~held_there[bin_of]
+    if not SMEARED * n < np.count_nonzero(elsewhere) < n - 1:
+        return None
+    left = float(same[elsewhere].mean()) - chance
+    if not -0.05 * chance - 4.0 * sd < left < LEFT * excess + 3.0 * sd:
+        return None
+    rows = np.flatnonzero(~(same & next_one & held_there[bin_of]))
+    # A row repeats where the phase passes a whole number: it is as many readings behind the rows.
+    index = at[rows] - np.floor(phase[rows] + 0.5 * frequency).astype(np.int64)
+    ratio = float(at[rows[-1]] - at[rows[0]]) / float(index[-1] - index[0])
+    ahead = np.maximum.accumulate(index - np.arange(rows.size))
+    missing = np.diff(ahead, prepend=ahead[0])
+    if chance > CHANCE:
+        # The part made a reading more there, and a row was left out: it was equal by chance.
+        equal = np.flatnonzero((missing > 0) & (np.diff(rows, prepend=0) > 1))
+        missing[equal] -= 1
+        rows, missing = np.insert(rows, equal, rows[equal] - 1), np.insert(missing, equal, 0)
+    return Held(ratio, rows, missing)
+
+
+def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
+    """Rows that repeat the one before at no beat, where readings are hardly ever equal by chance. A run of more than
+    RUN_MOST is a stuck one."""
+    n = same.size
+    starts = np.flatnonzero(~same)
+    lengths = np.diff(starts, append=n)
+    repeats = same & np.repeat(lengths <= RUN_MOST, lengths)
+    share, chance = float(repeats.mean()), float((again & ~same).mean())
+    if share < max(SHARE_LEAST, REPEATS_LEAST / n, 10.0 * chance) or chance > CHANCE:
+        return None
+    rows = np.flatnonzero(~repeats)
+    ratio = n / rows.size
+    unasked = np.diff(at[rows] - rows, prepend=at[rows[0]] - rows[0])
+    return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), even=False)
+
+
+def _phase(x: Array, time: Array, frequency: float, block: int) -> tuple[Array, float]:
+    """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
+    the size of the line. It is whole where x is largest."""
+    edges = np.arange(0, max(1, x.size // block)) * block
+    middle = np.add.reduceat(time, edges) / np.diff(edges, append=x.size)
+    phase = frequency * time
+    for _ in range(3):
+        line = np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)
+        turns = np.unwrap(np.angle(line)) / (2.0 * math.pi)
+        if edges.size < 2:
+            phase = phase + turns[0]
+            continue
+        slope = np.diff(turns) / np.diff(middle)
+        phase = phase + np.interp(time, middle, turns)
+        phase += slope[0] * np.minimum(time - middle[0], 0.0) + slope[-1] * np.maximum(time - middle[-1], 0.0)
+    return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())
