@@ -22,6 +22,7 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.held import held as held_rows
+from selfcal.lost_words import recurring_of
 from selfcal.model import Model
 from selfcal.readings import evened, look
 from selfcal.recording import Column, Recording, load, save
@@ -223,6 +224,50 @@ def test_lost_words_are_named_and_spoil_nothing(share: float, rate: float, q: fl
                 one = diagnose_record(of_recording(recording, MODEL, decimate), ["gx"])["gx"]
                 assert [finding.look.cause for finding in one.findings] == ["outliers"]
     held.check()
+
+
+@pytest.mark.parametrize(
+    ("share", "rate", "q", "off", "K"),
+    [(0.02, 100.0, 0.0, 4.0, 0.0), (0.1, 100.0, 0.4, 4.0, 0.0), (0.02, 50.0, 0.1, 3.0, 4e-3),
+     (0.05, 100.0, 1e-3, 1.5, 4e-3), (0.03, 100.0, 0.3, 2.0, 0.0), (0.01, 20.0, 0.05, 4.5, 4e-3),
+     (0.05, 100.0, 0.2, 1.0, 4e-3)],
+)  # fmt: skip
+@pytest.mark.parametrize("word", [0.0, 0.6])
+def test_lost_words_within_the_noise_are_left_out(
+    share: float, rate: float, q: float, off: float, K: float, word: float
+) -> None:
+    """A share of the readings is one value, less than 5 times the noise from the bias, on a lattice to the noise or
+    none: as many are left out as were lost, to 15 % and four standard deviations of the noise's own count."""
+    held, missed, records = Held(), 0, case_records(2, 60)
+    for seed in range(records):
+        random = np.random.default_rng([22, seed, round(100 * off)])
+        y, bias = noise(random, round(400 * rate), rate, K)
+        shift = word - bias[0] + off * 0.04 * math.sqrt(rate) * random.choice([-1.0, 1.0])
+        y, bias = y + shift, bias + shift
+        y = np.rint(y / q) * q if q else y
+        value = y[np.argmin(np.abs(y - word))] if q else word
+        own = np.count_nonzero(y == value)
+        lost = random.uniform(size=y.size) < share
+        y[lost] = value
+        recording = a_recording(y, rate)
+        failed = held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + q * q / 12.0 / rate), K)
+        found = look(recording, "gx", GYRO).recurring
+        if found is None:
+            missed += 1
+            continue
+        assert "outliers" in failed and found.value == value
+        left_out, truth = np.count_nonzero(found.mask), np.count_nonzero(lost)
+        assert abs(left_out - truth) < 0.15 * truth + 4.0 * math.sqrt(own)
+    assert missed <= records // 20
+    held.check()
+
+
+def test_the_codes_of_the_real_runs_are_no_lost_words() -> None:
+    for number in (1, 2, 4):
+        recorded = shared_recording(f"adis16405_run{number}.npz")
+        for name in recorded.columns if case_records(0, 1) else ("gx", "az"):
+            if name in MODEL.axes:
+                assert recurring_of(recorded.columns[name].values[:200_000], recorded.rate_hz) is None, (number, name)
 
 
 #: What moves readings far off, and is no lost word: n, noise, random numbers -> what is added.

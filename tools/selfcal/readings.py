@@ -18,6 +18,7 @@ from scipy.special import log_ndtr, ndtr, ndtri_exp
 
 from selfcal.held import Held, held
 from selfcal.lattice import Lattice, lattice_of
+from selfcal.lost_words import Recurring, recurring_of
 from selfcal.model import Group
 from selfcal.motion import Moved, loud
 from selfcal.recording import Column, Recording
@@ -39,11 +40,6 @@ GAP_MOST_S = 240.0
 LN_STUCK = math.log(1e-9)
 #: Samples on either side that make the level of one.
 AROUND = 32
-#: Far readings that are one value: how many at least, candidates that are looked at, neighbours on either side that
-#: make their level, how far off they are in the noise and how far their neighbours may be, and the evidence, nats.
-RECURS_LEAST, RECURS_LOOKED, RECURS_AROUND, RECURS_FAR, RECURS_NEAR, RECURS_NATS = 5, 6, 8, 5.0, 3.0, 16.0
-#: Steps that their noise is taken of, about, and readings of a candidate that are looked at first, at most.
-RECURS_STEPS, RECURS_SHOWN = 50_000, 500
 #: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
 CLIPPED_LEAST = -math.log(5e-4)
 #: A reading that bears less than this share of an unclipped one's information bears none.
@@ -79,16 +75,6 @@ class Clipped:
     def limit(self) -> float:
         """The limit with the most readings."""
         return max(self.limits, key=lambda limit: int(self.limits[limit].sum()))
-
-
-@dataclass(frozen=True)
-class Recurring:
-    """Readings far from their level that are one `value`: the `mask` [n], and the evidence in nats. A bus that loses a
-    word makes them."""
-
-    value: float
-    mask: Mask
-    nats: float
 
 
 @dataclass(frozen=True)
@@ -157,7 +143,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none, none)
     sound = values if inside.all() else np.where(inside, values, np.nan)
-    recurring = _recurring(sound, recording.rate_hz)
+    recurring = recurring_of(sound, recording.rate_hz)
     if recurring is not None:
         values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
     lattice = lattice_of(sound[np.isfinite(sound)], recording.rate_hz)
@@ -391,65 +377,6 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
         return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
     nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
     return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
-
-
-# --------------------------------------------------------------------------------------------------- recurring readings
-
-
-def _recurring(values: Array, rate_hz: float) -> Recurring | None:
-    """Readings [n] of one value, each far from the level of its neighbours, where that lattice of theirs has no reason
-    to come to this value so often.
-
-    A value counts where its neighbours rest: in motion a part comes to its limits. The evidence is that of its count
-    over the count of a cell about it (Poisson).
-    """
-    rows = np.flatnonzero(np.isfinite(values))
-    y = values[rows]
-    if y.size < 8 * RECURS_AROUND:
-        return None
-    steps = np.abs(np.diff(y))
-    # Lost words are in fewer than two fifths of the steps; on a lattice coarser than the noise most steps are none.
-    some = steps[:: max(1, steps.size // RECURS_STEPS)]
-    sigma = max(float(np.median(some)) / 0.6745, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
-    jump = steps > (RECURS_FAR - 1.0) * sigma
-    if not sigma > 0.0 or np.count_nonzero(jump) < RECURS_LEAST:
-        return None
-    jumps = np.unique(np.concatenate([np.flatnonzero(jump), np.flatnonzero(jump) + 1]))
-    unique, counts = np.unique(y[jumps], return_counts=True)
-    beside = np.delete(np.arange(-RECURS_AROUND, RECURS_AROUND + 1), RECURS_AROUND)
-    best: Recurring | None = None
-    for place in np.argsort(-counts, kind="stable")[:RECURS_LOOKED]:
-        value = float(unique[place])
-        if counts[place] < RECURS_LEAST:
-            break
-        some = jumps[y[jumps] == value][:RECURS_SHOWN]
-        about = y[np.clip(some[:, None] + beside, 0, y.size - 1)]
-        if not np.median(np.abs(value - np.median(about, axis=1))) > RECURS_FAR * sigma:
-            continue  # of the noise, as most are
-        own = y == value
-        others = np.flatnonzero(~own)
-        at = np.flatnonzero(own)
-        if others.size < 2 * at.size:
-            continue
-        # The same number of other readings on either side.
-        first = np.clip(np.searchsorted(others, at) - RECURS_AROUND, 0, others.size - 2 * RECURS_AROUND)
-        around = y[others[first[:, None] + np.arange(2 * RECURS_AROUND)]]
-        level = np.median(around, axis=1)
-        near = np.quantile(np.abs(around - level[:, None]), 0.75, axis=1) < RECURS_NEAR * sigma
-        far = np.abs(value - level) > RECURS_FAR * sigma
-        count = int((near & far).sum())
-        if count < RECURS_LEAST or 2 * count < at.size:
-            continue
-        lattice = lattice_of(y[others], rate_hz)
-        width = max(2.0 * sigma, 4.0 * lattice.step if lattice is not None else 0.0)
-        cells = 2.0 * width / lattice.step if lattice is not None else 20.0
-        expected = (np.count_nonzero(np.abs(y[others] - value) < width) + 1.0) / cells
-        nats = count * math.log(count / expected) - count + expected - math.log(unique.size)
-        if count > expected and nats > RECURS_NATS and (best is None or nats > best.nats):
-            mask = np.zeros(values.size, bool)
-            mask[rows[at[far]]] = True
-            best = Recurring(value, mask, min(1e6, float(nats)))
-    return best
 
 
 # ----------------------------------------------------------------------------------------------------- clipped readings

@@ -123,7 +123,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 failed.append(f"not adequate: {name}: lattice: {step}: {meaning}")
             elif not outcome["passed"] and check == "outliers":
                 share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
-                failed.append(f"not adequate: {name}: outliers: {share}, far from the rest: lost words of the bus?")
+                failed.append(f"not adequate: {name}: outliers: {share}, too many for noise: lost words of the bus?")
             elif not outcome["passed"] and check == "held_samples":
                 share = f"{100.0 * outcome['value']:.2g} % of the rows repeat the one before at no fixed rate"
                 failed.append(f"not adequate: {name}: held_samples: {share}: log at the sensor's own rate")

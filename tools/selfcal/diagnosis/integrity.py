@@ -128,7 +128,7 @@ def held_samples(record: Record, axis: str) -> Look | None:
 
 
 def recurring(record: Record, axis: str) -> Look | None:
-    """Far readings that are one value."""
+    """Readings that are one value too often."""
     readings = record.readings.get(axis)
     if readings is None or readings.recurring is None:
         return None
