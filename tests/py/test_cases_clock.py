@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from selfcal.errors import UserError
 from selfcal.recording import load
 from selfcal.sampling import Ambiguous, sampling
+from selfcal.timebase import clock_of
 
 from conftest import case_records
 
@@ -95,3 +98,25 @@ def test_the_lattice_of_the_stamps_is_not_taken_for_the_grid(rate_hz: float, los
         except Ambiguous:
             continue
         assert rate == pytest.approx(rate_hz, rel=1e-3)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.05, 0.14])
+@pytest.mark.parametrize("lost", [0.6, 0.8])
+def test_a_stated_rate_is_taken_however_many_samples_are_lost(jitter: float, lost: float) -> None:
+    """The rate right or 0.02 % off: each sample has its place. Twice, half and 4/3 of the rate are refused."""
+
+    def fail(row: int, why: str) -> NoReturn:
+        raise UserError(f"row {row}: {why}")
+
+    for seed in range(case_records(2, 30)):
+        random = np.random.default_rng(seed)
+        kept = np.flatnonzero(random.random(ROWS) >= lost)
+        time = np.sort(kept + jitter * random.standard_normal(kept.size)) / RATE_HZ
+        time = np.round(time - time[0], 6)
+        for stated in (RATE_HZ, 1.0002 * RATE_HZ):
+            clock = clock_of("log.csv", time, 1e-6, stated, fail)
+            assert clock.rate_hz == stated
+            assert abs(int(clock.missing_before.sum()) - int(np.ptp(kept)) - 1 + kept.size) <= 0.0003 * ROWS + 1
+        for wrong in (2.0, 0.5, 1.333):
+            with pytest.raises(UserError, match="does not agree with --rate"):
+                clock_of("log.csv", time, 1e-6, wrong * RATE_HZ, fail)

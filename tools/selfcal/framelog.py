@@ -101,7 +101,8 @@ def check_suffix(path: Path | str) -> None:
 class FrameLog:
     """The frames of a log, `speed` times as fast as they came; None: as fast as they are read.
 
-    `closed` at its end; `damage` says why that came early, if it did. `malformed` stays 0, as `Link` has it.
+    `closed` at its end; `damage` says why that came early, if it did. `malformed` counts damaged lines of a text log:
+    they are left out, but for the first.
     """
 
     def __init__(self, path: Path | str, speed: float | None = None) -> None:
@@ -157,12 +158,22 @@ class FrameLog:
 
     def _next(self) -> can.Message | None:
         """The next frame of the file; None at its end. Raises _NoFrame, and whatever python-can's readers do."""
-        frame = next(self._frames, None)
-        if frame is not None:
-            self._read += 1
-            if not math.isfinite(frame.timestamp):
-                raise _NoFrame(f"frame {self._read} has the time stamp {frame.timestamp:g}")
-        return frame
+        import can
+
+        while True:
+            try:
+                frame = next(self._frames, None)
+                if frame is not None and not math.isfinite(frame.timestamp):
+                    raise _NoFrame(f"frame {self._read + 1} has the time stamp {frame.timestamp:g}")
+            except Exception:
+                # Other readers of python-can do not go on after a line that they stumble over.
+                if not self._read or not isinstance(self._reader, _Lines | can.CanutilsLogReader):
+                    raise
+                self.malformed += 1
+                self._frames = iter(self._reader)
+                continue
+            self._read += frame is not None
+            return frame
 
     def _said(self, error: Exception) -> str:
         return str(error) if isinstance(error, _NoFrame) else f"frame {self._read + 1} cannot be read"
@@ -202,11 +213,12 @@ class _Lines:
 
     def __init__(self, path: Path, frame: Callable[[str], can.Message], skip: int) -> None:
         self._file: TextIO = path.open(encoding="ascii", errors="replace")
+        self._numbered = enumerate(self._file, start=1)
         self._frame = frame
         self._skip = skip
 
     def __iter__(self) -> Iterator[can.Message]:
-        for number, line in enumerate(self._file, start=1):
+        for number, line in self._numbered:
             if number > self._skip and line.strip():
                 try:
                     yield self._frame(line)

@@ -465,6 +465,7 @@ def _of_clock(clock: Clock) -> list[str]:
         return []
     spread = float(np.diff(clock.off_grid_s).std()) * clock.rate_hz
     told = f"the stamps lie on no grid: their mean rate, {clock.rate_hz:.4g} Hz, is taken; no lost sample shows"
+    told += ": --rate HZ states another"
     return [told] if spread > _NO_GRID else []
 
 

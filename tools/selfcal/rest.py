@@ -95,8 +95,8 @@ def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> s
     rest = rest_of(recording, [name for name in model.axes if name in recording.columns])
     text = f"outside the model's priors, {said}"
     if not rest.moved or rest.longest is None:
-        where = "it is quiet throughout" if rest.longest is not None else "it is too short to see motion in it"
-        return f"{text}; {where}: check the unit, or widen these priors in the model file"
+        where = "no part of it is quieter" if rest.longest is not None else "it is too short to see motion in it"
+        return f"{text}; {where}: take another stretch if it is shaken, check the unit, or widen these priors"
     listed = ", ".join(f"{a:.10g} to {b:.10g} s" for a, b in rest.moved[:MOST_LISTED])
     more = f" and {len(rest.moved) - MOST_LISTED} times more" if len(rest.moved) > MOST_LISTED else ""
     first, last = rest.longest

@@ -52,6 +52,8 @@ _MEAN, _GAP = 1.2, 20.0
 #: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
 #: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
+#: Rows over which a stated grid's phase is followed.
+_PIECE_OF_GRID = 100
 #: Least share of the samples of an even grid that is left: of fewer, random stamps on a lattice look alike.
 _KEPT = 0.4
 #: Rows that show it, rows looked at, and the power of a line over the mean beyond the largest of as many by chance.
@@ -86,6 +88,8 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         except Ambiguous:
             if rate is None:
                 raise  # a stated rate decides, and is checked by who knows it
+    if rate is not None and thinned_grid(time, 1.0 / rate):
+        return _on_grid(time, 1.0 / rate)
     positive = steps[steps > 0.0]
     first = float(np.median(positive[positive < 1.5 * np.median(positive)])) if rate is None else 1.0 / rate
     dt, missing = _fine(time, steps, first)
@@ -104,9 +108,14 @@ def _even(time: NDArray[np.float64], dt: float) -> bool:
     rows = time[: time.size // length * length].reshape(-1, length)
     rows = rows[:: math.ceil(len(rows) / _STRETCHES)]
     turns = (rows - rows[:, :1]) / dt
-    off = np.arange(-_TRIED, _TRIED + 1) / (2.0 * length)
+    off = np.arange(-_TRIED, _TRIED + 1) / (2.0 * max(length, float(np.median(turns[:, -1]))))
     lengths = [np.abs(np.exp(2j * math.pi * turns * (1.0 + each)).mean(axis=1)) ** 2 for each in off]
     return bool(np.median(np.max(lengths, axis=0)) > _COHERENT)
+
+
+def thinned_grid(time: NDArray[np.float64], dt: float) -> bool:
+    """Whether stamps lie on a grid of `dt` and on none of two or three times that: it lost samples, however many."""
+    return _even(time, dt) and not _even(time, 2.0 * dt) and not _even(time, 3.0 * dt)
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -264,6 +273,20 @@ def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> F
             break
         missing = again
     return dt, missing
+
+
+def _on_grid(time: NDArray[np.float64], dt: float) -> Found:
+    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record."""
+    edges = np.arange(0, max(1, time.size // _PIECE_OF_GRID)) * _PIECE_OF_GRID
+    turns = time / dt
+    for _ in range(3):
+        mean = np.add.reduceat(np.exp(2j * math.pi * turns), edges)
+        phase = np.unwrap(np.angle(mean)) / (2.0 * math.pi)
+        middle = np.add.reduceat(time, edges) / np.diff(edges, append=time.size)
+        turns = turns - (np.interp(time, middle, phase) if edges.size > 1 else phase[0])
+    place = np.maximum.accumulate(np.rint(turns).astype(np.int64) - np.arange(time.size))
+    missing = np.diff(place, prepend=place[0])
+    return float(time[-1]) / (time.size - 1 + int(missing.sum())), missing
 
 
 def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:

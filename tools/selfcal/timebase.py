@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from selfcal.errors import UserError
 from selfcal.limits import LEAST_RATE_HZ, LONGEST, MOST_RATE_HZ
-from selfcal.sampling import Ambiguous, sampling
+from selfcal.sampling import Ambiguous, sampling, thinned_grid
 
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
@@ -132,7 +132,8 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not np.isfinite(time[-1]):
         raise UserError(f"{path}: column 't' spans more than a number can hold")
     found, missing = _sampling(path, time, noise_s, rate, fail)
-    if rate is not None and (not 0.9 < found / rate < 1.1 or 2 * np.count_nonzero(missing) > missing.size):
+    lossy = 2 * np.count_nonzero(missing) > missing.size
+    if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
     rate = found if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
