@@ -25,6 +25,7 @@
 #   make setup                  the set-up alone
 #   make setup-all              every reader of other programs' logs too (400 MB); `make test` runs it
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
+#   make setup-packages         what packs lib/ for the registries of PlatformIO and ESP-IDF (70 MB)
 #   make lock [UPGRADE=1 | UPGRADE=name]
 #                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
@@ -112,8 +113,8 @@ lock:
 	    --python-version 3.11 --constraint requirements.txt --output-file requirements-$$group.txt || exit 1; done
 	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --output-file requirements-all.txt pyproject.toml
 
-# Packages that few need, each group by itself: `make setup-rivals`, `make setup-cluster`.
-OPTIONAL := rivals cluster
+# Packages that few need, each group by itself: `make setup-rivals` and so on.
+OPTIONAL := rivals cluster packages
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
 	$(PIP_INSTALL) --requirement tools/requirements-$*.txt

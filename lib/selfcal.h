@@ -11,7 +11,8 @@
  * HOW TO INTEGRATE
  *   1. `selfcal codegen MODEL.yaml -o DIR` writes selfcal_model.c and .h (const tables, for flash) and selfcal_config.h
  *      (sizes that follow from the model).
- *   2. Copy lib/ and these three files into the product. The library needs <string.h> and <math.h>.
+ *   2. Copy lib/ and these three files into the product, or take one of the manifests in lib/ (README.md). Tables of
+ *      the default model are in default/. The library needs <string.h> and <math.h>.
  *   3. Give selfcal_init() the model and SELFCAL_MODEL_BYTES of memory. The memory stays yours; nothing is allocated.
  *   4. selfcal_push() every sample, selfcal_skip() every missing one. The cost of a push is even: SELFCAL_BATCH bank
  *      samples are gathered, and while the next ones are, each push runs some nodes over them.

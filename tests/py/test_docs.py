@@ -242,7 +242,7 @@ def test_the_product_is_built_and_prints_as_printed(tmp_path: Path) -> None:
     document = ROOT / "lib" / "README.md"
     (tmp_path / "product.c").write_text(blocks(document, "c")[0], encoding="utf-8")
     (tmp_path / "CMakeLists.txt").write_text(blocks(document, "cmake")[0], encoding="utf-8")
-    as_c, as_cpp, by_cmake = blocks(document, "sh")
+    as_c, as_cpp, by_cmake, _ = blocks(document, "sh")
     said = blocks(document, "text")[0]
     feed = as_c.splitlines()[-1]
     shell(as_c, tmp_path)

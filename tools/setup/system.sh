@@ -24,6 +24,7 @@ missing_packages() {
     need make have make
     need cmake have cmake
     need ninja-build have ninja
+    need pkg-config have pkg-config
     need libeigen3-dev header eigen3/Eigen/Core g++
     need clang have clang
     need clang-tidy have clang-tidy

@@ -1,0 +1,43 @@
+/* Made by `selfcal codegen` from the model 'default'. Do not edit. */
+#ifndef SELFCAL_MODEL_H
+#define SELFCAL_MODEL_H
+
+#include "selfcal.h"
+
+#define SELFCAL_MODEL_ID 0xE5D59D27UL
+#define SELFCAL_MODEL_NODES 209U
+#define SELFCAL_MODEL_AXES 6U
+#define SELFCAL_MODEL_HYPOTHESES 3U
+#define SELFCAL_MODEL_REGRESSORS 0U
+/* 1: it handles steps of the bias, or changes of the noise (lib/changes.c). */
+#define SELFCAL_MODEL_CHANGES 0
+/* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units. */
+#define SELFCAL_MODEL_CHANNELS 0U
+/* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
+#define SELFCAL_MODEL_CHANNELS_READ 1
+/* With SELFCAL_FIXED no record overflows (lib/bank_kernel_fixed.c). The coarsest step of each axis that readings within
+ * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
+ * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */
+#define SELFCAL_MODEL_EXPONENTS {-17, -17, -17, -18, -18, -18}
+#define SELFCAL_MODEL_TERM_NODES 0U
+/* What selfcal_init() wants. */
+#define SELFCAL_MODEL_BYTES     (SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) +      SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) +      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
+/* Rate of the samples, Hz. */
+#define SELFCAL_MODEL_RATE_HZ 819.2F
+/* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */
+#define SELFCAL_MODEL_RATE_MILLIHZ 819200UL
+/* 1: every axis is one of lib/selfcal.dbc, in the unit that it has there. The library alone takes any. */
+#define SELFCAL_MODEL_UNITS_SENT 1
+/* 1: selfcal_model_gate is there. */
+#define SELFCAL_MODEL_GATE 1
+
+extern const selfcal_model_t selfcal_model;
+extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
+#if SELFCAL_MODEL_CHANNELS > 0
+extern const char *const selfcal_model_channel_name[SELFCAL_MODEL_CHANNELS];
+#endif
+#if SELFCAL_MODEL_GATE
+extern const selfcal_gate_config_t selfcal_model_gate;
+#endif
+
+#endif
