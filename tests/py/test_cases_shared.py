@@ -57,9 +57,9 @@ def settled(axes: dict[str, Array], rate: float = 1.0) -> tuple[dict[str, Diagno
 
 def gain_of(finding: Finding, record: Record) -> float:
     """Held-out gain, nats a sample."""
-    held_out, _ = score.gain(finding.look, finding.before, finding.after, record, finding.partner)
-    assert held_out is not None
-    return float(held_out["log_score_per_sample"]["after"] - held_out["log_score_per_sample"]["before"])
+    found = score.gain(finding.look, finding.before, finding.after, record, finding.partner).gain
+    assert found is not None
+    return float(found["log_score_per_sample"]["after"] - found["log_score_per_sample"]["before"])
 
 
 @pytest.mark.parametrize("kind", ["plain", "gaps", "breathing", "event", "line"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
 
@@ -83,7 +84,8 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
     look = finding.look
     inner = finding.before.unit
     try:
-        held_out, reason = gain(look, finding.before, finding.after, record, finding.partner)
+        known = finding.held_out or gain(look, finding.before, finding.after, record, finding.partner)
+        held_out, reason = deepcopy(known.gain), known.reason
     except Stopped:
         held_out, reason = None, "there was no time left to measure it"
     if held_out is not None:

@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State
 from selfcal.diagnosis.statistics import Statistic
 
+#: A finding whose gain lies so many standard deviations below 0 is none.
+HARM_SD = 2.0
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The contract's `gain` of one finding, or None with the `reason`."""
+
+    gain: dict[str, Any] | None
+    reason: str | None = None
+
+    @property
+    def harms(self) -> bool:
+        """Whether the finding predicts the rest of the record clearly worse."""
+        if self.gain is None:
+            return False
+        score = self.gain["log_score_per_sample"]
+        return bool(score["after"] - score["before"] < -HARM_SD * score["sd"])
+
 
 @dataclass(frozen=True)
 class Finding:
-    """One named cause on one axis. `partner`: the other axis, of a cause that two share."""
+    """One named cause on one axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where
+    the loop has asked for it."""
 
     look: Look
     round: int
@@ -20,12 +41,13 @@ class Finding:
     also_possible: tuple[str, ...] = ()
     shared_with: tuple[str, ...] = ()
     partner: State | None = None
+    held_out: HeldOut | None = None
 
 
 @dataclass
 class Diagnosed:
-    """One axis after the loop: what it began as, what it is, and what was found in which record. `unfinished`: why it
-    is not done, "" if it is."""
+    """One axis after the loop: what it began as, what it is, and what was found in which record. `harmful`: looks that
+    predict held-out time clearly worse, which are no findings. `unfinished`: why it is not done, "" if it is."""
 
     first: State
     state: State
@@ -33,7 +55,7 @@ class Diagnosed:
     findings: list[Finding] = field(default_factory=list)
     before: list[Statistic] = field(default_factory=list)
     after: list[Statistic] = field(default_factory=list)
-    refused: list[Look] = field(default_factory=list)
+    harmful: list[Look] = field(default_factory=list)
     unfinished: str = ""
 
     @property

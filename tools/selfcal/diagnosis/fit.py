@@ -148,13 +148,21 @@ def run(
 ) -> tuple[list[Sums], Array, Array]:
     """One pass, counted as work; sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their
     variances [n]."""
+    G, D, n, x, white, s = passed(series, terms, theta, marks, innovations)
+    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(G))], white, s
+
+
+def passed(
+    series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
     work.count(series.y.size, len(series.columns))
     m = matrices(terms, theta, series.dt, series.duration_s)
     at = list(marks) or [series.y.size]
-    G, D, n, x, white, s = _likelihood.run(
+    found: tuple[Array, Array, Array, Array, Array, Array] = _likelihood.run(
         series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, innovations
     )
-    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
+    return found
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,6 @@ LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cau
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and cause.stationary)
 CERTAIN = 25.0
-#: Motion whose held-out gain lies so many standard deviations below 0 is none.
-HARM_SD = 2.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
 #: Looks of a cause at an axis of a record, by the record's states: these stay alive with it.
@@ -159,9 +157,12 @@ def _integrity(
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
         parts = [each[name] for each in (handled, moved) if name in each]
         look = motion.look_of(parts) if parts else None
-        if look is not None and (name in handled or not _harms(look, one.state, states[name], record)):
-            shared = tuple(other for other in {**handled, **moved} if other != name)
-            one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared))
+        if look is not None:
+            # Motion that is left out already spoilt the first state.
+            known = None if name in handled else score.gain(look, one.state, states[name], record)
+            if known is None or not known.harms:
+                shared = tuple(other for other in {**handled, **moved} if other != name)
+                one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared, held_out=known))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
@@ -181,15 +182,6 @@ def _integrity(
     return replace(record, axes=states)
 
 
-def _harms(look: Look, before: State, after: State, record: Record) -> bool:
-    """Whether the rest of the record is predicted clearly worse without the samples that a finding leaves out."""
-    held_out, _ = score.gain(look, before, after, record)
-    if held_out is None:
-        return False
-    found = held_out["log_score_per_sample"]
-    return bool(found["after"] - found["before"] < -HARM_SD * found["sd"])
-
-
 def _rounds(
     record: Record,
     one: Diagnosed,
@@ -199,11 +191,9 @@ def _rounds(
     seen: Seen | None = None,
     provisional: bool = False,
 ) -> None:
-    first = 1 + max((finding.round for finding in one.findings), default=0)
+    number = 1 + max((finding.round for finding in one.findings), default=0)
     idle: set[Looks] = set()
-    for number in range(first, ROUNDS + 1):
-        if one.state.below_lattice:
-            return
+    while number <= ROUNDS and not one.state.below_lattice:
         advance(f"{one.state.axis}: round {number}")
         waiting = [cause for cause in causes if cause in idle]
         looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least, seen)
@@ -212,17 +202,23 @@ def _rounds(
             looks, idle = _by_worth([*looks, *more]), idle | unworthy
         else:
             idle |= set(waiting)
-        one.refused = looks
         if not looks or looks[0].net < least:
             return
         if len(one.findings) < BUSY:
             idle = set()
-        best = looks[0] if provisional else looks[0].measured()
+        best = looks[0]
         rivals = tuple(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )
-        before, one.state = one.state, one.state.refit(**best.changes)
-        one.findings.append(Finding(best, number, before, one.state, also_possible=rivals))
+        before, after = one.state, one.state.refit(**best.changes)
+        known = None if provisional else score.gain(best, before, after, record)
+        if known is not None and known.harms:
+            one.harmful.append(best)
+            continue
+        one.state = after
+        measured = best if provisional else best.measured()
+        one.findings.append(Finding(measured, number, before, after, rivals, held_out=known))
+        number += 1
 
 
 def _looked(
@@ -243,7 +239,11 @@ def _looked(
     for cause in causes:
         if (cause, axes) not in known:
             known[cause, axes] = cause(one.state, record), record
-        looks = [look for look in known[cause, axes][0] if named[look.cause] < (CAUSES[look.cause].most or ROUNDS)]
+        looks = [
+            look
+            for look in known[cause, axes][0]
+            if named[look.cause] < (CAUSES[look.cause].most or ROUNDS) and not any(map(look.repeats, one.harmful))
+        ]
         found += looks
         if all(look.net < least for look in looks):
             idle.add(cause)

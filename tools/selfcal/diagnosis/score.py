@@ -1,23 +1,28 @@
-"""What a finding gains on held-out time: the first half trains, the second is predicted from earlier samples only.
+"""What a finding gains on held-out time: the evidence of the second half, each sample predicted from earlier ones only.
 
-Parameters and coefficients are those of the first half; nothing that is scored was seen by them. A line's frequency is
-looked for anew in the first half. The place of a step or of a change is the whole record's.
+The prediction is over the posterior that the earlier samples leave. Coefficients have the prior of an extended model
+file, the white noise has none. The drift's parameters are a sum over nodes that the whole record leaves possible.
+What no posterior covers is looked for anew in the first half (`Cause.trained`). A column that is nothing in the first
+half was chosen by what is scored, so the price of its search is charged.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammaln, logsumexp, softmax
 
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.fit import Fit, Series, best, fit, moved
+from selfcal.diagnosis.extend import WIDE
+from selfcal.diagnosis.finding import HeldOut
+from selfcal.diagnosis.fit import Fit, passed, run
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array, matrices
+from selfcal.diagnosis.statemodel import Array, Mask, matrices
+from selfcal.readings import Rows
 
 #: How far ahead the bias is predicted, s.
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
@@ -25,122 +30,215 @@ HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 PIECES = 24
 #: Predictions of the bias at most.
 PREDICTIONS = 300
+#: Samples to score, and between the first and the last prediction, at least.
+LEAST = 30
 
 
 @dataclass(frozen=True)
-class Trained:
-    """A state whose model was fitted on its first samples alone: innovations' ln density of every later one, [n], and
-    residual innovations [n]."""
+class Sequential:
+    """One model along the record: ln evidence [marks] of the samples before each mark, and by horizon the bias that
+    is predicted from each of its places."""
 
-    ln_density: Array
-    residual: Array
-    fit: Fit
-    series: Series
+    ln_evidence: Array
+    bias: Mapping[float, Array]
 
 
-def gain(
-    look: Look, before: State, after: State, record: Record, partner: State | None = None
-) -> tuple[dict[str, Any] | None, str | None]:
-    """The contract's `gain` of one finding, or None with the reason. `partner`: the axis that shares the cause."""
+@dataclass(frozen=True)
+class Cut:
+    """The scored time: `edges` [pieces + 1], samples that count of each piece `sizes`, and places `marks` among which
+    the pieces lie, where the samples that are left `out` [n] of one model begin and end too: neither scores them."""
+
+    edges: Rows
+    marks: Rows
+    sizes: Rows
+    out: Mask
+
+    def scores(self, ln_evidence: Array) -> Array:
+        """Log score a sample [pieces] from ln evidence at the marks."""
+        steps = np.where(self.out[self.marks[:-1]], 0.0, np.diff(ln_evidence))
+        return np.asarray(np.add.reduceat(steps, np.searchsorted(self.marks, self.edges[:-1])) / self.sizes)
+
+
+def gain(look: Look, before: State, after: State, record: Record, partner: State | None = None) -> HeldOut:
+    """What one finding gains. `partner`: the axis that shares the cause."""
     cause = CAUSES[look.cause]
     if cause.no_gain:
-        return None, cause.no_gain
+        return HeldOut(None, cause.no_gain)
     n = before.y.size
     split = n // 2
-    if cause.together is not None and partner is not None:
-        return _joint(cause.together, look, (before, partner), split)
-    if before is after:
-        return None, "the readings are left out before and after: the model of the noise is the same"
+    joint = cause.together is not None and partner is not None
+    if before is after and not joint:
+        return HeldOut(None, "the readings are left out before and after: the model of the noise is the same")
     if cause.onset and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
             split = place + max(20, (n - place) // 4)
         if n - split < max(60, n // 20):
-            return None, "too little of the record is left after its detection"
+            return HeldOut(None, "too little of the record is left after its detection")
     if cause.trained is not None:
         after = cause.trained(look, before, after, record, split)
-    old, new = _trained(before, split), _trained(after, split)
-    both = np.isfinite(old.ln_density) & np.isfinite(new.ln_density)
-    both[:split] = False
-    if both.sum() < 30:
-        return None, "too few samples are left to score"
-    parts = [np.array([part.mean() for part in np.array_split(one.ln_density[both], PIECES)]) for one in (old, new)]
-    difference = parts[1] - parts[0]
-    sd = float(difference.std(ddof=1)) / math.sqrt(PIECES)
-    return {
-        "log_score_per_sample": {
-            "before": float(old.ln_density[both].mean()),
-            "after": float(new.ln_density[both].mean()),
-            "sd": sd,
-            "samples": int(both.sum()),
-        },
-        "bias_rmse": {"unit": before.unit, "horizon_s": _errors(old, new, split)},
-    }, None
+    cut = _cut(before, partner if joint and partner is not None else after, split)
+    if cut is None:
+        return HeldOut(None, "too few samples are left to score")
+    if cause.together is not None and partner is not None:
+        # The joint log score of two axes less the other one's own is the first one's given the other.
+        old = _sequential(before, cut.marks, {})
+        one, two = (_residual(state, split) for state in (before, partner))
+        more, sd = cause.together(one, two, before.dt, split, look.estimate)
+        scores = cut.scores(old.ln_evidence)
+        return _held_out(cut, scores, scores + more, sd, before.unit, {})
+    horizons = _horizons(before.dt, n, split)
+    cut = replace(cut, marks=np.union1d(cut.marks, np.concatenate([*horizons.values(), cut.edges])))
+    old, new = (_sequential(state, cut.marks, horizons) for state in (before, after))
+    scores, later = cut.scores(old.ln_evidence), cut.scores(new.ln_evidence)
+    at = int(np.searchsorted(cut.edges, _begin(before, after, split), "right")) - 1
+    later[at] -= _price(look, before, after, split) / cut.sizes[at]
+    sd = float((later - scores).std(ddof=1)) / math.sqrt(PIECES)
+    return _held_out(cut, scores, later, sd, before.unit, _errors(after, old, new, cut.marks, horizons))
 
 
-def _joint(
-    together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]],
-    look: Look,
-    pair: tuple[State, State],
-    split: int,
-) -> tuple[dict[str, Any] | None, str | None]:
-    """After: the joint log score of two axes less the other one's own, which is the first one's given the other. The
-    bias is predicted alike."""
-    one, two = (_trained(state, split) for state in pair)
-    both = np.isfinite(one.ln_density) & np.isfinite(two.ln_density)
-    both[:split] = False
-    if both.sum() < 30:
-        return None, "too few samples are left to score"
-    more, sd = together(one.residual, two.residual, one.series.dt, split, look.estimate)
-    before = float(one.ln_density[both].mean())
-    return {
-        "log_score_per_sample": {"before": before, "after": before + more, "sd": sd, "samples": int(both.sum())},
-        "bias_rmse": {"unit": pair[0].unit, "horizon_s": {}},
-    }, None
-
-
-def _trained(state: State, split: int) -> Trained:
-    series = state.series
-    first = Series(series.y[:split], series.dt, series.r[:split], np.ascontiguousarray(series.columns[:, :split]))
-    chosen = best([fit(first, terms, _start(state, terms)) for terms in state.bases()])
-    # The transitions of 1/f noise depend on the length: keep those of the half.
-    _, white, s = _pass(series, chosen)
-    residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
-    ln_density = -0.5 * (residual**2 + np.log(2.0 * math.pi * chosen.sigma**2 * s))
-    return Trained(np.where(np.isfinite(series.y), ln_density, np.nan), residual, chosen, series)
-
-
-def _start(state: State, terms: Any) -> Array:
-    return moved(next((one for one in state.fits if one.terms == terms), state.best), terms)
-
-
-def _pass(series: Series, chosen: Fit, marks: list[int] | None = None) -> tuple[list[Any], Array, Array]:
-    from selfcal import _likelihood
-    from selfcal.diagnosis.fit import Sums
-
-    m = matrices(chosen.terms, chosen.theta, chosen.dt, chosen.duration_s)
-    at = marks or [series.y.size]
-    G, D, n, x, white, s = _likelihood.run(
-        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, marks is None
+def _held_out(
+    cut: Cut, before: Array, after: Array, sd: float, unit: str, ahead: Mapping[str, Mapping[str, float]]
+) -> HeldOut:
+    """From the scores of the pieces."""
+    share = cut.sizes / cut.sizes.sum()
+    return HeldOut(
+        {
+            "log_score_per_sample": {
+                "before": float(before @ share),
+                "after": float(after @ share),
+                "sd": sd,
+                "samples": int(cut.sizes.sum()),
+            },
+            "bias_rmse": {"unit": unit, "horizon_s": ahead},
+        }
     )
-    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(at))], white, s
 
 
-def _errors(old: Trained, new: Trained, split: int) -> dict[str, dict[str, float]]:
+def _cut(one: State, two: State, split: int) -> Cut | None:
+    """The scored time in pieces of equal size; None: too few samples are left."""
+    n = one.y.size
+    there = [np.isfinite(state.y) for state in (one, two)]
+    kept = split + np.flatnonzero((there[0] & there[1])[split:])
+    if kept.size < LEAST:
+        return None
+    pieces = np.array_split(kept, PIECES)
+    edges = np.array([split, *(piece[0] for piece in pieces[1:]), n])
+    out = there[0] != there[1]
+    changes = split + 1 + np.flatnonzero(np.diff(out[split:]))
+    return Cut(edges, np.union1d(edges, changes), np.array([piece.size for piece in pieces]), out)
+
+
+def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
+    """By horizon the samples from which the bias is predicted, where there are enough."""
+    places = np.unique(np.linspace(split, n - 1, PREDICTIONS).astype(np.int64))
+    found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
+    return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= LEAST}
+
+
+def _ahead(horizon: float, dt: float) -> int:
+    return max(1, round(horizon / dt))
+
+
+def _window(dt: float) -> int:
+    """Samples of the mean that is the reading of a bias: one second."""
+    return max(1, round(1.0 / dt))
+
+
+def _added(before: State, after: State) -> list[Array]:
+    """The columns that a finding has added."""
+    known = {one.name for one in before.regressors}
+    return [one.values for one in after.regressors if one.name not in known]
+
+
+def _begin(before: State, after: State, split: int) -> int:
+    """The first scored sample that the finding's columns change."""
+    return split + min((int(np.argmax(one[split:] != 0.0)) for one in _added(before, after)), default=0)
+
+
+def _price(look: Look, before: State, after: State, split: int) -> float:
+    """Nats that the search costs where the finding's columns are nothing before the scored samples."""
+    added = _added(before, after)
+    late = bool(added) and not any(one[:split].any() for one in added)
+    return max(0.0, look.gain - look.net) if late else 0.0
+
+
+def _prior(state: State) -> Array:
+    """Prior sd of each column's coefficient over the white noise; infinite for the bias."""
+    c, sd = np.abs(state.best.c[1:]), state.best.sd[1:]
+    return np.array([math.inf, *np.maximum(WIDE * (c + 2.0 * sd) / state.best.sigma, 1e-12)])
+
+
+def _posterior(G: Array, D: Array, n: Array, prior: Array) -> tuple[Array, Array]:
+    """ln evidence [m] and mean of the coefficients [m, p] from the sums up to each mark.
+
+    The priors of the coefficients are normal, that of the bias is flat, and that of the white noise 1/sigma."""
+    good = np.isfinite(G).all(axis=(1, 2))
+    G[~good] = np.eye(prior.size + 1)
+    A, b = G[:, 1:, 1:] + np.diag(prior**-2.0), G[:, 1:, 0]
+    size = np.sqrt(np.diagonal(A, axis1=1, axis2=2))
+    scaled = A / (size[:, :, None] * size[:, None, :])
+    c = np.linalg.solve(scaled, (b / size)[:, :, None])[:, :, 0] / size
+    rss = np.maximum(G[:, 0, 0] - (b * c).sum(axis=1), 1e-300)
+    volume = 2.0 * (np.log(size).sum(axis=1) + np.log(prior[1:]).sum()) + np.linalg.slogdet(scaled)[1]
+    half = 0.5 * (n - 1.0)
+    return np.where(good, gammaln(half) - half * np.log(math.pi * rss) - 0.5 * (D + volume), -math.inf), c
+
+
+def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Sequential:
+    """The model of a state: a sum over nodes of the drift, with the weights that the samples before a mark leave them.
+
+    The nodes are what the whole record leaves possible."""
+    series, prior, window, nodes = state.series, _prior(state), _window(state.dt), list(state.drifts())
+    ln_evidence = np.empty((len(nodes), marks.size))
+    bias = {horizon: np.empty((len(nodes), places.size)) for horizon, places in horizons.items()}
+    total = np.cumsum(np.pad(series.columns, ((0, 0), (1, 0))), axis=1)
+    for k, (fit, theta, ln_share) in enumerate(nodes):
+        G, D, n, x, _, _ = passed(series, fit.terms, theta, marks.tolist())
+        value, c = _posterior(G, D, n, prior)
+        ln_evidence[k] = value + ln_share
+        m = matrices(fit.terms, theta, series.dt, series.duration_s)
+        drift = x[:, 0] - np.einsum("mp,mps->ms", c, x[:, 1:])
+        for horizon, places in horizons.items():
+            ahead, at = _ahead(horizon, state.dt) - 1, np.searchsorted(marks, places)
+            column = (total[:, places + ahead + window] - total[:, places + ahead]) / window
+            forward = m.h @ np.linalg.matrix_power(m.F, ahead)
+            bias[horizon][k] = drift[at] @ forward + (c[at] * column.T).sum(axis=1)
+    weight = softmax(ln_evidence, axis=0)
+    predicted = {
+        horizon: (weight[:, np.searchsorted(marks, places)] * bias[horizon]).sum(axis=0)
+        for horizon, places in horizons.items()
+    }
+    return Sequential(logsumexp(ln_evidence, axis=0), predicted)
+
+
+def _residual(state: State, split: int) -> Array:
+    """Innovations [n] over the white noise, by the parameters and coefficients that the first samples show best."""
+    series, prior = state.series, _prior(state)
+
+    best = (-math.inf, state.best, state.best.theta, np.zeros(0), 1.0)
+    for fit, theta, ln_share in state.drifts():
+        G, D, n, _, _, _ = passed(series, fit.terms, theta, [split])
+        value, c = _posterior(G, D, n, prior)
+        direction = np.array([1.0, *-c[0]])
+        if value[0] + ln_share > best[0]:
+            sigma = math.sqrt(direction @ G[0] @ direction / n[0])
+            best = (float(value[0]) + ln_share, fit, theta, direction, sigma)
+    _, fit, theta, direction, sigma = best
+    white = run(series, fit.terms, theta, innovations=True)[1]
+    return np.asarray(white @ direction / sigma)
+
+
+def _errors(
+    state: State, old: Sequential, new: Sequential, marks: Rows, horizons: Mapping[float, Rows]
+) -> dict[str, dict[str, float]]:
     """Root mean square of predicted minus read bias at each horizon; the reading is a mean of one second about it."""
-    series = old.series
-    rate = 1.0 / series.dt
-    window = max(1, round(rate))
-    n = series.y.size
+    window = _window(state.dt)
     found: dict[str, dict[str, float]] = {}
-    for horizon in HORIZONS_S:
-        ahead = max(1, round(horizon * rate))
-        last = n - ahead - window
-        if last - split < 30:
-            continue
-        marks = np.unique(np.linspace(split, last, PREDICTIONS).astype(int))
-        read = np.array([_mean(new.series.y[at + ahead - 1 : at + ahead - 1 + window]) for at in marks])
-        errors = [_predicted(one, marks, ahead, window) - read for one in (old, new)]
+    for horizon, places in horizons.items():
+        first = places + _ahead(horizon, state.dt) - 1
+        read = np.array([_mean(state.y[at : at + window]) for at in first])
+        errors = [one.bias[horizon] - read for one in (old, new)]
         good = np.isfinite(errors[0]) & np.isfinite(errors[1])
         if good.sum() < 10:
             continue
@@ -155,18 +253,6 @@ def _errors(old: Trained, new: Trained, split: int) -> dict[str, dict[str, float
 def _mean(values: Array) -> float:
     good = values[np.isfinite(values)]
     return float(good.mean()) if good.size else math.nan
-
-
-def _predicted(one: Trained, marks: Array, ahead: int, window: int) -> Array:
-    sums, _, _ = _pass(one.series, one.fit, [int(at) for at in marks])
-    m = matrices(one.fit.terms, one.fit.theta, one.fit.dt, one.fit.duration_s)
-    forward = m.h @ np.linalg.matrix_power(m.F, ahead - 1)
-    found = []
-    for at, part in zip(marks, sums, strict=True):
-        state = part.x[0] - one.fit.c @ part.x[1:]
-        column = one.series.columns[:, at + ahead - 1 : at + ahead - 1 + window].mean(axis=1)
-        found.append(float(forward @ state + one.fit.c @ column))
-    return np.array(found)
 
 
 def inflation(before: State, after: State) -> Mapping[str, float]:

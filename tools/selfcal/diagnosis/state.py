@@ -127,9 +127,12 @@ class State:
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         if rich and not self.extras.flicker:
             fits.append(refit(series, self.rich))
-        for one in fits:
-            for theta, ln_share in nodes(series, one):
-                yield one, theta, ln_share
+        yield from _nodes(series, fits)
+
+    def drifts(self) -> Iterator[tuple[Fit, Array, float]]:
+        """The same of the model as it is."""
+        near = self.near()
+        yield from _nodes(self.series, [one for one in self.fits if one.terms in near])
 
     def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
         """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
@@ -199,6 +202,12 @@ class State:
         return math.sqrt(2.0 * NET_LEAST / A) if 1e-9 * G[k, k] < A else math.inf
 
 
+def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, float]]:
+    for one in fits:
+        for theta, ln_share in nodes(series, one):
+            yield one, theta, ln_share
+
+
 def gain_for(worth: Callable[[float], float]) -> float:
     """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
     from scipy.optimize import brentq
@@ -255,6 +264,10 @@ class Look:
     shown_by: str = ""
     others: tuple[str, ...] = ()
     measure: Callable[[], Mapping[str, Any]] | None = None
+
+    def repeats(self, other: Look) -> bool:
+        """Whether both are the same cause of the same channel."""
+        return self.cause == other.cause and self.estimate.get("other") == other.estimate.get("other")
 
     def measured(self) -> Look:
         """The look with the intervals that `measure` has, where they take work that only a taken look is worth."""

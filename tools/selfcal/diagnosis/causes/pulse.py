@@ -295,7 +295,6 @@ CAUSE = Cause(
     alike=_alike,
     once="a pulse is an event of its recording",
     pictures=shown("means", "evidence"),
-    onset=True,
     least=_least,
     entry=_entry,
     of_column=_of_column,

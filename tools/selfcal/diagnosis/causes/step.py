@@ -203,7 +203,6 @@ CAUSE = Cause(
     alike=_alike,
     pictures=shown("means", "evidence"),
     once="a jump is an event of its recording",
-    onset=True,
     least=_least,
     entry=_entry,
     of_column=_of_column,
