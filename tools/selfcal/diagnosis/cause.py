@@ -108,7 +108,7 @@ class Cause:
     id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
     looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
-    stationary   motion must not be taken for it: it is looked for before motion.
+    before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
     alike        whether two looks on two axes are one cause with its size on each.
     settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
@@ -138,7 +138,7 @@ class Cause:
     record_next: str
     looks: Looks | None = None
     most: int = 0
-    stationary: bool = False
+    before_motion: Looks | None = None
     slow: bool = False
     alike: Callable[[Look, Look], bool] = _never
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None

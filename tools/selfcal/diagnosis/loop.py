@@ -21,7 +21,7 @@ from selfcal.motion import Moved
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
 #: Those that motion must not be taken for, and what they must show to be taken first.
-STATIONARY: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and cause.stationary)
+STATIONARY: tuple[Looks, ...] = tuple(cause.before_motion for cause in CAUSES.values() if cause.before_motion)
 CERTAIN = 25.0
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12

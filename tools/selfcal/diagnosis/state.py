@@ -267,7 +267,8 @@ class Look:
 
     def repeats(self, other: Look) -> bool:
         """Whether both are the same cause of the same channel."""
-        return self.cause == other.cause and self.estimate.get("other") == other.estimate.get("other")
+        channels = [(one.cause, one.estimate.get("other"), one.estimate.get("channel")) for one in (self, other)]
+        return channels[0] == channels[1]
 
     def measured(self) -> Look:
         """The look with the intervals that `measure` has, where they take work that only a taken look is worth."""

@@ -1,19 +1,34 @@
-"""One change of the white noise: the cumulative sum of squared innovations bends."""
+"""The noise level changes once, or follows a channel.
+
+One change bends the cumulative sum of squared innovations. A level that follows a channel has a logarithm in proportion
+to the temperature, the supply, or the logarithm of another axis' short-term variance.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
+from selfcal.diagnosis.causes import vibration
+from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
-from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, gain_for, ln_looks, mixture, net
+from selfcal.diagnosis.record import Record, smoothed
+from selfcal.diagnosis.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
+from selfcal.diagnosis.statemodel import Array
+from selfcal.recording import SIDE_CHANNELS
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
+#: A squared innovation counts as so many variances at most: one wild sample is no change of the noise.
+MOST = 12.0
+#: Steps of the search for a slope, and the largest one in standard deviations of the channel.
+STEPS, FARTHEST = 30, 1.0
+#: Shares of the record that the channel lies below at the quiet and at the loud end of `ratio`.
+ENDS = (5.0, 95.0)
 
 
 def ln_changes(n: int, gain: float) -> float:
@@ -25,6 +40,11 @@ def ln_changes(n: int, gain: float) -> float:
 
 
 def looks(state: State, record: Record) -> list[Look]:
+    """The likeliest place, and every channel that the level may follow."""
+    return once(state, record) + follows(state, record)
+
+
+def once(state: State, record: Record) -> list[Look]:
     """The likeliest place."""
     present = np.isfinite(state.y)
     w = state.whitened[present]
@@ -32,7 +52,7 @@ def looks(state: State, record: Record) -> list[Look]:
     edge = max(EDGE_SAMPLES, round(n * EDGE_SHARE))
     if n < 4 * edge:
         return []
-    square = np.minimum(w * w, 12.0) + 1e-12  # one wild sample is no change of the noise
+    square = np.minimum(w * w, MOST) + 1e-12
     total = np.cumsum(square)
     k = np.arange(1, n)
     first, second = total[:-1] / k, (total[-1] - total[:-1]) / (n - k)
@@ -50,7 +70,7 @@ def looks(state: State, record: Record) -> list[Look]:
     r[place:] *= ratio**2
     changed = state.refit(r=r)
     # Limited squares show less of the louder part. With the change in the model both parts are limited alike.
-    left = np.minimum(changed.whitened[present] ** 2, 12.0)
+    left = np.minimum(changed.whitened[present] ** 2, MOST)
     more = math.sqrt(float(left[at + 1 :].mean() / left[: at + 1].mean()))
     ratio *= more
     r[place:] *= more**2
@@ -83,13 +103,117 @@ def looks(state: State, record: Record) -> list[Look]:
     ]
 
 
+@dataclass(frozen=True)
+class Level:
+    """What the noise level may follow: ln of the variance is in proportion to `values` [n] of `column`."""
+
+    column: str
+    unit: str
+    values: Array
+    input: str
+    width_s: float
+    ln_looks: float
+
+
+def levels(state: State, record: Record) -> Iterator[Level]:
+    """Every channel over the widths of its means that the record is long enough for, s."""
+    n, dt = state.y.size, state.dt
+    sides = {record.channel_names[name]: (SIDE_CHANNELS[name][1], one) for name, one in record.channels.items()}
+    others = record.variances(state.axis)
+    price = LN_SMOOTHINGS + math.log(max(1, len(sides) + len(others)))
+    for name, (unit, values) in sides.items():
+        for width in SMOOTHING_S:
+            if width == SMOOTHING_S[0] or width <= 0.1 * n * dt:
+                yield Level(name, unit, smoothed(values, round(width / dt)), "value", width, price)
+    for name, values in others.items():
+        for width in vibration.WIDTHS_S:
+            if width * record.recorded_hz >= vibration.LEAST and width <= 0.1 * n * dt:
+                power = smoothed(values, round(width / dt))
+                yield Level(name, "1", np.log(np.maximum(power, 1e-12 * power.max())), "variance", width, price)
+
+
+def follows(state: State, record: Record) -> list[Look]:
+    """For each channel the width of its means that shows most."""
+    present = np.isfinite(state.whitened)
+    if present.sum() < 4 * EDGE_SAMPLES:
+        return []
+    square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
+    wide = max(1.0, float(np.var(square / square.mean())) / 2.0) if state.lsb == 0.0 else 1.0
+    best: dict[str, tuple[float, Level]] = {}
+    for level in levels(state, record):
+        scan = _slope(square, level.values[present])[1] / wide
+        if scan > best.get(level.column, (0.0, level))[0]:
+            best[level.column] = scan, level
+    found = (_follows(state, level, wide) for scan, level in best.values() if net(scan, 1, level.ln_looks) >= 1.0)
+    return [look for look in found if look is not None]
+
+
+def _follows(state: State, level: Level, wide: float) -> Look | None:
+    """The look at one channel, refitted: limited squares show less of the louder part at first."""
+    present = np.isfinite(state.whitened)
+    changed, slope, sd = state, 0.0, math.inf
+    for _ in range(2):
+        square = np.minimum(changed.whitened[present] ** 2, MOST) + 1e-12
+        more, _, sd = _slope(square, level.values[present])
+        slope += more
+        changed = state.refit(r=state.r * np.exp(slope * (level.values - level.values.mean())))
+    exact = (changed.best.ln_likelihood - state.best.ln_likelihood) / wide
+    worth = net(exact, 1, level.ln_looks)
+    if worth < 1.0:
+        return None
+    # The level is the root of the variance.
+    size, sd = 0.5 * slope, 0.5 * sd * math.sqrt(wide)
+    span = float(np.diff(np.percentile(level.values[present], ENDS))[0])
+    ratio = math.exp(abs(size) * span)
+    estimate = {
+        "channel": level.column,
+        "input": level.input,
+        "form": "static",
+        "coefficient": interval(size, sd, "1" if level.unit == "1" else f"1/{level.unit}"),
+        "ratio": interval(ratio, ratio * span * sd, "1"),
+    }
+    return Look("variance_change", exact, worth, estimate, {"r": changed.r})
+
+
+def _slope(square: Array, values: Array) -> tuple[float, float, float]:
+    """Slope of ln variance by `values` [n], its gain of ln likelihood, and its standard deviation, by Newton's steps.
+
+    `square` [n]: squared innovations; their mean variance is free."""
+    spread = float(values.std())
+    if not spread > 0.0:
+        return 0.0, 0.0, math.inf
+    x = (values - values.mean()) / spread
+    b, n = 0.0, square.size
+
+    def value(b: float) -> float:
+        return -0.5 * n * math.log(float((square * np.exp(-b * x)).mean()))
+
+    none = now = value(0.0)
+    bend = 1.0
+    for _ in range(STEPS):
+        share = square * np.exp(-b * x)
+        share /= share.sum()
+        mean = float(share @ x)
+        bend = 0.5 * n * max(float(share @ x**2) - mean**2, 1e-9)
+        step = float(np.clip(0.5 * n * mean / bend, -FARTHEST, FARTHEST))
+        while (there := value(b + step)) < now and abs(step) > 1e-6:
+            step *= 0.5
+        b, now = b + step, max(there, now)
+        if abs(step) < 1e-4:
+            break
+    return b / spread, now - none, 1.0 / (math.sqrt(bend) * spread)
+
+
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """The change of the noise as the training samples have it."""
-    place = round((look.when or (0.0, 0.0))[0] * record.rate_hz)
-    w2 = np.minimum(before.whitened**2, 12.0)
-    ratio = float(np.nanmean(w2[place:split]) / np.nanmean(w2[:place]))
+    square = np.minimum(before.whitened[:split] ** 2, MOST)
+    if look.when is None:
+        shape = np.log(after.r / before.r)
+        there = np.isfinite(square)
+        return replace(after, r=before.r * np.exp(_slope(square[there], shape[:split][there])[0] * shape))
+    place = round(look.when[0] * record.rate_hz)
     r = before.r.copy()
-    r[place:] *= ratio
+    r[place:] *= float(np.nanmean(square[place:]) / np.nanmean(square[:place]))
     return replace(after, r=r)
 
 
@@ -100,24 +224,24 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
 
 
 def _extend(at: Extension) -> None:
-    if not at.tree.get("regressors"):  # a module handles changes beside no column
+    if at.finding.look.when and not at.tree.get("regressors"):  # a module handles changes beside no column
         add_handling(at.tree, "variance_changes", True)
 
 
 CAUSE = Cause(
     "variance_change",
-    "The noise level changes once.",
-    "Look for what was switched on at that time.",
+    "The noise level changes.",
+    "Look for what was switched on at that time, or for what the channel drives.",
     looks=looks,
     most=3,
-    stationary=True,
+    before_motion=once,
     pictures=shown("marked_level"),
     once="a change of the noise is an event of its recording",
     onset=True,
     trained=_trained,
     least=_least,
     extend=_extend,
-    of_estimate=lambda look: medians(look, "time_s", "ratio"),
+    of_estimate=lambda look: medians(look, "time_s", "ratio") if look.when else None,
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0, "variance_time_s"),
         "ratio": positive(lambda s: 2.0, "noise_ratio"),

@@ -1,0 +1,124 @@
+"""A noise level that follows a channel is named with the channel and its size; one that follows none names none.
+
+Truth: the numbers that each record was drawn with, sample by sample.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom, poisson
+
+from selfcal.diagnosis.causes import variance_change
+from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import NET_LEAST, P_LOOK, Look, State
+from selfcal.diagnosis.statemodel import Array
+from selfcal.forms import variance_of
+from selfcal.recording import save
+from selfcal.verbs.diagnose import diagnose
+
+from conftest import case_records
+
+SAMPLES = 2400
+
+
+def wave(random: np.random.Generator, n: int, turns: float) -> Array:
+    """[n]: three slow waves of random phase, the mean 0 and the deviation 1."""
+    t = np.arange(n) / n
+    waves = [np.sin(2.0 * math.pi * (f * turns * t + random.uniform())) for f in (1.0, 1.7, 2.6)]
+    found = sum(waves, np.zeros(n))
+    return np.asarray((found - found.mean()) / found.std())
+
+
+def switched(random: np.random.Generator, n: int) -> Array:
+    """[n]: a machine that is on for a while and off for a while, 0 and 1."""
+    edges = np.cumsum(random.uniform(n / 20.0, n / 6.0, 40))
+    return np.asarray((np.searchsorted(edges, np.arange(n)) % 2).astype(np.float64))
+
+
+def drift(random: np.random.Generator, n: int) -> Array:
+    if random.random() < 0.5:
+        return np.asarray(0.01 * random.standard_normal(n).cumsum())
+    keep, x, found = math.exp(-1.0 / 200.0), 0.0, np.zeros(n)
+    for k in range(n):
+        x = keep * x + 0.3 * math.sqrt(1.0 - keep**2) * random.standard_normal()
+        found[k] = x
+    return found
+
+
+def drawn(random: np.random.Generator, follows: str, n: int = SAMPLES) -> tuple[Array, Array, Array, float]:
+    """Axis, temperature, other axis that a machine shakes, and d ln(sd) by the channel: 0 of "nothing"."""
+    temperature = 25.0 + 3.0 * wave(random, n, random.uniform(0.8, 3.0))
+    loud = 1.0 + random.uniform(1.0, 3.0) * switched(random, n)
+    other = 2.0 * loud * random.standard_normal(n) + drift(random, n)
+    ln_level, size = np.zeros(n), 0.0
+    if follows == "temperature":
+        size = float(random.choice([-1.0, 1.0])) * random.uniform(0.05, 0.12)
+        ln_level = size * (temperature - 25.0)
+    elif follows == "vibration":
+        size = random.uniform(0.15, 0.4)  # of ln(variance)
+        ln_level = 2.0 * size * np.log(loud)
+    return np.exp(ln_level) * random.standard_normal(n) + drift(random, n), temperature, other, size
+
+
+def looked(y: Array, temperature: Array, other: Array) -> list[Look]:
+    states = {
+        name: State(name, "deg/s", values - values.mean(), 1.0, 0.0, np.ones(y.size)).refit()
+        for name, values in (("gx", y), ("gy", other))
+    }
+    roughness = {name: variance_of(one.y) for name, one in states.items()}
+    names, present = {"temperature": "temp"}, np.ones(y.size, bool)
+    record = Record(1.0, states, {"temperature": temperature}, names, present, recorded_hz=1.0, roughness=roughness)
+    return variance_change.follows(states["gx"], record)
+
+
+def test_a_level_that_follows_nothing() -> None:
+    """Two channels beside it change, and the other axis is shaken: no more look so than a look may by chance."""
+    random = np.random.default_rng(71)
+    records = case_records(60, 1000)
+    count = sum(
+        any(look.net >= NET_LEAST for look in looked(*drawn(random, "nothing")[:3])) for _ in range(records)
+    )
+    print(f"clean: {count} of {records}")
+    assert count <= poisson.isf(1e-3, records * P_LOOK)
+
+
+@pytest.mark.parametrize("follows", ["temperature", "vibration"])
+def test_a_level_that_follows_a_channel(follows: str) -> None:
+    """The channel is the strongest; the coefficient of a temperature lies in its interval in 90 % of the records.
+
+    The short-term variance of another axis is known from some samples, so its coefficient has no exact truth."""
+    random = np.random.default_rng([72, len(follows)])
+    records, right, inside = case_records(12, 150), 0, 0
+    column = {"temperature": "temp", "vibration": "gy"}[follows]
+    for _ in range(records):
+        *axes, size = drawn(random, follows)
+        look = max(looked(*axes), key=lambda one: one.net, default=None)
+        if look is None or look.estimate["channel"] != column or look.net < NET_LEAST:
+            continue
+        right += 1
+        found = look.estimate["coefficient"]
+        inside += found["q05"] <= size <= found["q95"]
+        assert found["median"] * size > 0.0
+        assert look.estimate["ratio"]["median"] > 1.0
+    print(f"{follows}: {right} of {records} right, {inside} inside")
+    assert right >= binom.isf(1.0 - 1e-3, records, 0.95)
+    if follows == "temperature":
+        assert binom.isf(1.0 - 1e-3, right, 0.9) <= inside
+
+
+def test_a_recording_of_both(tmp_path: Path) -> None:
+    """The whole diagnosis names the temperature, states the size, and the noise level is explained by it."""
+    random = np.random.default_rng(73)
+    y, temperature, _, size = drawn(random, "temperature")
+    save(tmp_path / "log.npz", {"gx": ("deg/s", 0.04 * y), "temp": ("degC", temperature)}, 1.0)
+    findings = diagnose(tmp_path / "log.npz")["axes"]["gx"]["findings"]
+    (found,) = (one for one in findings if one["cause"] == "variance_change")
+    assert found["estimate"]["channel"] == "temp"
+    assert found["estimate"]["coefficient"]["unit"] == "1/degC"
+    assert found["estimate"]["coefficient"]["median"] == pytest.approx(size, abs=0.02)
+    assert found["gain"]["log_score_per_sample"]["after"] > found["gain"]["log_score_per_sample"]["before"]
+    assert "Channel temp" in found["words"]
