@@ -5,6 +5,7 @@ A writer is `write_*(drawn, folder)`; it gives the path of its log. Where a form
 
 from __future__ import annotations
 
+import json
 import struct
 import zipfile
 from collections.abc import Callable, Iterator
@@ -326,8 +327,7 @@ def of_sensor(d: Drawn, values: Array, every: int = 1, device: int = 7) -> list[
     us = d.us
     late = us + np.random.default_rng(5).integers(200, 3000, d.t.size).cumsum() % 3000 + 200
     return [
-        (int(late[k]), (int(us[k]), device, *values[k].tolist(), float(d.temp[k])))
-        for k in range(0, d.t.size, every)
+        (int(late[k]), (int(us[k]), device, *values[k].tolist(), float(d.temp[k]))) for k in range(0, d.t.size, every)
     ]
 
 
@@ -365,6 +365,270 @@ def write_ulog_rewritten(d: Drawn, folder: Path) -> Path:
     return path
 
 
+# ------------------------------------------------------------------------------------------------------------ ArduPilot
+
+
+def dataflash_of(path: Path, imus: dict[str, list[tuple[int, int, Any, Any, float]]], with_units: bool = True) -> Path:
+    """A DataFlash log by ArduPilot's description of it: rows (stamp, instance, gyro, accel, temperature) by message."""
+
+    def fmt(kind: int, name: str, length: int, codes: str, names: str) -> bytes:
+        return b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", kind, length, name.encode(), codes.encode(), names.encode())
+
+    names = "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T"
+    out = [fmt(128, "FMT", 89, "BBnNZ", "Type,Length,Name,Format,Columns")]
+    if with_units:
+        out.append(fmt(129, "UNIT", 3 + 73, "QbZ", "TimeUS,Id,Label"))
+        out.append(fmt(130, "FMTU", 3 + 41, "QBNN", "TimeUS,FmtType,UnitIds,MultIds"))
+        for key, label in (("s", "s"), ("#", "instance"), ("E", "rad/s"), ("o", "m/s/s"), ("O", "degC")):
+            out.append(b"\xa3\x95\x81" + struct.pack("<Qb64s", 0, ord(key), label.encode()))
+    messages = []
+    for number, (name, rows) in enumerate(imus.items()):
+        kind = 140 + number
+        out.append(fmt(kind, name, 3 + 37, "QBfffffff", names))
+        if with_units:
+            out.append(b"\xa3\x95\x82" + struct.pack("<QB16s16s", 0, kind, b"s#EEEoooO", b"F-0000000"))
+        layout = struct.Struct("<QB7f")
+        messages += [
+            (us, b"\xa3\x95" + bytes([kind]) + layout.pack(us, instance, *g, *a, temp))
+            for us, instance, g, a, temp in rows
+        ]
+    messages.sort(key=lambda one: one[0])
+    path.write_bytes(b"".join([*out, *(data for _, data in messages)]))
+    return path
+
+
+def imu_rows(d: Drawn, instance: int, sign: float = 1.0) -> list[tuple[int, int, Any, Any, float]]:
+    rows = zip(d.us.tolist(), (sign * d.gyro).tolist(), (sign * d.accel).tolist(), d.temp.tolist(), strict=True)
+    return [(us, instance, g, a, temp) for us, g, a, temp in rows]
+
+
+def write_dataflash(d: Drawn, folder: Path) -> Path:
+    return dataflash_of(folder / "00000042.BIN", {"IMU": imu_rows(d, 0)})
+
+
+def write_tlog(d: Drawn, folder: Path) -> Path:
+    """HIGHRES_IMU, written by pymavlink; a ground station's stamps before each message."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    link = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    path = folder / "flight.tlog"
+    received = (d.received() // 1000).tolist()
+    with path.open("wb") as file:
+        for k, (us, g, a) in enumerate(zip(d.us.tolist(), d.gyro.tolist(), d.accel.tolist(), strict=True)):
+            message = dialect.MAVLink_highres_imu_message(us, *a, *g, 0, 0, 0, 1013, 0, 0, float(d.temp[k]), 0xFFFF)
+            file.write(struct.pack(">Q", received[k]) + message.pack(link))
+    return path
+
+
+# ----------------------------------------------------------------------------------------------------------------- MCAP
+
+
+def write_mcap_json(d: Drawn, folder: Path) -> Path:
+    """ROS's fields in JSON; the file's own times are those of receipt."""
+    from mcap.writer import Writer
+
+    path = folder / "log.mcap"
+    received = d.received().tolist()
+    stamps = d.ns
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("imu", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/imu", "json", schema)
+        for k in range(d.t.size):
+            ns = int(stamps[k])
+            message = {
+                "header": {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}},
+                "angular_velocity": dict(zip("xyz", d.gyro[k].tolist(), strict=True)),
+                "linear_acceleration": dict(zip("xyz", d.accel[k].tolist(), strict=True)),
+            }
+            writer.add_message(channel, received[k], json.dumps(message).encode(), received[k])
+        writer.finish()
+    return path
+
+
+def write_mcap_units(d: Drawn, folder: Path) -> Path:
+    """Plain names in JSON, deg/s and g by the schema, times of publication."""
+    from mcap.writer import Writer
+
+    path = folder / "plain.mcap"
+    kinds = {**{f"gyro_{a}": "deg/s" for a in "xyz"}, **{f"accel_{a}": "g" for a in "xyz"}, "temperature": "degC"}
+    schema_text = {"type": "object", "properties": {name: {"type": "number", "unit": u} for name, u in kinds.items()}}
+    rows = np.column_stack([np.degrees(d.gyro), d.accel / 9.80665, d.temp]).tolist()
+    stamps = d.ns.tolist()
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("imu", "jsonschema", json.dumps(schema_text).encode())
+        channel = writer.register_channel("imu", "json", schema)
+        for ns, row in zip(stamps, rows, strict=True):
+            writer.add_message(channel, ns, json.dumps(dict(zip(kinds, row, strict=True))).encode(), ns)
+        writer.finish()
+    return path
+
+
+def write_mcap_protobuf(d: Drawn, folder: Path) -> Path:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from mcap_protobuf.writer import Writer
+
+    file = descriptor_pb2.FileDescriptorProto(name="imu.proto", package="imu", syntax="proto3")
+    for name, fields in (
+        ("Stamp", (("sec", 3, ""), ("nsec", 3, ""))),
+        ("Vector", tuple((a, 1, "") for a in "xyz")),
+        (
+            "Imu",
+            (("timestamp", 11, "Stamp"), ("angular_velocity", 11, "Vector"), ("linear_acceleration", 11, "Vector")),
+        ),
+    ):
+        message = file.message_type.add(name=name)
+        for number, (label, kind, of) in enumerate(fields, 1):
+            message.field.add(name=label, number=number, type=kind, label=1, type_name=f".imu.{of}" if of else None)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    Imu = message_factory.GetMessageClass(pool.FindMessageTypeByName("imu.Imu"))
+    path = folder / "proto.mcap"
+    received = d.received().tolist()
+    stamps = d.ns.tolist()
+    with path.open("wb") as stream, Writer(stream) as writer:
+        for k, ns in enumerate(stamps):
+            one = Imu()
+            one.timestamp.sec, one.timestamp.nsec = ns // 10**9, ns % 10**9
+            for vector, values in ((one.angular_velocity, d.gyro[k]), (one.linear_acceleration, d.accel[k])):
+                vector.x, vector.y, vector.z = values.tolist()
+            writer.write_message("/imu", one, received[k], received[k])
+    return path
+
+
+def write_ros2_mcap(d: Drawn, folder: Path) -> Path:
+    (found,) = write_ros2(d, folder, mcap=True).glob("*.mcap")
+    return found
+
+
+# ------------------------------------------------------------------------------------------- laboratories and vehicles
+
+
+def write_hdf5(d: Drawn, folder: Path) -> Path:
+    """Matrices with units, compressed; the temperature in a group of its own rate."""
+    import h5py
+
+    path = folder / "log.h5"
+    with h5py.File(path, "w") as file:
+        imu = file.create_group("imu")
+        imu.create_dataset("time", data=d.us).attrs["unit"] = "us"
+        for name, values, unit in (("gyro", np.degrees(d.gyro), "deg/s"), ("accel", d.accel, "m/s^2")):
+            imu.create_dataset(name, data=values, compression="gzip", chunks=True).attrs["unit"] = unit
+        slow = file.create_group("env")
+        slow.create_dataset("time", data=d.us[::10]).attrs["unit"] = "us"
+        slow.create_dataset("temperature", data=d.temp[::10]).attrs["unit"] = "degC"
+        file.create_dataset("comment", data="a bench")
+    return path
+
+
+def write_mat73(d: Drawn, folder: Path) -> Path:
+    """As MATLAB lays it: a user block, matrices transposed, characters as numbers; units in `meta`."""
+    import h5py
+
+    path = folder / "log.mat"
+    units = {**{f"g{a}": {"unit": "rad/s"} for a in "xyz"}, **{f"a{a}": {"unit": "m/s^2"} for a in "xyz"}}
+    meta = json.dumps({"columns": {**units, "t": {"unit": "s"}, "temp": {"unit": "degC"}}})
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in (("t", d.t), ("temp", d.temp)):
+            file.create_dataset(name, data=values[None, :])
+        for letter, values in (("g", d.gyro), ("a", d.accel)):
+            for place, axis in enumerate("xyz"):
+                file.create_dataset(letter + axis, data=values[None, :, place])
+        file.create_dataset("meta", data=np.array([[ord(one)] for one in meta], np.uint16))
+    data = bytearray(path.read_bytes())
+    data[:128] = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    path.write_bytes(bytes(data))
+    return path
+
+
+def write_parquet(d: Drawn, folder: Path) -> Path:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    path = folder / "log.parquet"
+    arrays, fields = [pa.array(d.ns, pa.timestamp("ns"))], [pa.field("time", pa.timestamp("ns"))]
+    for name, values, unit in (("gyro", d.gyro, "rad/s"), ("accel", d.accel / 9.80665, "g")):
+        for place, axis in enumerate("xyz"):
+            arrays.append(pa.array(values[:, place]))
+            fields.append(pa.field(f"{name}_{axis}", pa.float64(), metadata={"unit": unit}))
+    arrays.append(pa.array(d.temp + 273.15))
+    fields.append(pa.field("temp", pa.float64(), metadata={"unit": "K"}))
+    parquet.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path, compression="zstd")
+    return path
+
+
+def write_tdms(d: Drawn, folder: Path) -> Path:
+    """Waveforms: groups of two rates, units in the channels, no channel of times."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    path = folder / "log.tdms"
+    with TdmsWriter(path) as writer:
+        channels = []
+        for name, values, unit in (("Gyro", np.degrees(d.gyro), "deg/s"), ("Acc", d.accel / 9.80665, "g")):
+            for place, axis in enumerate("XYZ"):
+                properties = {"unit_string": unit, "wf_increment": 1.0 / d.rate, "wf_start_offset": 0.0}
+                channels.append(ChannelObject("IMU", f"{name} {axis}", values[:, place], properties))
+        warm = {"unit_string": "degC", "wf_increment": 10.0 / d.rate, "wf_start_offset": 0.0}
+        writer.write_segment([*channels, ChannelObject("Slow", "Temperature", d.temp[::10].copy(), warm)])
+    return path
+
+
+def write_mf4(d: Drawn, folder: Path) -> Path:
+    from asammdf import MDF, Signal
+
+    path = folder / "log.mf4"
+    with MDF(version="4.10") as file:
+        signals = []
+        for name, values, unit in (("Gyro", np.degrees(d.gyro), "deg/s"), ("Acc", d.accel, "m/s^2")):
+            signals += [Signal(values[:, k].copy(), d.t, unit=unit, name=f"{name}_{a}") for k, a in enumerate("XYZ")]
+        file.append(signals, comment="imu")
+        file.append([Signal(d.temp[::10].copy(), d.t[::10].copy(), unit="degC", name="Temperature")], comment="slow")
+        file.save(path, overwrite=True, compression=2)
+    return path
+
+
+DBC = """VERSION ""
+BU_: IMU
+BO_ 256 Rates: 8 IMU
+ SG_ Gyro_X : 0|20@1- (0.0001,0) [0|0] "rad/s" Vector__XXX
+ SG_ Gyro_Y : 20|20@1- (0.0001,0) [0|0] "rad/s" Vector__XXX
+ SG_ Gyro_Z : 40|20@1- (0.0001,0) [0|0] "rad/s" Vector__XXX
+BO_ 257 Accelerations: 8 IMU
+ SG_ Acc_X : 0|20@1- (0.001,0) [0|0] "m/s^2" Vector__XXX
+ SG_ Acc_Y : 20|20@1- (0.001,0) [0|0] "m/s^2" Vector__XXX
+ SG_ Acc_Z : 40|20@1- (0.001,0) [0|0] "m/s^2" Vector__XXX
+BO_ 512 Status: 2 IMU
+ SG_ Temperature : 0|16@1- (0.01,0) [0|0] "degC" Vector__XXX
+"""
+
+
+def write_frames(d: Drawn, folder: Path, suffix: str) -> tuple[Path, Path]:
+    """A log of CAN frames by python-can, and its database. The database is written by hand."""
+    import can
+    import cantools
+
+    dbc = folder / "imu.dbc"
+    dbc.write_text(DBC, encoding="utf-8")
+    database = cantools.database.load_file(dbc)
+    path = folder / f"log{suffix}"
+    with can.Logger(path) as log:
+        for k, t in enumerate((1_700_000_000.0 + d.t).tolist()):
+            parts = [("Rates", "Gyro", d.gyro[k]), ("Accelerations", "Acc", d.accel[k])]
+            frames = [(name, {f"{of}_{a}": v for a, v in zip("XYZ", row, strict=True)}) for name, of, row in parts]
+            if k % 10 == 0:
+                frames.append(("Status", {"Temperature": d.temp[k]}))
+            for name, values in frames:
+                message = database.get_message_by_name(name)
+                data = message.encode(values, strict=False)
+                log.on_message_received(
+                    can.Message(timestamp=t, arbitration_id=message.frame_id, data=data, is_extended_id=False)
+                )
+    return path, dbc
+
+
 #: Writers by format, of logs that open without an option.
 WRITERS: dict[str, Callable[[Drawn, Path], Path]] = {
     "euroc": write_euroc,
@@ -384,4 +648,15 @@ WRITERS: dict[str, Callable[[Drawn, Path], Path]] = {
     "ulog_default": write_ulog_default,
     "vehicle_imu": write_vehicle_imu,
     "ulog_rewritten": write_ulog_rewritten,
+    "dataflash": write_dataflash,
+    "tlog": write_tlog,
+    "mcap_json": write_mcap_json,
+    "mcap_units": write_mcap_units,
+    "mcap_protobuf": write_mcap_protobuf,
+    "ros2_mcap": write_ros2_mcap,
+    "hdf5": write_hdf5,
+    "mat73": write_mat73,
+    "parquet": write_parquet,
+    "tdms": write_tdms,
+    "mf4": write_mf4,
 }

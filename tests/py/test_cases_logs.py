@@ -7,6 +7,8 @@ written by it.
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
@@ -25,23 +27,15 @@ from selfcal.recording import Recording, load
 from selfcal.verbs.convert import convert
 from selfcal.verbs.identify import identify
 
-from conftest import case_records, run
+from conftest import ROOT, case_records, run
 
 #: Interval of the writers' least exact stamps against a clock: the rate is asked for to 1e-4.
 RATE = 1e-4
 #: Writers whose logs have no accelerometer, and no temperature.
 NO_ACCEL = ("ulog2csv_gyro", "blackbox_csv")
-WARM = (
-    "ulog2csv_gyro",
-    "plotjuggler",
-    "xsens",
-    "ros1",
-    "ros2",
-    "db3",
-    "realsense",
-    "ulog",
-    "ulog_default",
-    "ulog_rewritten",
+COLD = (
+    *("euroc", "ulog2csv", "rostopic", "blackbox_csv", "phyphox", "sensor_logger", "vehicle_imu"),
+    *("mcap_json", "mcap_protobuf"),
 )
 
 
@@ -72,11 +66,10 @@ def test_a_log_opens_as_it_is(name: str, drawn: logs.Drawn, tmp_path: Path) -> N
             expected = truth[::step, place]
             # Steps of a float32 at 9.81 m/s^2, and nine digits.
             assert in_si(recording, letter + axis) == pytest.approx(expected, rel=3e-7, abs=1e-9), one.name
-    if name in WARM:
+    assert ("temp" in recording.columns) == (name not in COLD)
+    if name not in COLD:
         # A degree takes 9.5 s at its fastest; thinned out a hundred times, the last second is held.
-        assert np.abs(recording.columns["temp"].values - drawn.temp).max() < 0.11
-    else:
-        assert "temp" not in recording.columns
+        assert np.abs(recording.in_unit("temp", "degC") - drawn.temp).max() < 0.11
 
 
 @pytest.mark.parametrize("name", logs.WRITERS)
@@ -130,6 +123,71 @@ def test_instances_of_a_ulog_are_not_mixed(drawn: logs.Drawn, tmp_path: Path) ->
     recording = load(log, source=["sensor.1"])
     for name, truth in (("gx", -drawn.gyro[:, 0]), ("az", -drawn.accel[:, 2])):
         assert in_si(recording, name) == pytest.approx(truth, rel=3e-7)
+
+
+@pytest.mark.parametrize("with_units", [False, True])
+def test_imus_of_a_dataflash_log_are_not_mixed(with_units: bool, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Two instances of one message, each with its own values, in turn; units by FMTU, or the message's own."""
+    both = [row for pair in zip(logs.imu_rows(drawn, 0), logs.imu_rows(drawn, 1, -1.0), strict=True) for row in pair]
+    log = logs.dataflash_of(tmp_path / "two.bin", {"IMU": both}, with_units)
+    with pytest.raises(UserError, match=r"--source 'IMU.0' \(gx gy gz ax ay az; 100 Hz.*--source 'IMU.1'"):
+        load(log)
+    for name, sign in (("IMU.0", 1.0), ("IMU.1", -1.0)):
+        recording = load(log, source=[name])
+        assert recording.samples == drawn.t.size
+        for axis, truth in (("gx", drawn.gyro[:, 0]), ("az", drawn.accel[:, 2])):
+            assert in_si(recording, axis) == pytest.approx(sign * truth, rel=3e-7)
+
+
+def test_counts_of_a_tlog(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """RAW_IMU is in mrad/s and mg of ArduPilot, in counts of others; two vehicles are two sources."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    def log(vehicles: dict[int, int]) -> Path:
+        path = tmp_path / "raw.tlog"
+        with path.open("wb") as file:
+            for vehicle, autopilot in vehicles.items():
+                link = dialect.MAVLink(None, srcSystem=vehicle)
+                beat = dialect.MAVLink_heartbeat_message(2, autopilot, 0, 0, 4, 3)
+                file.write(bytes(8) + beat.pack(link))
+            for k in range(500):
+                for vehicle in vehicles:
+                    link = dialect.MAVLink(None, srcSystem=vehicle)
+                    one = dialect.MAVLink_raw_imu_message(
+                        5_000_000 + 10_000 * k, 1, 2, 1000, vehicle + k % 3, 5, 6, 0, 0, 0
+                    )
+                    file.write(k.to_bytes(8, "big") + one.pack(link))
+        return path
+
+    recording = load(log({1: 3}))
+    assert recording.columns["gx"].unit == "mrad/s"
+    assert recording.columns["az"].values == pytest.approx(1000.0)
+    assert recording.columns["az"].unit == "mg"
+    with pytest.raises(UserError, match=r"'gx' is in LSB: give the size of one with --scale"):
+        load(log({1: 12}))
+    path = log({1: 3, 2: 3})
+    with pytest.raises(UserError, match=r"--source 'RAW_IMU@1'.*--source 'RAW_IMU@2'"):
+        load(path)
+    assert load(path, source=["RAW_IMU@2"]).columns["gx"].values[:3] == pytest.approx([2.0, 3.0, 4.0])
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".asc", ".trc", ".log"])
+def test_frames_by_a_database(suffix: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Signals by their names and units, to half a count; the temperature in a slower message."""
+    log, dbc = logs.write_frames(drawn, tmp_path, suffix)
+    recording = load(log, dbc=dbc)
+    assert recording.rate_hz == pytest.approx(drawn.rate, rel=RATE)
+    assert recording.samples == drawn.t.size
+    for name, truth, count in (("gy", drawn.gyro[:, 1], 1e-4), ("az", drawn.accel[:, 2], 1e-3)):
+        assert np.abs(in_si(recording, name) - truth).max() <= 0.5001 * count
+    assert np.abs(recording.columns["temp"].values - drawn.temp).max() < 0.02
+    if suffix != ".log":
+        with pytest.raises(UserError, match=r"name the database of its signals with --dbc FILE\.dbc"):
+            load(log)
+    other = tmp_path / "other.dbc"
+    other.write_text(logs.DBC.replace("BO_ 2", "BO_ 3").replace("BO_ 5", "BO_ 6"), encoding="utf-8")
+    with pytest.raises(UserError, match="no frame in it is a message of"):
+        load(log, dbc=other)
 
 
 def test_samples_of_a_fifo(drawn: logs.Drawn, tmp_path: Path) -> None:
@@ -197,6 +255,29 @@ def test_convert(name: str, output: str, drawn: logs.Drawn, tmp_path: Path) -> N
         convert(log, log)
 
 
+def test_the_page_your_log(tmp_path: Path) -> None:
+    """Every line of the page runs as printed on such a log. In `make test` one of them runs; each has its log."""
+    page = (ROOT / "tools" / "LOGS.md").read_text(encoding="utf-8")
+    printed = [shlex.split(one) for one in re.findall(r"`selfcal (identify [^`]*)`", page)]
+    short = logs.Drawn(seconds=1200.0 if case_records(0, 1) else 30.0)
+    written: dict[str, Path] = {}
+    for name, write in logs.WRITERS.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        path = write(short if case_records(0, 1) else logs.Drawn(seconds=0.2), folder)
+        written[path.name] = path
+    (tmp_path / "can").mkdir()
+    path, _ = logs.write_frames(short, tmp_path / "can", ".blf")
+    written[path.name] = path
+    assert {words[1] for words in printed} <= written.keys()
+    for words in printed:
+        if not case_records(0, 1) and words[1] not in ("log.blf",):
+            continue
+        done = run(*words, cwd=written[words[1]].parent)
+        assert done.returncode == 0, (words, done.stderr)
+        assert "gx" in done.stdout
+
+
 # -------------------------------------------------------------------------------------------------------------- hostile
 
 
@@ -240,7 +321,10 @@ def mutated(random: np.random.Generator, whole: bytes) -> bytes:
 
 
 #: Writers of binary logs, one a format and storage.
-BINARY = ("ros1", "db3", "ulog", "phyphox")
+BINARY = (
+    *("ros1", "db3", "ulog", "phyphox", "dataflash", "tlog", "mcap_json", "mcap_protobuf", "ros2_mcap"),
+    *("hdf5", "mat73", "parquet", "tdms", "mf4"),
+)
 
 
 @pytest.mark.parametrize("name", BINARY)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import selfcal
+from selfcal.loaders import READ
 
 from conftest import CALLED, COMMAND, ROOT, run
 
@@ -92,8 +93,8 @@ def test_verbs_are_functions() -> None:
         (["nonsense"], "No such command 'nonsense'; see `selfcal --help`"),
         (
             ["identify"],
-            "Missing argument 'LOG...' (Recording: .csv, .tsv, .txt, .log, .npz, .mat, .rda, .rdata, .rds; .gz of text"
-            "; several files are joined by their time stamps); see `selfcal identify --help`",
+            f"Missing argument 'LOG...' (Recording: {READ}; several files are joined by their time stamps); see "
+            "`selfcal identify --help`",
         ),
         (["identify", "."], ".: is a folder: name a recording in it (.csv, "),
         (["identify", "log.csv", "--engine", "gpu"], "Invalid value for '--engine': 'gpu' is not one of 'library', "),

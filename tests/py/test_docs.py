@@ -30,7 +30,7 @@ from conftest import COMMAND as PROGRAM
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
-    *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md"),
+    *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md", "tools/LOGS.md"),
 )
 WALKTHROUGH = ROOT / "tools" / "README.md"
 TOUR = ROOT / "README.md"

@@ -381,7 +381,7 @@ def _load(
 ) -> list[Recording]:
     """The sensors of one file that are meant, and the temperatures beside them, each by its own clock."""
     with reading(path, "not a sound recording"):
-        form = format_of(path)
+        form = format_of(path, frames="dbc" in hints)
         if form is None:
             parts = _text_parts(path, rate, header, skip_bad)
         else:
@@ -658,8 +658,6 @@ class _Header:
             elif meant is not None and key in meant:
                 name, unit, size = meant[key].name, meant[key].unit, meant[key].size
             entry = described.get(split(key)[0], {}) if unit is None else {}
-            if unit is None and not entry:
-                entry = described.get(key, {})
             cell = first[place] if place < len(first) else ""
             dates = is_date(cell)
             if name == "t" and not self.no_time and not dates and is_clock(cell):

@@ -36,12 +36,20 @@ class Format:
     extra: str = ""
 
 
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
     Format("an npz file", (".npz",), "npz"),
     Format("a MATLAB file", (".mat",), "matlab"),
     Format("an R file", (".rda", ".rdata", ".rds"), "r_data"),
     Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags", "ros"),
+    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap", "ros"),
     Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog", "px4"),
+    Format("a DataFlash log", (".bin", ".tlog"), "dataflash", ((0, b"\xa3\x95\x80"),), "pymavlink", "ardupilot"),
+    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py", "lab"),
+    Format("a Parquet file", (".parquet",), "parquet", ((0, b"PAR1"),), "pyarrow", "lab"),
+    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms", "lab"),
+    Format("an MDF file", (".mf4", ".mdf"), "mf4", ((0, b"MDF     "), (0, b"UnFinMF ")), "asammdf", "automotive"),
+    Format("a log of CAN frames", (".blf", ".asc", ".trc"), "can_log", ((0, b"LOGG"),), "can", "automotive"),
 )
 
 #: How a message lists what is read, and what is written.
@@ -61,9 +69,11 @@ def is_text(path: Path) -> bool:
     return path.name.lower().removesuffix(".gz").endswith(TEXT)
 
 
-def format_of(path: Path) -> Format | None:
-    """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. Raises UserError,
-    and OSError."""
+def format_of(path: Path, *, frames: bool = False) -> Format | None:
+    """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. `frames`: it is a
+    log of CAN frames, which may be a text. Raises UserError, and OSError."""
+    if frames:
+        return next(one for one in FORMATS if one.module == "can_log")
     if path.is_dir():
         if any(True for pattern in _ROS_FOLDER for _ in path.glob(pattern)):
             return next(one for one in FORMATS if one.module == "ros")
