@@ -420,6 +420,113 @@ def write_tlog(d: Drawn, folder: Path) -> Path:
     return path
 
 
+# ----------------------------------------------------------------------------------------------------------- Betaflight
+
+
+def _unsigned(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def _signed(value: int) -> bytes:
+    return _unsigned((value << 1 ^ value >> 31) & 0xFFFFFFFF)
+
+
+def _three(values: tuple[int, ...], wide: tuple[tuple[int, ...], ...]) -> bytes:
+    """The smallest form of three numbers; `wide`: bits of the forms 0 to 2."""
+    for form, bits in enumerate(wide):
+        if all(-(1 << b - 1) <= v < 1 << b - 1 for v, b in zip(values, bits, strict=True)):
+            if bits == (6, 6, 6):
+                return bytes([form << 6 | values[0] & 0x3F, values[1] & 0x3F, values[2] & 0x3F])
+            total = -(-(2 + sum(bits)) // 8)
+            packed = form
+            packed <<= 8 * total - 2 - sum(bits)
+            for value, b in zip(values, bits, strict=True):
+                packed = packed << b | value & (1 << b) - 1
+            return packed.to_bytes(total, "big")
+    sizes = [next(n for n in (1, 2, 3, 4) if -(1 << 8 * n - 1) <= v < 1 << 8 * n - 1) for v in values]
+    tag = 0xC0 | sum(n - 1 << 2 * k for k, n in enumerate(sizes))
+    return bytes([tag]) + b"".join(v.to_bytes(n, "little", signed=True) for v, n in zip(values, sizes, strict=True))
+
+
+def _four(values: list[int]) -> bytes:
+    tag, halves = 0, list[int]()
+    for k, value in enumerate(values):
+        form = 0 if value == 0 else 1 if -8 <= value < 8 else 2 if -128 <= value < 128 else 3
+        tag |= form << 2 * k
+        count = (0, 1, 2, 4)[form]
+        halves += [value >> 4 * (count - 1 - j) & 0xF for j in range(count)]
+    halves += [0] * (len(halves) % 2)
+    return bytes([tag]) + bytes(a << 4 | b for a, b in zip(halves[::2], halves[1::2], strict=True))
+
+
+def blackbox_of(d: Drawn, fine: bool = True, every: int = 32) -> tuple[bytes, NDArray[np.int64], NDArray[np.int64]]:
+    """A log by Betaflight's description of the format, with every encoding that it has; counts of both sensors.
+
+    Each 32nd frame stands for itself, others are differences; between them are slow frames and events.
+    """
+    gyro = np.rint(np.degrees(d.gyro) * (10.0 if fine else 1.0)).astype(np.int64)
+    accel = np.rint(d.accel / 9.80665 * 2048).astype(np.int64)
+    random = np.random.default_rng(8)
+    n = d.t.size
+    size = (10.0 ** random.uniform(0.0, 6.0, (n, 1))).astype(np.int64)
+    p_terms, f_terms = (random.integers(-size, size + 1, (n, 3)) for _ in range(2))
+    command = random.integers(-300, 300, (n, 4)) * random.integers(0, 2, (n, 4))
+    volts = random.integers(0, 4000, (n, 3)) * random.integers(0, 2, (n, 3))
+    names = ["loopIteration", "time", *(f"axisP[{k}]" for k in range(3)), *(f"axisF[{k}]" for k in range(3))]
+    names += [f"rcCommand[{k}]" for k in range(4)] + ["vbatLatest", "amperageLatest", "rssi"]
+    names += [f"gyroADC[{k}]" for k in range(3)] + [f"accSmooth[{k}]" for k in range(3)]
+    rows = np.column_stack([np.arange(n), d.us, p_terms, f_terms, command, volts, gyro, accel]).tolist()
+    i_enc, i_pred = [1, 1, *[0] * 6, *[0] * 4, 3, 0, 1, *[0] * 6], [0] * 21
+    i_pred[12] = 9  # the battery, less than its reference
+    p_enc = [9, 0, 7, 7, 7, 10, 10, 10, 8, 8, 8, 8, 6, 6, 6, *[0] * 6]
+    p_pred = [6, 2, *[1] * 6, *[1] * 4, *[1] * 3, *[3] * 6]
+    head = {
+        "Product": "Blackbox flight data recorder by Nicholas Sherlock", "Data version": "2", "I interval": str(every),
+        "P interval": "1", "Field I name": ",".join(names), "Field I signed": ",".join(["1"] * len(names)),
+        "Field I predictor": ",".join(map(str, i_pred)), "Field I encoding": ",".join(map(str, i_enc)),
+        "Field P predictor": ",".join(map(str, p_pred)), "Field P encoding": ",".join(map(str, p_enc)),
+        "Field S name": "flightModeFlags,stateFlags", "Field S signed": "0,0", "Field S predictor": "0,0",
+        "Field S encoding": "1,1", "Firmware type": "Betaflight", "gyro_scale": "0x3f800000", "acc_1G": "2048",
+        "vbatref": "4095", "blackbox_high_resolution": str(int(fine)),
+    }  # fmt: skip
+    out = [f"H {name}:{value}\n".encode() for name, value in head.items()]
+    before: list[list[int]] = []
+    for k, row in enumerate(rows):
+        if k % every == 0:
+            frame = [_unsigned(row[0]), _unsigned(row[1]), *map(_signed, row[2:12])]
+            frame += [_unsigned(4095 - row[12] & 0x3FFF), _signed(row[13]), _unsigned(row[14]), *map(_signed, row[15:])]
+            if k % (4 * every) == 0:
+                out.append(b"S" + _unsigned(3) + _unsigned(70))
+                out.append(b"E\x00" + _unsigned(row[1]))
+            before = [row, row]
+            out.append(b"I" + b"".join(frame))
+            continue
+        last, older = before
+        left = [v - w for v, w in zip(row, last, strict=True)]
+        near = [v - int((w + x) / 2) for v, w, x in zip(row, last, older, strict=True)]
+        volt = left[12:15]
+        out.append(
+            b"P" + _signed(row[1] - 2 * last[1] + older[1])
+            + _three(tuple(left[2:5]), ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
+            + _three(tuple(left[5:8]), ((2, 2, 2), (5, 5, 4), (8, 7, 7))) + _four(left[8:12])
+            + bytes([sum((v != 0) << k for k, v in enumerate(volt))]) + b"".join(_signed(v) for v in volt if v)
+            + b"".join(map(_signed, near[15:]))
+        )  # fmt: skip
+        before = [row, last]
+    out.append(b"E\xffEnd of log\0")
+    return b"".join(out), gyro, accel
+
+
+def write_blackbox(d: Drawn, folder: Path) -> Path:
+    path = folder / "btfl_001.bbl"
+    path.write_bytes(blackbox_of(d)[0])
+    return path
+
+
 # ----------------------------------------------------------------------------------------------------------------- MCAP
 
 
@@ -648,6 +755,7 @@ WRITERS: dict[str, Callable[[Drawn, Path], Path]] = {
     "ulog_default": write_ulog_default,
     "vehicle_imu": write_vehicle_imu,
     "ulog_rewritten": write_ulog_rewritten,
+    "blackbox": write_blackbox,
     "dataflash": write_dataflash,
     "tlog": write_tlog,
     "mcap_json": write_mcap_json,

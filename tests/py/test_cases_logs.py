@@ -35,8 +35,12 @@ RATE = 1e-4
 NO_ACCEL = ("ulog2csv_gyro", "blackbox_csv")
 COLD = (
     *("euroc", "ulog2csv", "rostopic", "blackbox_csv", "phyphox", "sensor_logger", "vehicle_imu"),
-    *("mcap_json", "mcap_protobuf"),
+    *("mcap_json", "mcap_protobuf", "blackbox"),
 )
+
+
+#: Sizes of a count, rad/s and m/s^2, of forms that hold whole ones.
+COUNTS = {"blackbox": {"g": np.radians(0.1), "a": 9.80665 / 2048}}
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +68,9 @@ def test_a_log_opens_as_it_is(name: str, drawn: logs.Drawn, tmp_path: Path) -> N
             one = recording.columns[letter + axis]
             step = round(drawn.rate / recording.clock_of(letter + axis).rate_hz)
             expected = truth[::step, place]
+            if name in COUNTS:
+                assert np.abs(in_si(recording, letter + axis) - expected).max() <= 0.5001 * COUNTS[name][letter]
+                continue
             # Steps of a float32 at 9.81 m/s^2, and nine digits.
             assert in_si(recording, letter + axis) == pytest.approx(expected, rel=3e-7, abs=1e-9), one.name
     assert ("temp" in recording.columns) == (name not in COLD)
@@ -83,7 +90,10 @@ def test_numbers_of_a_log(name: str, tmp_path: Path) -> None:
     for seed in range(max(1, records)):
         log = logs.WRITERS[name](logs.Drawn(seed=100 + seed), tmp_path)
         axis = identify(log, axes=("gy",), suspicion=False)["axes"]["gy"]
-        for key, truth in (("N", logs.N), ("K", logs.K)):
+        # Rounding to a count is white noise.
+        count = COUNTS.get(name, {"g": 0.0})["g"]
+        white = np.sqrt(logs.N**2 + count**2 / 12.0 / 100.0)
+        for key, truth in (("N", white), ("K", logs.K)):
             found = axis["parameters"]["random_walk"][key]
             size = np.radians(1.0) if found["unit"].startswith("deg") else 1.0
             assert abs(found["median"] * size - truth) < 5.0 * found["sd"] * size
@@ -188,6 +198,27 @@ def test_frames_by_a_database(suffix: str, drawn: logs.Drawn, tmp_path: Path) ->
     other.write_text(logs.DBC.replace("BO_ 2", "BO_ 3").replace("BO_ 5", "BO_ 6"), encoding="utf-8")
     with pytest.raises(UserError, match="no frame in it is a message of"):
         load(log, dbc=other)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_counts_of_a_blackbox(fine: bool, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Every frame of every encoding, exactly; two armings are two sources. A frame that is damaged costs those up to
+    the next that stands for itself, 32 of them."""
+    data, gyro, accel = logs.blackbox_of(drawn, fine)
+    log = tmp_path / "log.bbl"
+    log.write_bytes(data)
+    recording = load(log)
+    assert recording.columns["gy"].values == pytest.approx(gyro[:, 1] * (0.1 if fine else 1.0), abs=1e-12)
+    assert recording.columns["ax"].values == pytest.approx(accel[:, 0] / 2048, abs=1e-12)
+    log.write_bytes(data + data)
+    with pytest.raises(UserError, match=r"--source 'log 1' .*--source 'log 2'"):
+        load(log)
+    assert load(log, source=["log 2"]).samples == drawn.t.size
+    middle = len(data) // 2
+    log.write_bytes(data[:middle] + b"\xff" * 6 + data[middle + 6 :])
+    hurt = load(log)
+    assert drawn.t.size - 66 <= hurt.samples < drawn.t.size
+    assert hurt.lost == drawn.t.size - hurt.samples
 
 
 def test_samples_of_a_fifo(drawn: logs.Drawn, tmp_path: Path) -> None:
@@ -322,7 +353,7 @@ def mutated(random: np.random.Generator, whole: bytes) -> bytes:
 
 #: Writers of binary logs, one a format and storage.
 BINARY = (
-    *("ros1", "db3", "ulog", "phyphox", "dataflash", "tlog", "mcap_json", "mcap_protobuf", "ros2_mcap"),
+    *("ros1", "db3", "ulog", "phyphox", "blackbox", "dataflash", "tlog", "mcap_json", "mcap_protobuf", "ros2_mcap"),
     *("hdf5", "mat73", "parquet", "tdms", "mf4"),
 )
 

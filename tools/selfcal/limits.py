@@ -21,6 +21,8 @@ BLOCK_BYTES = 1 << 22
 MOST_GROWTH = 200
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
+#: Cells of these lines that are looked at for a known heading.
+MOST_HEADINGS = 30_000
 #: What a MATLAB or R file may unpack to, and what any of them may however small it is. Each number is held three times.
 MOST_UNPACKED_BYTES, MOST_UNPACKED_SMALL = 1 << 30, 1 << 26
 #: Objects in an R file: each value of a text column is one.

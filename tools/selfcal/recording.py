@@ -28,6 +28,7 @@ from selfcal.limits import (
     LEAST_RATE_HZ,
     LONGEST_HEADING,
     MOST_CLOCKS,
+    MOST_HEADINGS,
     MOST_META_BYTES,
     MOST_NUMBERS,
     MOST_RATE_HZ,
@@ -620,8 +621,16 @@ class _Header:
         return one
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
-        """Whether one of a line's headings is a sensor's, in a text."""
-        return lambda keys: any(key in self.columns.values() for key in keys) or bool(self.sensors_of(keys, text.name))
+        """Whether one of a line's headings is a sensor's, in a text. Only so many are looked at."""
+        left = MOST_HEADINGS
+
+        def knows(keys: Sequence[str]) -> bool:
+            nonlocal left
+            left -= len(keys)
+            named = any(key in self.columns.values() for key in keys)
+            return named or (left > 0 and bool(self.sensors_of(keys, text.name)))
+
+        return knows
 
     def sensors_of(self, keys: Sequence[str], file: str = "") -> list[Sensor]:
         """The sensors of a table with these headings."""

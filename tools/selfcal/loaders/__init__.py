@@ -45,6 +45,7 @@ FORMATS = (
     Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap", "ros"),
     Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog", "px4"),
     Format("a DataFlash log", (".bin", ".tlog"), "dataflash", ((0, b"\xa3\x95\x80"),), "pymavlink", "ardupilot"),
+    Format("a Betaflight log", (".bbl", ".bfl"), "blackbox", ((0, b"H Product:Blackbox"),)),
     Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py", "lab"),
     Format("a Parquet file", (".parquet",), "parquet", ((0, b"PAR1"),), "pyarrow", "lab"),
     Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms", "lab"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from selfcal import units
 from selfcal.limits import LONGEST_HEADING
@@ -123,6 +124,7 @@ _ENDINGS = {
 }  # fmt: skip
 
 
+@lru_cache(4096)
 def split(text: str) -> tuple[str, str | None]:
     """`name[unit]` or `name(unit)` in its parts; unit None without brackets."""
     text = text.strip()
