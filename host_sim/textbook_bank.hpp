@@ -22,13 +22,14 @@
 
 namespace selfcal_reference {
 
-// The law of x_i: a sum of terms, each a random walk, a Gauss-Markov process or an oscillator, with the drift parameter d (K, sigma_m
-// or B) of the node. The paper's laws have one term or none; its filter takes any linear law.
+// The law of x_i: a sum of terms, each a random walk, a Gauss-Markov process or an oscillator, with the
+// drift parameter d (K, sigma_m or B) of the node. The paper's laws have one term or none; its filter takes any linear
+// law.
 //   walk:   x_i = x_(i-1) + deviation d sqrt(dt) w_i
 //   markov: its standard deviation is deviation d, its bandwidth `bandwidth` times the node's alpha (if stated: 1/s).
 //           Beside a walk, where d is a K, its standard deviation is deviation d / sqrt(bandwidth).
-//   oscillation, then damping: x'' + 2 rate x' + w^2 x = white noise, of two states, x and x'/w. `bandwidth` of the first
-//           is w, of the second the rate. Its standard deviation is that of a Gauss-Markov term of the bandwidth w.
+//   oscillation, then damping: x'' + 2 rate x' + w^2 x = white noise, of two states, x and x'/w. `bandwidth` of the
+//           first is w, of the second the rate. Its standard deviation is that of a Gauss-Markov term of bandwidth w.
 //   by_ratio: the node's second parameter multiplies the deviation.
 // Coloured noise: (e_i + theta e_(i-1)) / (1 + theta) instead of v_i, e_i ~ N(0, r_i sigma_v^2), r = 1 where a sample
 // is missing. The second parameter is (1 + theta) / (1 - theta): the spectrum's amplitude at 0 Hz over its amplitude at

@@ -120,12 +120,12 @@ static void put_swing(matrix_t *matrix, size_t pair, swing_t swing) {
 }
 
 /* Variance that an oscillation gains as it turns so, v the stationary one of each state. */
-static selfcal_wide_t gained(swing_t swing, selfcal_wide_t v, bool first) {
+static selfcal_wide_t turned_var(swing_t swing, selfcal_wide_t v, bool first) {
     const selfcal_wide_t off = first ? swing.up : swing.down;
     return v * (1.0 - swing.m * swing.m - off * off);
 }
 
-static selfcal_wide_t gained_both(swing_t swing, selfcal_wide_t v) {
+static selfcal_wide_t turned_both(swing_t swing, selfcal_wide_t v) {
     return -v * swing.m * (swing.up + swing.down);
 }
 
@@ -152,10 +152,10 @@ static void transform(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t order, const 
 }
 
 /* Adds to P what the states gain as an oscillation turns. */
-static void add_gained(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t pair, swing_t swing, selfcal_wide_t v) {
-    p[term_pair(pair - 1U, pair - 1U)] += gained(swing, v, true);
-    p[term_pair(pair, pair)] += gained(swing, v, false);
-    p[term_pair(pair, pair - 1U)] += gained_both(swing, v);
+static void add_turned(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t pair, swing_t swing, selfcal_wide_t v) {
+    p[term_pair(pair - 1U, pair - 1U)] += turned_var(swing, v, true);
+    p[term_pair(pair, pair)] += turned_var(swing, v, false);
+    p[term_pair(pair, pair - 1U)] += turned_both(swing, v);
 }
 
 /* The mean of a block over that of a point, for its slow turn w: right to (w dt)^4. */
@@ -264,7 +264,7 @@ static void carry(const selfcal_term_node_t *node, size_t order, selfcal_wide_t 
     put_swing(&whole, node->pair, turn_of(node));
     memcpy(p, node->p, sizeof node->p);
     transform(p, order, &whole);
-    add_gained(p, node->pair, turn_of(node), (selfcal_wide_t)node->q[node->pair - 1U]);
+    add_turned(p, node->pair, turn_of(node), (selfcal_wide_t)node->q[node->pair - 1U]);
 }
 
 /* Whether P has come to rest. */
@@ -477,7 +477,7 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     }
     transform(term->p, order, &whole);
     if (term->pair != 0U) {
-        add_gained(term->p, term->pair, power(turn_of(term), count), (selfcal_wide_t)term->q[term->pair - 1U]);
+        add_turned(term->p, term->pair, power(turn_of(term), count), (selfcal_wide_t)term->q[term->pair - 1U]);
     }
     for (size_t a = 0; a < order; a++) {
         const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a],
@@ -521,7 +521,7 @@ static void swing_now(const selfcal_model_t *model, const selfcal_term_t *first,
     const swing_t back = swing_of(first, late_s - dt_s);
     const swing_t of_point = {back.m / mean, back.up / mean, back.down / mean};
     put_swing(&now->per_prediction, a + 1U, of_point);
-    add_gained(now->after, a + 1U, swing_of(first, late_s), variance);
+    add_turned(now->after, a + 1U, swing_of(first, late_s), variance);
 }
 
 /* The filter holds predictions, phi times the states now; a state of phi 0 is noise, no drift. */
@@ -572,7 +572,7 @@ static void spread_of(const selfcal_t *self, size_t j, selfcal_wide_t spread[SEL
         spread[term_pair(a, a)] -= in_pair(term, a) ? 0.0 : (selfcal_wide_t)term->q[a];
     }
     if (term->pair != 0U) {
-        add_gained(spread, term->pair, turn_of(term), -(selfcal_wide_t)term->q[term->pair - 1U]);
+        add_turned(spread, term->pair, turn_of(term), -(selfcal_wide_t)term->q[term->pair - 1U]);
     }
     transform(spread, SELFCAL_TERMS_MAX, &now.per_prediction);
     for (size_t k = 0; k < SELFCAL_TERM_PAIRS; k++) {
@@ -635,7 +635,8 @@ static bool states_sound(const selfcal_t *self) {
     }
     for (size_t k = 0; k < nodes; k++) {
         const selfcal_term_node_t *node = &terms->node[k];
-        if (!is_bool(&node->steady) || node->pair >= SELFCAL_TERMS_MAX || !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
+        if (!is_bool(&node->steady) || node->pair >= SELFCAL_TERMS_MAX ||
+            !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
             return false;
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {

@@ -106,7 +106,8 @@ LawTuple tuple_of(const sr::Law &law) {
     LawTuple t;
     std::get<1>(t) = law.coloured_noise;
     for (const sr::Term &term : law.terms)
-        std::get<0>(t).emplace_back(static_cast<int>(term.kind), term.deviation, term.bandwidth, term.stated, term.by_ratio);
+        std::get<0>(t).emplace_back(static_cast<int>(term.kind), term.deviation, term.bandwidth, term.stated,
+                                    term.by_ratio);
     return t;
 }
 
@@ -122,7 +123,9 @@ sr::Node node(const std::vector<sr::Law> &laws, int hypothesis, double drift, do
                                     ", an index into the laws");
     const sr::Node out{static_cast<std::size_t>(hypothesis), drift, second, sigma_v};
     const sr::Law &law = laws[out.hypothesis];
-    const auto takes_second = [](const sr::Term &term) { return term.by_ratio || (term.kind != sr::Kind::walk && !term.stated); };
+    const auto takes_second = [](const sr::Term &term) {
+        return term.by_ratio || (term.kind != sr::Kind::walk && !term.stated);
+    };
     const bool has_second =
         law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), takes_second);
     if (!(sigma_v > 0.0) || (!law.terms.empty() && !(drift >= 0.0)) || (has_second && !(second > 0.0)))

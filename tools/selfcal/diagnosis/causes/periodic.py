@@ -17,7 +17,7 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import Fit, finish, fit, moved
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
-from selfcal.diagnosis.statemodel import Array
+from selfcal.diagnosis.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array
 
 #: Fewer turns in a record than this are drift.
 TURNS_LEAST = 3.0
@@ -51,6 +51,8 @@ def _band(state: State, record: Record) -> list[Look]:
     count = int(np.isfinite(state.y).sum())
     power = np.abs(rfft(w)) ** 2 / count
     low = max(4, math.ceil(10.0 * TURNS_LEAST))
+    if not state.extras.oscillation:  # a slower band is that
+        low = max(low, math.ceil(n * state.dt / max(PERIOD_LIMITS[0], SAMPLES_LEAST * state.dt)))
     best: tuple[float, int, int] | None = None
     for width in BAND_WIDTHS:
         if width > power.size // 8:
