@@ -368,7 +368,7 @@ CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens chec
 check: setup
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
 
-C_ALL := $(wildcard lib/*.c port/app/*.c port/replay/*.c port/posix/*.c) $(MODEL)/selfcal_model.c
+C_ALL := $(wildcard lib/*.c port/app/*.c port/sensors/*.c port/replay/*.c port/posix/*.c) $(MODEL)/selfcal_model.c
 # each COMPILER+FLAGS,FILES: every file by itself, so that every complaint is seen
 each = @failed=0; for file in $(2); do $(1) $$file || failed=1; done; exit $$failed
 
@@ -387,7 +387,7 @@ MACHINE_cortex-m4f := -DQEMU_NETDUINOPLUS2
 MACHINE_cortex-m0 := -DQEMU_MICROBIT
 EMBEDDED = $(wildcard port/qemu/*.c port/$(1)/*.c)
 INCLUDES_OF = $(INCLUDES:-I$(MODEL)=-I$(BUILD)/$(1)/model) $(MACHINE_$(CORE_$(1)))
-ARM_C := $(wildcard lib/*.c port/app/*.c port/replay/*.c)
+ARM_C := $(wildcard lib/*.c port/app/*.c port/sensors/*.c port/replay/*.c)
 ARM_GCC := arm-none-eabi-gcc -O2 -c -o /dev/null $(ARM_COMPILE)
 check-arm: $(BOARDS:%=check-arm-%)
 .PHONY: $(BOARDS:%=check-arm-%)

@@ -1,0 +1,567 @@
+#include "icm42688.h"
+
+#include <math.h>
+#include <string.h>
+
+/* Registers of bank 0. */
+enum {
+    DEVICE_CONFIG = 0x11,
+    FIFO_CONFIG = 0x16,
+    FIFO_COUNTH = 0x2E,
+    FIFO_DATA = 0x30,
+    SIGNAL_PATH_RESET = 0x4B,
+    INTF_CONFIG0 = 0x4C,
+    PWR_MGMT0 = 0x4E,
+    GYRO_CONFIG0 = 0x4F,
+    ACCEL_CONFIG0 = 0x50,
+    TMST_CONFIG = 0x54,
+    FIFO_CONFIG1 = 0x5F,
+    SELF_TEST_CONFIG = 0x70,
+    WHO_AM_I = 0x75,
+    BANK_SEL = 0x76 /* in every bank */
+};
+enum { GYRO_ST_DATA = 0x5F, ACCEL_ST_DATA = 0x3B, OFFSET_USER0 = 0x77 }; /* banks 1, 2 and 4 */
+#define READ 0x80U
+#define IDENTITY 0x47U
+#define RESET 0x01U
+#define STREAM 0x40U               /* FIFO: the oldest packet gives way */
+#define FLUSH 0x02U
+#define BIG_ENDIAN_NO_I2C 0x33U    /* counts in bytes */
+#define BOTH_LOW_NOISE 0x0FU
+#define TIMESTAMPS 0x21U           /* 1 us, no delta, no FSYNC */
+#define PACKETS_OF_16 0x0FU
+#define PACKETS_OF_20 0x5FU        /* and a FIFO that is read in parts */
+#define RATE_1KHZ 0x06U
+#define GYRO_250 (3U << 5)
+#define ACCEL_4G (2U << 5)
+#define TEST_ALL 0x7FU
+
+/* A header: accelerometer, gyro, 20 bits, timestamp. The two lowest bits say that a rate has just changed. */
+#define HEADER 0x78U
+#define HEADER_16 0x68U
+#define HEADER_KIND 0xFCU
+#define EMPTY 0x80U
+
+enum { SHORT_PACKET = 16, FIFO_BYTES = 2048, FIFO_PACKETS = FIFO_BYTES / ICM42688_PACKET };
+#define G 9.80665F
+#define GYRO_STEP (2000.0F / 262144.0F)
+#define ACCEL_STEP (16.0F * G / 131072.0F)
+
+/* Self-test, at 250 deg/s and 4 g. */
+#define GYRO_LSB_PER_DPS (32768.0F / 250.0F)
+#define ACCEL_LSB_PER_G (32768.0F / 4.0F)
+#define GYRO_RESPONSE 2620.0F /* LSB of code 1; each further one 1 % more */
+#define ACCEL_RESPONSE 1310.0F
+enum { TEST_SAMPLES = 32 };   /* at least */
+
+#define RESET_US 2000U        /* the data sheet: 1 ms */
+#define SPIN_US 60000U        /* the data sheet: 45 ms from power-on of the gyro */
+#define STRAIN_US 200000U     /* the self-test's deflection settles */
+#define GATHER_US 70000U
+#define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
+#define CHECK_US 10000000U    /* between readings of the settings */
+#define BACKOFF_MIN_US 100000U
+#define BACKOFF_MAX_US 10000000U
+#define BLIND_US 1000000U     /* from here on the processor's clock counts: a timestamp's turns are unsure */
+enum { PROVEN_SAMPLES = 1000 };
+/* All axes as before: from the third in a row on withheld, the sixteenth is a fault. */
+enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16 };
+/* Timestamps out of place in a row: the packets do not follow each other after all. */
+enum { MISMATCHES = 4 };
+
+enum { STEP_RESET, STEP_SPIN, STEP_LEVEL, STEP_STRAIN, STEP_RESPONSE, STEP_RELAX };
+
+/* --- registers --- */
+
+static uint64_t now_of(const icm42688_t *self) {
+    return self->bus->time_us(self->bus->context);
+}
+
+/* `count` registers from `address` on, 14 at most. */
+static bool read_registers(icm42688_t *self, uint8_t address, uint8_t *values, size_t count) {
+    uint8_t out[15] = {(uint8_t)(READ | address)}, in[15];
+    if (!self->bus->transfer(self->bus->context, out, in, 1U + count)) {
+        return false;
+    }
+    memcpy(values, in + 1, count);
+    return true;
+}
+
+static bool write_byte(icm42688_t *self, uint8_t address, uint8_t value) {
+    const uint8_t out[2] = {address, value};
+    uint8_t in[2];
+    return self->bus->transfer(self->bus->context, out, in, 2U);
+}
+
+/* And reads back: a byte has no checksum. */
+static bool write_register(icm42688_t *self, uint8_t address, uint8_t value) {
+    uint8_t found;
+    return write_byte(self, address, value) && read_registers(self, address, &found, 1U) && found == value;
+}
+
+static bool flush(icm42688_t *self) {
+    self->next = self->held = 0;
+    self->continuous = false;
+    return write_byte(self, SIGNAL_PATH_RESET, FLUSH);
+}
+
+/* Registers of another bank; back in bank 0 in any case. */
+static bool read_bank(icm42688_t *self, uint8_t bank, uint8_t address, uint8_t *values, size_t count) {
+    const bool read = write_register(self, BANK_SEL, bank) && read_registers(self, address, values, count);
+    return write_register(self, BANK_SEL, 0U) && read;
+}
+
+/* --- offsets --- */
+
+static float offset_step(size_t axis) {
+    return axis < 3U ? 1.0F / 32.0F : 0.5e-3F * G;
+}
+
+/* Six numbers of 12 bits in nine bytes of bank 4: a byte with the high bits of two between their low ones. */
+static void pack_offsets(const int16_t added[ICM42688_AXES], uint8_t bytes[9]) {
+    for (size_t pair = 0; pair < 3U; pair++) {
+        const unsigned first = (unsigned)added[2U * pair] & 0xFFFU, second = (unsigned)added[2U * pair + 1U] & 0xFFFU;
+        bytes[3U * pair] = (uint8_t)(first & 0xFFU);
+        bytes[3U * pair + 1U] = (uint8_t)((second >> 8) << 4 | first >> 8);
+        bytes[3U * pair + 2U] = (uint8_t)(second & 0xFFU);
+    }
+}
+
+static bool write_offsets(icm42688_t *self, const int16_t added[ICM42688_AXES]) {
+    uint8_t bytes[9];
+    pack_offsets(added, bytes);
+    bool written = write_register(self, BANK_SEL, 4U);
+    for (uint8_t i = 0; i < sizeof bytes && written; i++) {
+        written = write_register(self, (uint8_t)(OFFSET_USER0 + i), bytes[i]);
+    }
+    return write_register(self, BANK_SEL, 0U) && written;
+}
+
+bool icm42688_offsets(icm42688_t *self, const float wanted[ICM42688_AXES], float got[ICM42688_AXES]) {
+    int16_t added[ICM42688_AXES];
+    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+        const float steps = wanted[axis] / offset_step(axis);
+        if (!(steps > -2048.4F && steps < 2047.4F)) {
+            return false;
+        }
+        added[axis] = (int16_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
+        got[axis] = (float)added[axis] * offset_step(axis);
+    }
+    if (self->state == ICM42688_RUNNING) {
+        if (!write_offsets(self, added) || !flush(self)) {
+            (void)write_offsets(self, self->added);
+            (void)flush(self);
+            return false;
+        }
+    }
+    memcpy(self->added, added, sizeof added);
+    return true;
+}
+
+/* --- start --- */
+
+static void enter(icm42688_t *self, uint8_t step) {
+    self->state = ICM42688_STARTING;
+    self->step = step;
+    self->step_us = now_of(self);
+}
+
+static void begin(icm42688_t *self) {
+    (void)write_byte(self, BANK_SEL, 0U);
+    (void)write_byte(self, DEVICE_CONFIG, RESET);
+    self->next = self->held = 0;
+    self->continuous = false;
+    self->blind = true;
+    enter(self, STEP_RESET);
+}
+
+static void fail(icm42688_t *self, icm42688_fault_t fault) {
+    self->state = ICM42688_FAILED;
+    self->fault = fault;
+    self->step_us = now_of(self);
+    self->next = self->held = 0;
+    self->counters.faults++;
+    if (self->good >= PROVEN_SAMPLES) {
+        self->backoff_us = BACKOFF_MIN_US;
+    } else {
+        self->backoff_us = self->backoff_us < BACKOFF_MAX_US / 2U ? self->backoff_us * 2U : BACKOFF_MAX_US;
+    }
+    self->good = 0;
+}
+
+bool icm42688_init(icm42688_t *self, const icm42688_bus_t *bus, float rate_hz) {
+    static const struct {
+        float rate_hz;
+        uint8_t code;
+        uint32_t period_us;
+    } rates[] = {{1000.0F, 6, 1000}, {500.0F, 15, 2000}, {200.0F, 7, 5000},
+                 {100.0F, 8, 10000}, {50.0F, 9, 20000},  {25.0F, 10, 40000}};
+    memset(self, 0, sizeof *self);
+    self->bus = bus;
+    self->temperature = INT16_MIN;
+    self->backoff_us = BACKOFF_MIN_US / 2U;
+    for (size_t i = 0; i < sizeof rates / sizeof rates[0]; i++) {
+        if (fabsf(rate_hz - rates[i].rate_hz) <= 1e-3F * rates[i].rate_hz) {
+            self->rate = rates[i].code;
+            self->period_us = rates[i].period_us;
+            self->ticks_q8 = rates[i].period_us * 240U; /* 30/32 of 256: the PLL's unit */
+            begin(self);
+            return true;
+        }
+    }
+    return false;
+}
+
+/* Bytes in the FIFO. */
+static bool fifo_count(icm42688_t *self, uint32_t *count) {
+    uint8_t bytes[2];
+    if (!read_registers(self, FIFO_COUNTH, bytes, 2U)) {
+        return false;
+    }
+    *count = (uint32_t)bytes[0] << 8 | bytes[1];
+    return true;
+}
+
+static bool read_fifo(icm42688_t *self, size_t bytes) {
+    uint8_t out[sizeof self->chunk] = {READ | FIFO_DATA};
+    return self->bus->transfer(self->bus->context, out, self->chunk, 1U + bytes);
+}
+
+static int16_t word_of(const uint8_t *bytes) {
+    const int32_t value = (int32_t)bytes[0] << 8 | bytes[1];
+    return (int16_t)(value >= 0x8000 ? value - 0x10000 : value);
+}
+
+/* Mean of the short packets that wait, gx to az, LSB. */
+static bool mean(icm42688_t *self, float result[ICM42688_AXES]) {
+    int32_t sum[ICM42688_AXES] = {0};
+    size_t taken = 0;
+    uint32_t count;
+    if (!fifo_count(self, &count)) {
+        return false;
+    }
+    for (size_t left = count / SHORT_PACKET; left > 0U;) {
+        const size_t packets = left < ICM42688_CHUNK ? left : ICM42688_CHUNK;
+        if (!read_fifo(self, packets * SHORT_PACKET)) {
+            return false;
+        }
+        left -= packets;
+        for (size_t i = 0; i < packets; i++) {
+            const uint8_t *packet = self->chunk + 1U + i * SHORT_PACKET;
+            if ((packet[0] & HEADER_KIND) != HEADER_16) {
+                return false;
+            }
+            for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+                sum[axis] += word_of(packet + (axis < 3U ? 7U : 1U) + 2U * (axis % 3U));
+            }
+            taken++;
+        }
+    }
+    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+        result[axis] = (float)sum[axis] / (float)(taken > 0U ? taken : 1U);
+    }
+    return taken >= TEST_SAMPLES;
+}
+
+static bool prepare_test(icm42688_t *self) {
+    return read_bank(self, 1U, GYRO_ST_DATA, self->codes, 3U) &&
+           read_bank(self, 2U, ACCEL_ST_DATA, self->codes + 3, 3U) &&
+           write_register(self, INTF_CONFIG0, BIG_ENDIAN_NO_I2C) && write_register(self, TMST_CONFIG, TIMESTAMPS) &&
+           write_register(self, GYRO_CONFIG0, GYRO_250 | RATE_1KHZ) &&
+           write_register(self, ACCEL_CONFIG0, ACCEL_4G | RATE_1KHZ) &&
+           write_register(self, FIFO_CONFIG1, PACKETS_OF_16) && write_register(self, FIFO_CONFIG, STREAM) &&
+           write_byte(self, PWR_MGMT0, BOTH_LOW_NOISE); /* no access for 200 us now */
+}
+
+/* Whether each axis moved as at the factory, or by a plausible amount if the factory has left no code. */
+static bool responded(const icm42688_t *self, const float moved[ICM42688_AXES]) {
+    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+        const bool gyro = axis < 3U;
+        const float response = fabsf(moved[axis] - self->level[axis]);
+        float least = gyro ? 60.0F * GYRO_LSB_PER_DPS : 0.05F * ACCEL_LSB_PER_G;
+        float most = gyro ? INFINITY : 1.2F * ACCEL_LSB_PER_G;
+        if (self->codes[axis] > 0U) {
+            float expected = gyro ? GYRO_RESPONSE : ACCEL_RESPONSE;
+            for (uint8_t code = 1; code < self->codes[axis]; code++) {
+                expected *= 1.01F;
+            }
+            least = 0.5F * expected;
+            most = gyro ? INFINITY : 1.5F * expected;
+        }
+        if (!(response > least && response < most)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool set_up(icm42688_t *self) {
+    return write_register(self, SELF_TEST_CONFIG, 0U) && write_register(self, FIFO_CONFIG, 0U) &&
+           write_register(self, GYRO_CONFIG0, self->rate) && write_register(self, ACCEL_CONFIG0, self->rate) &&
+           write_register(self, FIFO_CONFIG1, PACKETS_OF_20) && write_offsets(self, self->added) &&
+           write_register(self, FIFO_CONFIG, STREAM);
+}
+
+static void expect(icm42688_t *self) {
+    self->progress_us = now_of(self);
+    self->packets_seen = 0;
+}
+
+static void run(icm42688_t *self) {
+    self->state = ICM42688_RUNNING;
+    self->equal = 0;
+    self->dropped = 0;
+    self->mismatches = 0;
+    self->checked_us = now_of(self);
+    expect(self);
+}
+
+static void start_on(icm42688_t *self) {
+    static const uint32_t wait[] = {RESET_US, SPIN_US, GATHER_US, STRAIN_US, GATHER_US, STRAIN_US};
+    if (now_of(self) - self->step_us < wait[self->step]) {
+        return;
+    }
+    uint8_t identity;
+    float moved[ICM42688_AXES];
+    switch (self->step) {
+    case STEP_RESET:
+        if (!read_registers(self, WHO_AM_I, &identity, 1U) || identity != IDENTITY) {
+            fail(self, ICM42688_ABSENT);
+        } else if (!prepare_test(self)) {
+            fail(self, ICM42688_SET_UP);
+        } else {
+            enter(self, STEP_SPIN);
+        }
+        return;
+    case STEP_SPIN:
+        (void)flush(self);
+        enter(self, STEP_LEVEL);
+        return;
+    case STEP_LEVEL:
+        if (!mean(self, self->level) || !write_register(self, SELF_TEST_CONFIG, TEST_ALL)) {
+            fail(self, ICM42688_SELF_TEST);
+        } else {
+            enter(self, STEP_STRAIN);
+        }
+        return;
+    case STEP_STRAIN:
+        (void)flush(self);
+        enter(self, STEP_RESPONSE);
+        return;
+    case STEP_RESPONSE:
+        if (!mean(self, moved) || !responded(self, moved)) {
+            fail(self, ICM42688_SELF_TEST);
+        } else if (!set_up(self)) {
+            fail(self, ICM42688_SET_UP);
+        } else {
+            enter(self, STEP_RELAX);
+        }
+        return;
+    default:
+        (void)flush(self);
+        run(self);
+        return;
+    }
+}
+
+/* --- run --- */
+
+/* Whether one of the settings has been found wrong twice. */
+static bool altered(icm42688_t *self) {
+    const struct {
+        uint8_t address, value;
+    } wanted[] = {{PWR_MGMT0, BOTH_LOW_NOISE}, {GYRO_CONFIG0, self->rate},      {ACCEL_CONFIG0, self->rate},
+                  {FIFO_CONFIG, STREAM},       {FIFO_CONFIG1, PACKETS_OF_20},   {TMST_CONFIG, TIMESTAMPS},
+                  {SELF_TEST_CONFIG, 0U},      {INTF_CONFIG0, BIG_ENDIAN_NO_I2C}, {BANK_SEL, 0U}};
+    for (size_t i = 0; i < sizeof wanted / sizeof wanted[0]; i++) {
+        uint8_t found, again;
+        if (read_registers(self, wanted[i].address, &found, 1U) && found != wanted[i].value &&
+            read_registers(self, wanted[i].address, &again, 1U) && again == found) {
+            return true;
+        }
+    }
+    return false;
+}
+
+static void watch(icm42688_t *self) {
+    const uint64_t now = now_of(self);
+    const uint64_t silence = SILENCE_US > 10U * self->period_us ? SILENCE_US : 10U * self->period_us;
+    if (now - self->checked_us >= CHECK_US) {
+        self->checked_us = now;
+        if (altered(self)) {
+            fail(self, ICM42688_SET_UP);
+            return;
+        }
+    }
+    uint32_t count;
+    if (self->equal >= REPEATS_STUCK) {
+        fail(self, ICM42688_STUCK);
+    } else if (now - self->progress_us > silence && self->next == self->held) {
+        if (self->packets_seen > 0U) {
+            fail(self, ICM42688_NO_DATA);
+        } else if (!fifo_count(self, &count) || count < ICM42688_PACKET || count > FIFO_BYTES) { /* floating lines */
+            fail(self, ICM42688_SILENT);
+        }
+    }
+}
+
+void icm42688_poll(icm42688_t *self) {
+    switch (self->state) {
+    case ICM42688_STARTING: start_on(self); break;
+    case ICM42688_RUNNING: watch(self); break;
+    default:
+        if (now_of(self) - self->step_us >= self->backoff_us) {
+            begin(self);
+        }
+        break;
+    }
+}
+
+/* Reads the next packets; false: there are none. */
+static bool fetch(icm42688_t *self) {
+    uint32_t count;
+    if (!fifo_count(self, &count) || count < ICM42688_PACKET || count > FIFO_BYTES) {
+        return false;
+    }
+    uint32_t packets = count / ICM42688_PACKET;
+    if (packets + 1U >= FIFO_PACKETS) {
+        if (self->continuous) {
+            self->counters.overruns++;
+        }
+        self->continuous = false;
+    }
+    const uint8_t held = (uint8_t)(packets < ICM42688_CHUNK ? packets : ICM42688_CHUNK);
+    self->read_us = now_of(self);
+    if (!read_fifo(self, (size_t)held * ICM42688_PACKET)) {
+        self->continuous = false;
+        return false;
+    }
+    self->behind = (uint8_t)(packets - held);
+    self->next = 0;
+    self->held = held;
+    return true;
+}
+
+/* Six numbers of 20 bits, gx to az. False: not a packet, or bits set that a sensor leaves 0. */
+static bool unpack(const uint8_t *packet, int32_t raw[ICM42688_AXES]) {
+    if ((packet[0] & HEADER_KIND) != HEADER) {
+        return false;
+    }
+    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+        const bool gyro = axis < 3U;
+        const uint8_t *high = packet + (gyro ? 7U : 1U) + 2U * (axis % 3U);
+        const uint8_t low = packet[17U + axis % 3U];
+        const uint32_t nibble = gyro ? low & 15U : (uint32_t)low >> 4;
+        const uint32_t value = (uint32_t)high[0] << 12 | (uint32_t)high[1] << 4 | nibble;
+        if ((nibble & (gyro ? 1U : 3U)) != 0U || value == 0x80000U) { /* the latter: no valid sample */
+            return false;
+        }
+        raw[axis] = (int32_t)(value ^ 0x80000U) - 0x80000;
+    }
+    return true;
+}
+
+/* Periods from the last sample to one at `us` with this timestamp, after a break. */
+static uint32_t periods(const icm42688_t *self, uint64_t us, uint16_t stamp) {
+    const uint64_t passed = us > self->last_us ? us - self->last_us : 0U;
+    uint64_t count = (passed + self->period_us / 2U) / self->period_us;
+    if (!self->blind && passed < BLIND_US) { /* whole turns of the timestamp from the clock, the rest from the timestamp */
+        const uint64_t ticks = passed * self->ticks_q8 / self->period_us / 256U;
+        const uint32_t part = (uint16_t)(stamp - self->last_stamp);
+        const uint64_t turns = ticks > part ? (ticks - part + 0x8000U) >> 16 : 0U;
+        count = (((turns << 16) + part) * 256U + self->ticks_q8 / 2U) / self->ticks_q8;
+    }
+    return count < 1U ? 1U : count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
+}
+
+/* Whether the timestamp is where `count` periods after the last one have it, within a quarter. */
+static bool in_place(icm42688_t *self, uint16_t stamp, uint32_t count) {
+    const uint16_t step = (uint16_t)(stamp - self->last_stamp);
+    const int16_t off = (int16_t)(uint16_t)(step - (uint16_t)((uint64_t)count * self->ticks_q8 / 256U));
+    const int32_t bound = (int32_t)(self->ticks_q8 / 1024U);
+    if (off >= bound || off <= -bound) {
+        return false;
+    }
+    if (count == 1U) {
+        const uint32_t ticks = (uint32_t)((int32_t)self->ticks_q8 + 4 * off), nominal = self->period_us * 256U;
+        if (ticks > nominal - nominal / 6U && ticks < nominal + nominal / 6U) {
+            self->ticks_q8 = ticks;
+        }
+    }
+    return true;
+}
+
+/* Whether a good packet with this timestamp is a sample, and how many are missing before it. */
+static bool placed(icm42688_t *self, uint64_t us, uint16_t stamp, uint32_t *missing) {
+    if (self->continuous && self->dropped == 0U && stamp == self->last_stamp) {
+        self->counters.stale++;
+        return false;
+    }
+    if (self->continuous && !in_place(self, stamp, self->dropped + 1U)) {
+        self->counters.damaged++;
+        self->dropped++;
+        if (++self->mismatches >= MISMATCHES) {
+            self->continuous = false;
+        }
+        return false;
+    }
+    *missing = self->continuous ? self->dropped : self->anchored ? periods(self, us, stamp) - 1U : 0U;
+    return true;
+}
+
+static bool take(icm42688_t *self, const int32_t raw[ICM42688_AXES], uint64_t us, uint16_t stamp) {
+    self->equal = memcmp(raw, self->last, sizeof self->last) == 0 ? self->equal + 1U : 0U;
+    memcpy(self->last, raw, sizeof self->last);
+    if (self->equal > REPEATS_TAKEN) {
+        self->counters.repeated++;
+        self->dropped++;
+        return false;
+    }
+    self->last_us = us;
+    self->last_stamp = stamp;
+    self->anchored = self->continuous = true;
+    self->blind = false;
+    self->dropped = 0;
+    self->mismatches = 0;
+    self->good++;
+    self->counters.samples++;
+    expect(self);
+    return true;
+}
+
+bool icm42688_sample(icm42688_t *self, float reading[ICM42688_AXES], uint32_t *missing) {
+    while (self->state == ICM42688_RUNNING && (self->next < self->held || fetch(self))) {
+        const uint8_t *packet = self->chunk + 1U + (size_t)self->next * ICM42688_PACKET;
+        self->next++;
+        if ((packet[0] & EMPTY) != 0U && packet[0] == 0xFFU) { /* the count was too high */
+            self->next = self->held;
+            return false;
+        }
+        self->packets_seen++;
+        const uint64_t us = self->read_us - (uint64_t)(self->held - self->next + self->behind) * self->period_us;
+        const uint16_t stamp = (uint16_t)((unsigned)packet[15] << 8 | packet[16]);
+        int32_t raw[ICM42688_AXES];
+        if (!unpack(packet, raw)) {
+            self->counters.damaged++;
+            self->dropped++;
+            if (++self->mismatches >= MISMATCHES) { /* out of step with the packets */
+                (void)flush(self);
+                self->mismatches = 0;
+            }
+            continue;
+        }
+        if (!placed(self, us, stamp, missing) || !take(self, raw, us, stamp)) {
+            continue;
+        }
+        for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+            reading[axis] = axis < 3U ? (float)raw[axis] * (0.5F * GYRO_STEP) : (float)raw[axis] * (0.25F * ACCEL_STEP);
+        }
+        self->temperature = word_of(packet + 13);
+        return true;
+    }
+    return false;
+}
+
+float icm42688_temperature(const icm42688_t *self) {
+    return self->temperature == INT16_MIN ? NAN : 25.0F + (float)self->temperature / 132.48F;
+}
