@@ -257,6 +257,25 @@ typedef struct {
     bool variance_changes;
 } selfcal_handling_t;
 
+/* What selfcal_imu_t has beside the bank. Each `code` is NULL where the model has no such part. */
+typedef struct selfcal_gate_code selfcal_gate_code_t;
+extern const selfcal_gate_code_t selfcal_gate_code;
+typedef struct selfcal_columns_code selfcal_columns_code_t;
+extern const selfcal_columns_code_t selfcal_columns_code;
+typedef struct selfcal_judging_code selfcal_judging_code_t;
+extern const selfcal_judging_code_t selfcal_judging_code;
+typedef struct selfcal_changes_code selfcal_changes_code_t;
+extern const selfcal_changes_code_t selfcal_changes_code;
+typedef struct selfcal_gate_config selfcal_gate_config_t;
+typedef struct {
+    float rate_hz;                         /* of the samples */
+    const selfcal_gate_config_t *gate;     /* of gate_code */
+    const selfcal_gate_code_t *gate_code;  /* keeps motion out */
+    const selfcal_columns_code_t *columns; /* forms the values of the regressors: with them, and only then */
+    const selfcal_judging_code_t *judging; /* judges the model */
+    const selfcal_changes_code_t *changes; /* handles steps and changes of the noise; with judging */
+} selfcal_pipe_t;
+
 typedef struct {
     uint32_t id;        /* checksum of the tables: a snapshot or a monitor tells models apart by it */
     float dt_s;         /* bank interval, 1e-6 to 1e6 */
@@ -270,6 +289,7 @@ typedef struct {
     const selfcal_forgetting_t *forgetting; /* likewise */
     const selfcal_states_code_t *states;    /* &selfcal_states_code if a law is a sum, else NULL */
     const selfcal_handling_t *handling;     /* NULL: nothing is handled, and none of its cost */
+    const selfcal_pipe_t *pipe;             /* for selfcal_imu_t; NULL: the bank alone */
 } selfcal_model_t;
 
 /* ------------------------------------------------------------------------------------------------------------- bank */
@@ -727,7 +747,7 @@ typedef enum { SELFCAL_MOVING = 0, SELFCAL_RESTING = 1 } selfcal_motion_t;
  * statistics), shaken_above, moved_above and rate_moved_above (their thresholds). */
 typedef struct selfcal_gate selfcal_gate_t;
 
-typedef struct {
+struct selfcal_gate_config {
     uint8_t axes;
     uint32_t window;   /* samples, 2 or more; a divisor of the bank's block, see selfcal_push_moving() */
     /* probability that a window of rest is taken for motion, up to 0.1; 0: never, to measure noise */
@@ -743,7 +763,7 @@ typedef struct {
     float sigma[SELFCAL_AXES_MAX];
     bool is_rate[SELFCAL_AXES_MAX]; /* a gyro: after a motion it must read what it read before. Others may rest at a new
                                        level. */
-} selfcal_gate_config_t;
+};
 
 /* Noise of one axis at rest; the factors are 1 where it is white. */
 typedef struct {
@@ -910,6 +930,91 @@ bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame);
 
 /* CRC-12/CDMA2000: polynomial 0xF13, initial value 0xFFF, most significant bit first. */
 uint16_t selfcal_crc12(const uint8_t *data, size_t length);
+
+/* ------------------------------------------------------------------------------------------------------------ pipe
+ * The way of a sample in one call: gate, columns, bank, judgement, changes, whatever the model names.
+ *
+ *     selfcal_imu_init(&imu, &selfcal_model, memory, sizeof memory);
+ *     each sample:  selfcal_imu_sample(&imu, reading, NULL, NULL);
+ *     now and then: selfcal_imu_ask(&imu, SELFCAL_ALL_AXES);
+ *     idle:         selfcal_imu_work(&imu);
+ *     at any time:  selfcal_imu_report(&imu, axis), selfcal_imu_reason(&imu, axis), selfcal_imu_corrected(&imu, &out)
+ */
+
+typedef struct selfcal_imu selfcal_imu_t; /* of its members, `bank`, `computing` and `gate` may be looked at */
+
+/* Begin over `memory`, aligned to 8 bytes. `size`: SELFCAL_MODEL_IMU_BYTES of the generated header. Model and memory
+ * must outlive the use. A gate that the model has watches from the first sample on. Fails as selfcal_init() does.
+ * SELFCAL_BAD_MODEL also if the parts that the model names do not go together. */
+selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_model_t *model, void *memory, size_t size);
+
+/* From here on the last report of each axis is kept, for selfcal_imu_report() and selfcal_imu_corrected(). Without it
+ * the last report of all. `kept` must outlive the use. */
+typedef struct selfcal_kept selfcal_kept_t;
+void selfcal_imu_keep(selfcal_imu_t *imu, selfcal_kept_t *kept);
+
+/* The gate begins anew, or is off: every sample counts as one of rest. True if it watches. */
+bool selfcal_imu_watch(selfcal_imu_t *imu, bool on);
+
+/* Take one sample of every axis, in the model's order and units. `channels`: of the regressors, as their sources count
+ * them; NULL without any. `side`: temperature and supply, for the judgement; NULL: neither is known.
+ * Returns a bit for each axis that has changed, whose last report is of the past: ask for another. Beside them
+ * SELFCAL_IMU_DEAR: the sample took as long as a slice of a report. Let the next slice wait. */
+#define SELFCAL_IMU_DEAR 0x80000000UL
+uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const float channels[], const float side[]);
+
+/* `count` samples are missing before the next one. */
+void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count);
+
+/* False while a report is worked out and one more sample might overtake it. Let the samples wait then. */
+bool selfcal_imu_room(const selfcal_imu_t *imu);
+
+/* Reports of these axes are due, a bit each. SELFCAL_BUSY: one of them has begun. Else why the last of them cannot be
+ * made. */
+#define SELFCAL_ALL_AXES 0xFFFFU
+selfcal_status_t selfcal_imu_ask(selfcal_imu_t *imu, uint32_t axes);
+
+/* Take one step of the reports that are due, as selfcal_report_step(). With regressors an axis takes two reports. The
+ * likelier of both stands. SELFCAL_BUSY: there is more to do. SELFCAL_OK: there is not. Else the last report of all has
+ * come to nothing, and there is no more to do. */
+selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu);
+
+/* The last report of an axis, NULL: none yet, or a change has made it one of the past. It stays as it is until another
+ * one of the axis (without selfcal_imu_keep(): of any axis) is worked on. */
+const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis);
+
+/* The judgement at that report; NULL: the model is not judged. */
+const selfcal_judgement_t *selfcal_imu_judgement(const selfcal_imu_t *imu, uint8_t axis);
+
+/* The coefficients at that report, by column; NULL: the model has no regressors. */
+const selfcal_sent_coefficient_t *selfcal_imu_coefficients(const selfcal_imu_t *imu, uint8_t axis);
+
+/* Why the calibration of an axis is not to be relied on now. */
+selfcal_reason_t selfcal_imu_reason(const selfcal_imu_t *imu, uint8_t axis);
+
+/* The bias of an axis's last report, unit. It goes with selfcal_imu_shift(). NAN: there is none. */
+float selfcal_imu_bias(const selfcal_imu_t *imu, uint8_t axis);
+
+/* Whether the sensor rests, by the code of selfcal.dbc. */
+uint32_t selfcal_imu_motion(const selfcal_imu_t *imu);
+
+/* The newest sample less the bias predicted for its time, with its sd and reason. False: no sample has come since the
+ * last call, or selfcal_imu_keep() has not been called. O(alpha nodes axes). */
+bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected);
+
+/* As selfcal_shift(), with all that is known of the axis. Not while a report is worked out. */
+selfcal_status_t selfcal_imu_shift(selfcal_imu_t *imu, uint8_t axis, float amount);
+
+/* As selfcal_power_on(): before the first sample, or after selfcal_imu_restore(). */
+selfcal_status_t selfcal_imu_power_on(selfcal_imu_t *imu, uint64_t samples);
+
+/* All is forgotten but what the sensor adds (selfcal_imu_shift()). */
+selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu);
+
+/* As selfcal_save() and selfcal_restore(); the snapshot is of the bank alone. After a restore `gap` samples, and the
+ * rest of a bank interval, are missing. */
+selfcal_status_t selfcal_imu_save(const selfcal_imu_t *imu, selfcal_write_t write, void *context);
+selfcal_status_t selfcal_imu_restore(selfcal_imu_t *imu, const void *snapshot, size_t length, uint64_t gap);
 
 #include "selfcal_layout.h"
 

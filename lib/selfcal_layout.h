@@ -528,6 +528,70 @@ struct selfcal_adequacy {
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };
 
+/* ------------------------------------------------------------------------------------------------------------ pipe */
+
+typedef struct {
+    selfcal_gate_t gate;
+    uint32_t learn_at; /* windows of rest after which its noise is taken anew */
+    uint32_t at_once;  /* its windows of that kind so far */
+} selfcal_watched_t;
+
+typedef struct {
+    selfcal_former_t former;
+    uint32_t skipped;          /* samples before the next one */
+    bool with;                 /* the report under way has all regressors of the axis in use */
+    selfcal_wide_t ln_without; /* ln evidence of the report without, over the laws */
+    selfcal_report_t report_with;
+    selfcal_coefficients_t coefficients[SELFCAL_HYPOTHESES_MAX];
+    selfcal_sent_coefficient_t sent[SELFCAL_AXES_MAX][SELFCAL_REGRESSORS_MAX]; /* of each axis's last report */
+    float values[SELFCAL_REGRESSORS_MAX];                                      /* at the newest sample */
+    float rested[SELFCAL_AXES_MAX][SELFCAL_REGRESSORS_MAX]; /* those for which an axis's bias holds */
+} selfcal_imu_columns_t;
+
+typedef struct {
+    selfcal_adequacy_t adequacy;
+    selfcal_judgement_t judged[SELFCAL_AXES_MAX]; /* at each axis's last report */
+} selfcal_imu_judge_t;
+
+struct selfcal_kept {
+    uint64_t passed;      /* samples, the missing ones too */
+    uint64_t gathered_at; /* of them, to the end of the last bank interval of the report under way */
+    uint64_t rests_on[SELFCAL_AXES_MAX]; /* ... of each axis's last report */
+    selfcal_report_t report[SELFCAL_AXES_MAX];
+    float reading[SELFCAL_AXES_MAX]; /* the newest */
+    bool newer;                      /* than what was last corrected */
+};
+
+struct selfcal_imu {
+    /* in the caller's memory; NULL: the model does not name it */
+    selfcal_watched_t *gate;
+    selfcal_imu_columns_t *columns;
+    selfcal_imu_judge_t *judge;
+    selfcal_changes_t *changes; /* with what was learned before a change behind it */
+    selfcal_kept_t *kept;       /* or NULL */
+    void *memory;               /* of the bank */
+    size_t size;
+    uint16_t due;   /* reports, a bit for each axis */
+    bool watching;  /* the gate is on */
+    bool computing; /* a report is worked out */
+    bool whole;     /* it is whole */
+    selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* of each axis's last report */
+    float bias[SELFCAL_AXES_MAX];              /* likewise; NAN: none */
+    selfcal_t bank;
+    selfcal_work_t work;
+    selfcal_report_t report; /* under way, or the last */
+};
+
+/* Bytes of a part, of all that is learned before a change, and of the parts that a model names. */
+#define SELFCAL_PART(bytes) (((size_t)(bytes) + 7U) / 8U * 8U)
+#define SELFCAL_CHANGES_SIZE(nodes, axes) \
+    SELFCAL_PART(sizeof(selfcal_changes_t) + (size_t)(nodes) * (axes) * sizeof(float))
+#define SELFCAL_PARTS_SIZE(nodes, axes, gate, columns, judged, changes) \
+    (((gate) ? SELFCAL_PART(sizeof(selfcal_watched_t)) : 0U) + \
+     ((columns) ? SELFCAL_PART(sizeof(selfcal_imu_columns_t)) : 0U) + \
+     ((judged) ? SELFCAL_PART(sizeof(selfcal_imu_judge_t)) : 0U) + \
+     ((changes) ? SELFCAL_CHANGES_SIZE(nodes, axes) : 0U))
+
 /* -------------------------------------------------------------------------------------------------------- telemetry */
 
 struct selfcal_telemetry {

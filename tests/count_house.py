@@ -1,7 +1,7 @@
 """House rules that are counted: `python tests/count_house.py` prints what breaks them. Called by `make check`.
 
 Lines of at most 120 columns; in `lib/`, without the generated files: few conditional lines of the preprocessor, no
-circle among its files, no function above 80 lines, no two static functions of one name.
+circle among its files, no function above 80 lines, no two static functions of one name. No circle in `port/app`.
 """
 
 from __future__ import annotations
@@ -113,10 +113,13 @@ def complaints() -> list[str]:
     conditionals = sum(len(re.findall(r"^\s*#\s*(?:if|elif)", text, re.MULTILINE)) for text in library.values())
     if conditionals > CONDITIONALS:
         found.append(f"lib: {conditionals} conditional lines, {CONDITIONALS} are allowed")
-    for kind, edges in (("include", includes(library)), ("call", calls(library))):
-        way = circle(edges)
-        if way:
-            found.append(f"lib: files {kind} each other in a circle: {' > '.join(way)}")
+    app = [path for path in tracked([".c", ".h"]) if path.parent.name == "app"]
+    application = {path.name: path.read_text(encoding="utf-8") for path in app}
+    for folder, texts in (("lib", library), ("port/app", application)):
+        for kind, edges in (("include", includes(texts)), ("call", calls(texts))):
+            way = circle(edges)
+            if way:
+                found.append(f"{folder}: files {kind} each other in a circle: {' > '.join(way)}")
     statics: dict[str, set[str]] = {}
     for name, text in library.items():
         for function, static, lines in functions(text):

@@ -11,7 +11,7 @@ are two kinds of records:
 
 Prints, for cold and warm: the median sd of N and K (of ln) and of the coefficient, the share of 90 % intervals that
 hold the truth, how often the regressor is in use, and the rms error of the corrected output 300 s after the report. Of
-the two reports, with the regressor in use and without, the likelier one counts, as in port/app/app_reports.c.
+the two reports, with the regressor in use and without, the likelier one counts, as in lib/imu_columns.c.
 """
 
 from __future__ import annotations

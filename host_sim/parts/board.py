@@ -53,8 +53,8 @@ class Bench:
         self.machine.run(self.machine.now_us + seconds * 1e6)
 
     def value(self, name: str) -> int:
-        """A scalar variable of the firmware: `sensor.counters.stale`."""
-        address, size = place(self.elf, name)
+        """A scalar variable of the firmware: `sensor.counters.stale`, `app.imu.gate->gate.state`."""
+        address, size = place(self.elf, name, self.machine.uc.mem_read)
         return int.from_bytes(self.machine.uc.mem_read(address, size), "little")
 
 

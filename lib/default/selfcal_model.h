@@ -22,6 +22,12 @@
 #define SELFCAL_MODEL_TERM_NODES 0U
 /* What selfcal_init() wants. */
 #define SELFCAL_MODEL_BYTES     (SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) +      SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) +      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
+/* 1: the model is judged (lib/adequacy.c), and steps and changes of the noise are found where it handles them. */
+#ifndef SELFCAL_MODEL_JUDGED
+#define SELFCAL_MODEL_JUDGED 1
+#endif
+/* What selfcal_imu_init() wants. */
+#define SELFCAL_MODEL_IMU_BYTES     (SELFCAL_MODEL_BYTES +      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS,                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ 819.2F
 /* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */

@@ -30,11 +30,6 @@
 #error "APP_CORRECTED_MS: milliseconds, 0 for none"
 #endif
 
-/* 1: the module judges its own model (lib/adequacy.c) and tells it with each report; 0: no, and nothing of its cost. */
-#ifndef APP_ADEQUACY
-#define APP_ADEQUACY 1
-#endif
-
 /* -DAPP_COMMAND_KEY=0x0706050403020100ULL,0x0F0E0D0C0B0A0908ULL, a key of your own, low half first: the image takes
  * commands (command.h). Without a key it looks at nothing that comes by the wire but the opening and closing of an
  * SLCAN channel. */
@@ -44,7 +39,6 @@
 #define APP_COMMANDS 0
 #endif
 
-#if APP_COMMANDS
 /* Answers that wait for the wire: one of an order, when it has been obeyed, and one of all that is answered at once.
  * Private. */
 enum { OF_ORDER, AT_ONCE, ANSWERS };
@@ -53,7 +47,6 @@ typedef struct {
     uint8_t item;
     uint32_t value;
 } answer_t;
-#endif
 
 /* Private; declared here so that the caller can place it. About 0.2 kB a node, nearly all in `memory`. */
 typedef struct {
@@ -63,8 +56,7 @@ typedef struct {
     uint32_t told_ms;           /* the last status */
     uint32_t report_number;
     uint8_t stage;    /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
-    bool computing;   /* an axis's report is being worked out */
-    bool worked_out;  /* ... is, and waits for the wire */
+    bool worked_out;  /* an axis's report is, and waits for the wire */
     bool fresh;       /* samples came in since the last report was begun */
     bool ended;       /* no sample will follow */
     bool restored;    /* a saved state was, and no sample has come since */
@@ -78,22 +70,11 @@ typedef struct {
     uint32_t saved_ms;  /* when the state was saved last, or the start */
     selfcal_module_t told; /* filled in by `module` */
     uint32_t begun_ms; /* start of the axis report under way */
-    selfcal_reason_t reason[SELFCAL_MODEL_AXES]; /* of each axis's last report */
-#if SELFCAL_MODEL_GATE
-    bool gated;
-    uint64_t learn_at; /* windows of rest after which the gate's noise is taken anew */
-    selfcal_gate_t gate;
-#endif
 #if APP_CORRECTED_MS
     uint32_t corrected_ms; /* when a corrected sample was sent last */
-    uint64_t passed;       /* samples, the missing ones too */
-    uint64_t gathered_at;  /* of them, to the end of the last bank interval of the report under way */
-    uint64_t rests_on[SELFCAL_MODEL_AXES]; /* ... of each axis's last report */
-    selfcal_report_t last_report[SELFCAL_MODEL_AXES];
-    float reading[SELFCAL_MODEL_AXES]; /* the newest */
-    uint32_t reading_ms;
-    bool newer;            /* than what was last looked at for a corrected sample */
+    uint32_t reading_ms;   /* of the newest sample */
     selfcal_corrected_t corrected;
+    selfcal_kept_t kept;
 #endif
 #if APP_COMMANDS
     command_t command;
@@ -102,35 +83,11 @@ typedef struct {
     answer_t answer[ANSWERS];
     bool restarting;        /* once the answer is out */
     uint32_t restart_ms;    /* since when */
-    float bias[SELFCAL_MODEL_AXES]; /* of the last reports; NAN: none */
 #endif
     selfcal_frame_t frame;
     selfcal_telemetry_t telemetry;
-    selfcal_t bank;
-    selfcal_work_t work;
-    selfcal_report_t report;
-#if APP_ADEQUACY
-    selfcal_adequacy_t adequacy;
-#if SELFCAL_MODEL_CHANGES
-    selfcal_changes_t changes;
-    float learned[SELFCAL_MODEL_NODES * SELFCAL_MODEL_AXES]; /* before a change */
-#endif
-    selfcal_judgement_t judged; /* of the axis of the report that is sent */
-#endif
-#if SELFCAL_MODEL_REGRESSORS > 0
-    float used[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS]; /* coefficients of each axis's last report; 0: unused */
-    selfcal_former_t former;
-    bool with;                 /* the report under way has all regressors of the axis in use */
-    selfcal_wide_t ln_without; /* ln evidence of the report without, over the laws */
-    selfcal_report_t report_with;
-    selfcal_coefficients_t coefficients[SELFCAL_MODEL_HYPOTHESES];
-    selfcal_sent_coefficient_t sent[SELFCAL_MODEL_REGRESSORS];
-#if APP_CORRECTED_MS
-    float values[SELFCAL_MODEL_REGRESSORS];                     /* at the newest sample */
-    float rested[SELFCAL_MODEL_AXES][SELFCAL_MODEL_REGRESSORS]; /* the values for which its bias holds */
-#endif
-#endif
-    selfcal_wide_t memory[(SELFCAL_MODEL_BYTES + sizeof(selfcal_wide_t) - 1U) / sizeof(selfcal_wide_t)];
+    selfcal_imu_t imu;
+    selfcal_wide_t memory[(SELFCAL_MODEL_IMU_BYTES + sizeof(selfcal_wide_t) - 1U) / sizeof(selfcal_wide_t)];
 } app_t;
 
 /* Starts with the model linked in; a report of all axes every `period_ms`. Fails as selfcal_init() and
@@ -152,10 +109,8 @@ bool app_gate(app_t *app);
  * saves, tells of the module in the status, and sends a status even when no sample comes. `module` must stay. */
 void app_module(app_t *app, const port_module_t *module);
 
-#if APP_COMMANDS
-/* A frame of message COMMAND came. */
+/* A frame of message COMMAND came. Built in with APP_COMMAND_KEY. */
 void app_command(app_t *app, const uint8_t data[8]);
-#endif
 
 /* False: only a restart helps, and the watchdog must not be fed. The bank's memory was found corrupt, or an axis's
  * report took five minutes, or the port refused a frame for five minutes. */

@@ -10,13 +10,6 @@ typedef char the_key_has_two_halves[sizeof command_key == 16U ? 1 : -1];
 enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
 #define RESTART_MS 3000U /* at most for the answer to leave: the 2 KB before it take 2.1 s at 9600 baud */
 
-void app_begin_commands(app_t *app)
-{
-    for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        app->bias[axis] = NAN;
-    }
-}
-
 static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result)
 {
     app->told.command_count += result == SELFCAL_ANSWER_RESULT_DONE ? 1U : 0U;
@@ -32,27 +25,6 @@ static uint32_t axis_bit(uint8_t axis)
     return 1UL << port_axis(selfcal_model_axis_name[axis]);
 }
 
-/* The sensor adds `amount` from now on: everything learnt of the axis moves with it. */
-static void shift(app_t *app, uint8_t axis, float amount)
-{
-    if (amount == 0.0F || selfcal_shift(&app->bank, axis, amount) != SELFCAL_OK) {
-        return;
-    }
-    app->bias[axis] += amount;
-#if SELFCAL_MODEL_GATE
-    if (app->gated) {
-        selfcal_gate_shift(&app->gate, axis, amount);
-    }
-#endif
-#if APP_CORRECTED_MS
-    app->newer = false; /* the reading is one from before */
-    app->last_report[axis].bias_mean += amount;
-    for (uint8_t h = 0; h < SELFCAL_MODEL_HYPOTHESES; h++) {
-        app->last_report[axis].hypothesis[h].bias_mean += amount;
-    }
-#endif
-}
-
 /* Has the sensor take off the biases of `axes`, or, with none, take back all offsets. Everything learnt is kept. To
  * take offsets back is always possible: a sensor put in place of the one that was told may refuse it, and never run. */
 static uint8_t write_offsets(app_t *app, uint32_t axes)
@@ -66,11 +38,12 @@ static uint8_t write_offsets(app_t *app, uint32_t axes)
     }
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         const bool meant = (axes & axis_bit(axis)) != 0U;
-        if (meant && (selfcal_retired(&app->bank, axis) || !isfinite(app->bias[axis]))) {
+        if (meant && (selfcal_retired(&app->imu.bank, axis) || !isfinite(selfcal_imu_bias(&app->imu, axis)))) {
             return SELFCAL_ANSWER_RESULT_NOT_NOW;
         }
         found |= axis_bit(axis);
-        wanted[axis] = axes == 0U ? 0.0F : selfcal_shifted(&app->bank, axis) - (meant ? app->bias[axis] : 0.0F);
+        const float bias = meant ? selfcal_imu_bias(&app->imu, axis) : 0.0F;
+        wanted[axis] = axes == 0U ? 0.0F : selfcal_shifted(&app->imu.bank, axis) - bias;
     }
     if ((axes & ~found) != 0U) {
         return SELFCAL_ANSWER_RESULT_OUT_OF_RANGE;
@@ -79,32 +52,19 @@ static uint8_t write_offsets(app_t *app, uint32_t axes)
         return SELFCAL_ANSWER_RESULT_FAILED;
     }
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        shift(app, axis, got[axis] - selfcal_shifted(&app->bank, axis));
+        const float amount = got[axis] - selfcal_shifted(&app->imu.bank, axis);
+        if (amount != 0.0F) {
+            (void)selfcal_imu_shift(&app->imu, axis, amount);
+        }
     }
     return SELFCAL_ANSWER_RESULT_DONE;
 }
 
-/* Begins anew, with the offsets that the sensor adds. */
 static uint8_t forget(app_t *app)
 {
-    float shifted[SELFCAL_MODEL_AXES];
-    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        shifted[axis] = selfcal_shifted(&app->bank, axis);
-    }
-    const selfcal_status_t status = selfcal_init(&app->bank, &selfcal_model, app->memory, sizeof app->memory);
-    for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        (void)selfcal_shift(&app->bank, axis, shifted[axis]);
-        app->bias[axis] = NAN;
-    }
-    app_begin_columns(app);
     app->fresh = false;
     app->restored = false;
-#if SELFCAL_MODEL_GATE
-    if (app->gated) { /* its windows go on: the bank must start with one of them */
-        (void)app_gate(app);
-    }
-#endif
-    return status == SELFCAL_OK ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
+    return selfcal_imu_forget(&app->imu) == SELFCAL_OK ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
 static uint8_t saved(app_t *app, uint32_t now)
@@ -114,14 +74,10 @@ static uint8_t saved(app_t *app, uint32_t now)
     return app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
-void app_obey(app_t *app, uint32_t now)
+static void obey(app_t *app, uint32_t now)
 {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
-    command_pass(&app->command, now);
-    if (command == 0U || app->answer[OF_ORDER].waiting || app->module == NULL) {
-        return;
-    }
     app->ordered = 0;
     if (command == SELFCAL_ANSWER_COMMAND_SAVE) {
         result = saved(app, now);
@@ -138,6 +94,15 @@ void app_obey(app_t *app, uint32_t now)
         app->restart_ms = app_now(app); /* `now` may lie before a save */
     }
     answer(app, &app->answer[OF_ORDER], command, result);
+}
+
+bool app_obey(app_t *app, uint32_t now)
+{
+    command_pass(&app->command, now);
+    if (app->ordered != 0U && !app->answer[OF_ORDER].waiting && app->module != NULL) {
+        obey(app, now);
+    }
+    return app->restarting;
 }
 
 /* Checks a command's argument, and whether it can be obeyed now. */

@@ -7,7 +7,7 @@ static bool tell_sensor(app_t *app)
     float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
     bool any = false;
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
-        wanted[axis] = selfcal_shifted(&app->bank, axis);
+        wanted[axis] = selfcal_shifted(&app->imu.bank, axis);
         any = any || wanted[axis] != 0.0F;
     }
     return !any || app->module->write_offsets(app->module->context, wanted, got);
@@ -22,19 +22,13 @@ void app_restore(app_t *app)
         if (bytes == NULL) {
             break;
         }
-        const selfcal_status_t status =
-            selfcal_restore(&app->bank, &selfcal_model, app->memory, sizeof app->memory, bytes, length);
+        const selfcal_status_t status = selfcal_imu_restore(&app->imu, bytes, length, module->save_gap);
         if (status == SELFCAL_OK) {
-            /* Up to the start of a bank interval: it holds whole windows of the gate. */
-            (void)selfcal_moving(&app->bank);
-            const uint64_t block = app->bank.block, past = (app->bank.position + module->save_gap) % block;
-            (void)selfcal_skip(&app->bank, module->save_gap + (past > 0U ? block - past : 0U));
             module->tell(module->context, &app->told);
             if (app->told.reset_cause == SELFCAL_STATUS_RESET_CAUSE_POWER_ON) {
-                (void)selfcal_power_on(&app->bank, 0);
+                (void)selfcal_imu_power_on(&app->imu, 0);
             }
             (void)tell_sensor(app);
-            app_begin_columns(app);
             app->told.state_found = older == 0 ? SELFCAL_STATUS_STATE_FOUND_NEWEST : SELFCAL_STATUS_STATE_FOUND_OLDER;
             app->restored = true;
             return;
@@ -44,19 +38,25 @@ void app_restore(app_t *app)
     }
 }
 
+uint32_t app_absent(app_t *app)
+{
+    const uint32_t now = app_now(app);
+    const double passed = 1e-3 * (double)(now - app->absent_ms) * (double)SELFCAL_MODEL_RATE_HZ;
+    app->absent_ms = now;
+    return (uint32_t)passed;
+}
+
 void app_save(app_t *app, uint32_t now)
 {
     const port_module_t *module = app->module;
-    const uint32_t count = app->restored ? app_absent(app) : 0U;
-    if (count > 0U) {
-        app_pass(app, count);
-        app_begin_columns(app);
+    if (app->restored) {
+        selfcal_imu_skip(&app->imu, app_absent(app));
     }
     app->saved_ms = now;
     /* The state in use is kept, even if the newest is whole: start-up may have refused that as another model's. */
     const bool keep_older = app->told.state_found == SELFCAL_STATUS_STATE_FOUND_OLDER && app->told.state_saves == 0U;
     const bool whole = module->save_begin(module->context, keep_older) &&
-                       selfcal_save(&app->bank, module->save_put, module->context) == SELFCAL_OK;
+                       selfcal_imu_save(&app->imu, module->save_put, module->context) == SELFCAL_OK;
     if (module->save_end(module->context, whole)) {
         app->told.state_saves++;
     } else {

@@ -66,7 +66,6 @@ static bool module_save_end(void *context, bool whole)
     return saved;
 }
 
-#if APP_COMMANDS
 static bool module_random(void *context, uint32_t *number)
 {
     (void)context;
@@ -85,6 +84,7 @@ static void module_restart(void *context)
     board->restart();
 }
 
+#if APP_COMMANDS
 void module_command(const uint8_t data[8])
 {
     app_command(&app, data);
@@ -93,11 +93,7 @@ void module_command(const uint8_t data[8])
 
 static const port_module_t module = {
     &slots, module_tell, slots_stored, module_save_begin, slots_put, module_save_end, sensor_write_offsets,
-#if APP_COMMANDS
     module_random, module_sent, module_restart,
-#else
-    NULL, NULL, NULL,
-#endif
     BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 

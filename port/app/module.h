@@ -37,9 +37,7 @@ typedef struct {
 /* Returns only if the model is not one for this sensor. */
 void module_run(const module_board_t *board);
 
-#if APP_COMMANDS
-/* A frame of message COMMAND came. */
+/* A frame of message COMMAND came. Built in with APP_COMMAND_KEY. */
 void module_command(const uint8_t data[8]);
-#endif
 
 #endif

@@ -9,7 +9,7 @@ QEMU_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/replay/*.h port
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2
 QEMU_BOARD_cortex-m0 := QEMU_MICROBIT
 # Its RAM has no room for the judgement of the model beside six axes.
-QEMU_APP_cortex-m0 := -DAPP_ADEQUACY=0
+QEMU_APP_cortex-m0 := -DSELFCAL_MODEL_JUDGED=0
 QEMU_MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part's 32: the recording's buffers and a stack twice as large, which an image does not have.
 QEMU_MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000

@@ -89,7 +89,7 @@ static taken_t push_gate(void) {
     samples++;
     fill();
     const image_time_t start = image_now();
-    (void)selfcal_gate_push(&app.gate, ring[samples % RING]);
+    (void)selfcal_gate_push(&app.imu.gate->gate, ring[samples % RING]);
     return count_since(start);
 }
 
@@ -105,9 +105,9 @@ static void print_gate(void) {
     taken_t step = {0, 0, 0}, sum = {0, 0, 0}, judged = {0, 0, 0}, part = {0, 0, 0};
     uint32_t steps = 0;
     (void)app_gate(&app);
-    const uint32_t window = app.gate.config.window;
+    const uint32_t window = app.imu.gate->gate.config.window;
     for (uint32_t i = 0; i < 4U * window; i++) {
-        const bool working = app.gate.work != 0U;
+        const bool working = app.imu.gate->gate.work != 0U;
         const taken_t taken = push_gate();
         if (working) {
             steps++;
@@ -117,7 +117,7 @@ static void print_gate(void) {
             keep_worst(&judged, taken);
         }
     }
-    (void)selfcal_gate_skip(&app.gate, 1U);
+    (void)selfcal_gate_skip(&app.imu.gate->gate, 1U);
     for (uint32_t i = 1; i < window; i++) {
         keep_worst(&part, push_gate());
     }
@@ -146,17 +146,17 @@ int main(void) {
     count_print("sample", between, samples);
     count_print("sample.worst", worst_between, 1U);
 
-    if (app.gate.counters.alarms != 0U || app.gate.measured < 60U) {
+    if (app.imu.gate->gate.counters.alarms != 0U || app.imu.gate->gate.measured < 60U) {
         return 4; /* the record is one of rest */
     }
     const uint32_t before = samples;
     const uint64_t begun = now_ticks;
-    while (!app.computing) {
+    while (!app.imu.computing) {
         (void)turn(); /* the status */
     }
     count_print_value("sample.most_waiting", most_waiting);
     most_waiting = 0;
-    while (app.computing) {
+    while (app.imu.computing) {
         const taken_t taken = turn();
         keep_worst(&worst_report, taken);
     }

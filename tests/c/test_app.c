@@ -28,7 +28,7 @@ static port_sample_t sample(void *context, float reading[], uint32_t *missing)
     for (unsigned side = 0; side < PORT_SIDE; side++) {
         reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + side] = NAN;
     }
-    *missing = gaps && app.computing && draw() % 300U == 0U ? app.bank.block : 0U;
+    *missing = gaps && app.imu.computing && draw() % 300U == 0U ? app.imu.bank.block : 0U;
     time_samples += 1U + *missing;
     in_a_report++;
     return PORT_SAMPLE;
@@ -64,12 +64,12 @@ void tearDown(void) {}
 /* The truth is the rule at selfcal_room(): while it is kept each axis has its report. */
 static void each_axis_has_its_report(void)
 {
-    while (app.report_number == 0U || app.stage != 0U || app.computing || app.worked_out) {
-        if (!app.computing) {
+    while (app.report_number == 0U || app.stage != 0U || app.imu.computing || app.worked_out) {
+        if (!app.imu.computing) {
             in_a_report = 0;
         }
         TEST_ASSERT_TRUE(app_step(&app));
-        most_in_a_report = app.computing && in_a_report > most_in_a_report ? in_a_report : most_in_a_report;
+        most_in_a_report = app.imu.computing && in_a_report > most_in_a_report ? in_a_report : most_in_a_report;
     }
     for (unsigned axis = 1; axis <= PORT_AXES; axis++) {
         TEST_ASSERT_GREATER_THAN_MESSAGE(0U, frames[axis], "an axis has no report");
@@ -81,8 +81,8 @@ static void test_samples_go_on_in_a_report_as_long_as_there_is_room(void)
 {
     gaps = false;
     each_axis_has_its_report();
-    TEST_ASSERT_GREATER_OR_EQUAL(14U * app.bank.block + app.bank.block / 2U - 1U, most_in_a_report);
-    TEST_ASSERT_LESS_THAN(15U * app.bank.block + app.bank.block / 2U + 1U, most_in_a_report);
+    TEST_ASSERT_GREATER_OR_EQUAL(14U * app.imu.bank.block + app.imu.bank.block / 2U - 1U, most_in_a_report);
+    TEST_ASSERT_LESS_THAN(15U * app.imu.bank.block + app.imu.bank.block / 2U + 1U, most_in_a_report);
 }
 
 /* A gap ends an interval with what it has, which would be the one sample too many in the second half of the last. */

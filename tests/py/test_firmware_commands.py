@@ -683,11 +683,11 @@ def test_offsets_beside_the_sensors_own() -> None:
     assert status(board)["offset_gx"] == pytest.approx((register - 40) * 0.0125, abs=1e-6)
     assert obey(board, "reset", 1, seconds=3.5) == [RESULT["done"]]
     assert board.value("app.told.state_saves") == 2
-    learnt = board.value("app.bank.counters.samples")
+    learnt = board.value("app.imu.bank.counters.samples")
     board.power_cycle()
     board.run(1.0)
     assert board.value("app.told.state_found") == 1
-    assert board.value("app.bank.counters.samples") < learnt + 100
+    assert board.value("app.imu.bank.counters.samples") < learnt + 100
     assert board.sensor.registers[0x1A] == register
     assert board.machine.violations == board.machine.faults == []
 
@@ -736,7 +736,7 @@ def test_offsets_of_another_sensor() -> None:
     told = status(board)
     assert told["sensor_fault"] == 2
     assert told["offset_gx"] < 0.0
-    assert told["samples"] == board.value("app.bank.counters.samples")
+    assert told["samples"] == board.value("app.imu.bank.counters.samples")
     assert obey(board, "write_offsets", 0, seconds=1.6) == [RESULT["done"]]
     board.run(4.0)
     told = status(board)
@@ -753,10 +753,10 @@ def test_time_before_the_first_sample_of_a_restored_bank() -> None:
     before = board.machine.now_us
     board.sensor.plug(False)
     board.run(1.0)
-    known = board.value("app.bank.counters.missing")
+    known = board.value("app.imu.bank.counters.missing")
     board.run(9.0)
     assert obey(board, "save", seconds=3.5) == [RESULT["done"]]  # what has passed so far is in it
-    kept = board.value("app.bank.counters.missing") - known
+    kept = board.value("app.imu.bank.counters.missing") - known
     assert abs(kept - 1e-6 * (board.machine.now_us - before) * RATE_HZ) < 4.0 * RATE_HZ
     board.run(10.0)
     board.sensor.plug(True)
@@ -764,5 +764,5 @@ def test_time_before_the_first_sample_of_a_restored_bank() -> None:
     while not tap.seen:
         board.run(0.1)
     passed = 1e-6 * (board.machine.now_us - before) * RATE_HZ
-    missing = board.value("app.bank.counters.missing") - known
+    missing = board.value("app.imu.bank.counters.missing") - known
     assert abs(missing - passed) < 0.2 * RATE_HZ + RATE_HZ / BANK_HZ  # a look, a bank interval

@@ -506,7 +506,7 @@ def test_shocks_are_kept_out() -> None:
             shocks.append(Shock(start, start + (85 if gyro else 46), gyro, size))
         board.sensor.source = shaken(board.sensor.source, shocks)
         board.run(0.4 + 2400 / SLOW_RATE_HZ)
-        assert board.value("app.gate.measured") >= 30
+        assert board.value("app.imu.gate->gate.measured") >= 30
         board.run(4500 / SLOW_RATE_HZ)
         number = {tuple(readings([sample])[0].tolist()): index for index, _, sample in board.sensor.taken}
         first = number[tap.pushed[0][1]] - tap.pushed[0][0]
@@ -522,7 +522,7 @@ def test_shocks_are_kept_out() -> None:
         survived += (
             sound(board, tap, 0)
             and bad == 0
-            and board.value("app.gate.counters.alarms") == len(shocks)
+            and board.value("app.imu.gate->gate.counters.alarms") == len(shocks)
             and len(tap.intervals) >= 86 - 9 - 11 * len(shocks)
         )
         board.close()
@@ -537,13 +537,13 @@ def test_the_bank_begins_with_a_window() -> None:
     board = Board(image(**GATED), seed=1)
     tap = Tap(board)
     board.run(1.0)
-    while board.value("app.gate.state") == 0:
+    while board.value("app.imu.gate->gate.state") == 0:
         board.run(0.5 / SLOW_RATE_HZ)
     begin = board.sensor.index
     board.sensor.stale = lambda k: begin <= k < begin + 12
     board.run(6.0 * BLOCK / SLOW_RATE_HZ)
     assert len(tap.intervals) >= 3
-    assert board.value("app.bank.position") % WINDOW == board.value("app.gate.position")
+    assert board.value("app.imu.bank.position") % WINDOW == board.value("app.imu.gate->gate.position")
     board.close()
 
 
@@ -749,7 +749,7 @@ def test_a_slow_report_is_healthy() -> None:
         uc.context_restore(context)
         return answer
 
-    for stalled in (("app.computing", "app.begun_ms"), ("app.refused", "app.refused_ms")):
+    for stalled in (("app.imu.computing", "app.begun_ms"), ("app.refused", "app.refused_ms")):
         assert healthy(*stalled, 295.0)
         assert not healthy(*stalled, 305.0)
     assert healthy("app.stage", "app.begun_ms", 3000.0)
@@ -812,7 +812,7 @@ def found(board: parts.Board | parts.NrfBoard) -> tuple[int, int, int]:
     return (
         board.value("app.told.state_found"),
         board.value("app.told.state_refused"),
-        board.value("app.bank.counters.samples"),
+        board.value("app.imu.bank.counters.samples"),
     )
 
 
@@ -824,11 +824,11 @@ def two_saves(target: str) -> tuple[parts.Board | parts.NrfBoard, bytes, int, in
     while board.value("app.told.state_saves") < 1:
         board.run(0.1)
     first = board.retained()
-    samples = [board.value("app.bank.counters.samples")]
+    samples = [board.value("app.imu.bank.counters.samples")]
     operations = board.flash.operations
     board.flash.keep_history = True
     while board.value("app.told.state_saves") < 2:
-        before = board.value("app.bank.counters.samples")
+        before = board.value("app.imu.bank.counters.samples")
         board.run(0.005)
     samples.append(before)
     return board, first, samples[0], samples[1], operations

@@ -34,7 +34,7 @@ STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STAT
 #: Frames of a report of the default model; the Cortex-M0 does not judge it.
 REPORT = {"cortex-m4f": 52, "cortex-m0": 46}
 CORES = {"cortex-m4f": ["-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"], "cortex-m0": ["-mcpu=cortex-m0"]}
-APP = ("app.c", "app_frames.c", "app_reports.c", "app_samples.c", "app_state.c")
+APP = ("app.c", "app_frames.c", "app_reports.c", "app_state.c")
 #: What the emulated image calls through: main()'s port_t is a variable there, so its functions are named.
 CALLS = {"intake.c": ["selfcal_regressors_code?"], "adequacy.c": ["look?"]} | {
     **{file: ["selfcal_regressors_code?", "selfcal_states_code?"] for file in ("check.c", "report_bias.c")},
@@ -43,6 +43,8 @@ CALLS = {"intake.c": ["selfcal_regressors_code?"], "adequacy.c": ["look?"]} | {
     "report_node.c": ["selfcal_regressors_code?"],
     "bank.c": ["selfcal_regressors_code?", "selfcal_states_code?", "selfcal_kernel_run"],
     "snapshot.c": [],
+    "imu.c": [f"selfcal_{part}_code?" for part in ("gate", "columns", "judging", "changes")],
+    "imu_judge.c": ["selfcal_columns_code?"],
     **{file: ["board_time_ms", "board_sample", "board_send", "board_idle"] for file in APP},
     "replay.c": ["board_read"],
 }

@@ -194,13 +194,13 @@ def test_offsets_are_written_and_kept() -> None:
     made = NrfBoard(elf, seed=7)
     made.run(0.1)
     made.usart.say(b"O\r")
-    while made.value("app.report_number") < 2 or made.value("app.computing"):
+    while made.value("app.report_number") < 2 or made.value("app.imu.computing"):
         made.run(0.1)
     assert obey(made, "write_offsets", 0b10, 60.0) == RESULT["done"]
     register = made.sensor.registers[0x1C]  # YGYRO_OFF
     written = (register & 0xFFF) - (register & 0x1000)
     # a bias of 4 LSB of 0.05 deg/s known to 18 LSB/sqrt(samples); the step is a quarter of one
-    sd = 18.0 / made.value("app.bank.counters.samples") ** 0.5
+    sd = 18.0 / made.value("app.imu.bank.counters.samples") ** 0.5
     assert written * 0.25 == pytest.approx(-4.0, abs=4.0 * sd + 0.125)
     assert obey(made, "save", seconds=60.0) == RESULT["done"]
     made.power_cycle(made.retained())
@@ -217,21 +217,21 @@ def test_a_reset_during_a_report() -> None:
     made.run(0.1)
     made.usart.say(b"O\r")
     tap = Tap(made)
-    while not (made.value("app.computing") and made.value("app.work.hypothesis") == 2):
+    while not (made.value("app.imu.computing") and made.value("app.imu.work.hypothesis") == 2):
         made.run(0.1)  # a report that began anew would be at an earlier law of the first axis
     settings = set_up(made)
     made.sensor.reset()
     made.run(1.5)
-    assert made.value("app.computing")
+    assert made.value("app.imu.computing")
     axis = made.value("app.stage")
-    assert (axis, made.value("app.work.hypothesis")) >= (0, 2)
+    assert (axis, made.value("app.imu.work.hypothesis")) >= (0, 2)
     assert made.value("sensor.counters.faults") >= 1
     assert set_up(made) == settings
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
     long_ago = -10_000 % 2**32  # ten seconds before the start
     made.machine.uc.mem_write(parts.place(made.elf, "app.told_ms")[0], long_ago.to_bytes(4, "little"))
     made.run(0.5)
-    assert made.value("app.computing")
+    assert made.value("app.imu.computing")
     assert made.value("app.stage") == axis
     decoder, found = reports(messages(made))
     assert decoder.status["sensor_fault_count"] >= 1
@@ -307,15 +307,15 @@ def test_an_extended_model_is_saved_again_and_again(kind: str, tmp_path: Path) -
     board.run(10.0)
     assert board.value("app.told.state_saves") >= 3
     assert board.value("app.told.state_save_failures") == 0
-    samples = board.value("app.bank.counters.samples")
+    samples = board.value("app.imu.bank.counters.samples")
     board.machine.reset("software")
     board.run(0.4)
     assert board.value("app.told.state_found") == 1
-    assert board.value("app.bank.powered") == 0
+    assert board.value("app.imu.bank.powered") == 0
     board.power_cycle(board.retained())
     board.run(0.4)
     assert board.value("app.told.state_found") == 1  # the newest
-    assert board.value("app.bank.counters.samples") > samples - 3 * QUIET_RATE_HZ
-    begun = int(board.value("app.bank.counters.samples")) + int(board.value("app.bank.counters.missing"))
-    since = (begun + int(board.value("app.bank.powered"))) % 2**64
+    assert board.value("app.imu.bank.counters.samples") > samples - 3 * QUIET_RATE_HZ
+    begun = int(board.value("app.imu.bank.counters.samples")) + int(board.value("app.imu.bank.counters.missing"))
+    since = (begun + int(board.value("app.imu.bank.powered"))) % 2**64
     assert 0 <= since <= 0.4 * QUIET_RATE_HZ

@@ -95,7 +95,7 @@ def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> 
     model, axes = Model.load(), ("gx", "gy", "ax") if core == "cortex-m4f" else ("gy", "ax")
     every = 200.0 if core == "cortex-m4f" else 600.0
     recording = part(tmp_path, 600.0, axes, slice(3000, 3070))
-    small = " -DSAME_FMAF -DAPP_ADEQUACY=0"  # as its core has it
+    small = " -DSAME_FMAF -DSELFCAL_MODEL_JUDGED=0"  # as its core has it
     flags = f"{ROOT}/tests/c/same_math.c -Wno-double-promotion" + (small if core == "cortex-m0" else "")
     history = {}
     for target in ("host", core):
@@ -131,7 +131,7 @@ def assert_close(history: Mapping[str, Sequence[AxisReport]], truth: Mapping[str
 def test_the_c_library_changes_nothing_that_matters(core: str, tmp_path: Path) -> None:
     model, axes = Model.load(), ("gy", "ax") if core == "cortex-m4f" else ("az",)
     recording = part(tmp_path, 600.0, axes)
-    flags = "-DAPP_ADEQUACY=0" if core == "cortex-m0" else ""
+    flags = "-DSELFCAL_MODEL_JUDGED=0" if core == "cortex-m0" else ""
     made = {target: program(model, recording.rate_hz, axes, target, core, tmp_path, flags) for target in ("host", core)}
     history = {target: run(one, recording, model, axes, 600.0, target)[0] for target, one in made.items()}
     assert_close(history[core], history["host"])

@@ -194,6 +194,15 @@ def _header(model: Model, tables: Tables, start: str) -> str:
     (SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES) + \
      SELFCAL_REGRESSORS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS) + \
      SELFCAL_TERMS_SIZE(SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_REGRESSORS))
+/* 1: the model is judged (lib/adequacy.c), and steps and changes of the noise are found where it handles them. */
+#ifndef SELFCAL_MODEL_JUDGED
+#define SELFCAL_MODEL_JUDGED 1
+#endif
+/* What selfcal_imu_init() wants. */
+#define SELFCAL_MODEL_IMU_BYTES \
+    (SELFCAL_MODEL_BYTES + \
+     SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS, \
+                        SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ {_f(tables.rate_hz)}
 /* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */
@@ -257,6 +266,8 @@ def _source(model: Model, tables: Tables) -> str:
     if handling != NOT_HANDLED:
         given = ", ".join([_f(handling.outlier_sd), *(str(b).lower() for b in handling.as_tuple[1:])])
         parts += [f"static const selfcal_handling_t handling = {{{given}}};", ""]
+    parts += _gate(model, tables)
+    parts += _pipe(model, tables)
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
     channels = ", ".join(f'"{name}"' for name, _ in tables.channels)
     parts += [
@@ -272,10 +283,11 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
         f"    {'&selfcal_states_code' if tables.term_nodes else 'NULL'},",
         f"    {'&handling' if handling != NOT_HANDLED else 'NULL'},",
+        "    &pipe,",
         "};",
         "",
     ]
-    return "\n".join(parts + _gate(model, tables))
+    return "\n".join(parts)
 
 
 def _f(value: float) -> str:
@@ -349,6 +361,19 @@ def _gate(model: Model, tables: Tables) -> list[str]:
         "const selfcal_gate_config_t selfcal_model_gate = {",
         f"    SELFCAL_MODEL_AXES, {numbers},",
         f"    {{{sigma}}}, {{{kinds}}},",
+        "};",
+        "",
+    ]
+
+
+def _pipe(model: Model, tables: Tables) -> list[str]:
+    gate = "&selfcal_model_gate, &selfcal_gate_code" if gate_table(model, tables) is not None else "NULL, NULL"
+    return [
+        "static const selfcal_pipe_t pipe = {",
+        f"    SELFCAL_MODEL_RATE_HZ, {gate},",
+        f"    {'&selfcal_columns_code' if tables.regressors else 'NULL'},",
+        "    SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,",
+        "    SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,",
         "};",
         "",
     ]

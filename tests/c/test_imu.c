@@ -1,0 +1,309 @@
+/* The pipe: bit for bit what its parts do, called by hand after the rules that selfcal.h states at each of them. */
+#include "noise.h"
+#include "selfcal_frames.h"
+#include "selfcal_model.h"
+#include "unity.h"
+
+#include <math.h>
+#include <string.h>
+
+enum { BLOCK = 15, WINDOW = 5, AXES = SELFCAL_MODEL_AXES, SAMPLES = 15000 };
+
+static selfcal_gate_config_t gate_config;
+static selfcal_pipe_t pipe;
+static selfcal_model_t model;
+static selfcal_wide_t memory[2][(SELFCAL_MODEL_IMU_BYTES + 200000U) / sizeof(selfcal_wide_t)];
+static selfcal_imu_t imu;
+static selfcal_kept_t kept;
+
+/* The same by hand. */
+static struct {
+    selfcal_t bank;
+    selfcal_gate_t gate;
+    uint32_t learn_at;
+    selfcal_adequacy_t adequacy;
+    selfcal_former_t former;
+    selfcal_work_t work;
+    selfcal_report_t report;
+} parts;
+
+/* With one regressor, the time. */
+static const float reference[] = {0.0F}, coefficient_sd[AXES] = {0.1F, 0.1F, 0.1F}, ln_odds[AXES];
+static const selfcal_source_t source[] = {{SELFCAL_COLUMN_TIME, 0U, 0.0F, 0.0F}};
+static const selfcal_regressors_t regressors = {
+    &selfcal_regressors_code, 1U, reference, coefficient_sd, source, ln_odds, NULL,
+};
+
+void setUp(void)
+{
+    state = 20261126U;
+    gate_config = selfcal_model_gate;
+    gate_config.window = WINDOW;
+    pipe = *selfcal_model.pipe;
+    pipe.rate_hz = (float)BLOCK;
+    pipe.gate = &gate_config;
+    model = selfcal_model;
+    model.block = BLOCK;
+    model.dt_s = 1.0F;
+    model.pipe = &pipe;
+}
+
+void tearDown(void) {}
+
+/* A record with gaps, a motion, and samples that are no numbers. */
+static uint32_t draw_sample(uint32_t at, float reading[])
+{
+    for (unsigned axis = 0; axis < AXES; axis++) {
+        reading[axis] = 0.1F * (float)axis + (axis < 3U ? 0.4F : 0.05F) * noise();
+        reading[axis] += at > 8000U && at < 8200U ? 20.0F * noise() : 0.0F;
+    }
+    if (at == 5000U) {
+        reading[1] = NAN;
+    }
+    return draw() % 500U == 0U ? draw() % 40U : 0U;
+}
+
+static void begin(void)
+{
+    memset(&parts, 0, sizeof parts);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    selfcal_imu_keep(&imu, &kept);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&parts.bank, &model, memory[1], sizeof memory[1]));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_init(&parts.gate, &gate_config));
+    parts.learn_at = SELFCAL_GATE_MEASURED_MIN;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_adequacy_init(&parts.adequacy, &parts.bank));
+    if (model.regressors != NULL) {
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_former_init(&parts.former, &model));
+    }
+}
+
+static void learn(void)
+{
+    if (parts.gate.measured == 0U) {
+        parts.learn_at = SELFCAL_GATE_MEASURED_MIN;
+    }
+    if (parts.gate.measured >= parts.learn_at) {
+        parts.learn_at *= 2U;
+        for (uint8_t axis = 0; axis < AXES; axis++) {
+            selfcal_gate_noise_t noise_of;
+            if (selfcal_gate_measured(&parts.gate, axis, &noise_of) == SELFCAL_OK) {
+                (void)selfcal_gate_noise(&parts.gate, axis, &noise_of);
+            }
+        }
+    }
+}
+
+/* By the rules at selfcal_push_moving(), selfcal_form() and selfcal_adequacy_push(). */
+static void take_by_hand(uint32_t missing, const float reading[], const float side[])
+{
+    float values[1] = {0.0F};
+    const bool columns = model.regressors != NULL;
+    if (missing > 0U) {
+        if (selfcal_gate_skip(&parts.gate, missing) == SELFCAL_MOVING) {
+            (void)selfcal_moving(&parts.bank);
+        }
+        (void)selfcal_skip(&parts.bank, missing);
+    }
+    if (columns) {
+        selfcal_form(&parts.former, missing, reading, NULL, values);
+    }
+    const bool first = selfcal_counters(&parts.bank)->samples == 0U && parts.gate.position != 0U;
+    const selfcal_motion_t before = parts.gate.state, now = selfcal_gate_push(&parts.gate, reading);
+    learn();
+    if (before == SELFCAL_RESTING && now == SELFCAL_RESTING && !first) {
+        (void)selfcal_push_with(&parts.bank, reading, values);
+    } else {
+        (void)selfcal_push_moving(&parts.bank, reading);
+    }
+    selfcal_adequacy_push(&parts.adequacy, &parts.bank, side, columns ? values : NULL);
+}
+
+static void assert_same_banks(void)
+{
+    const size_t after = offsetof(selfcal_t, n); /* pointers come first */
+    TEST_ASSERT_EQUAL_MEMORY((const char *)&parts.bank + after, (const char *)&imu.bank + after,
+                             sizeof imu.bank - after);
+    TEST_ASSERT_EQUAL_MEMORY(memory[1], imu.memory, SELFCAL_SIZE(model.nodes, model.axes));
+}
+
+static void assert_same_reports(void)
+{
+    while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+    }
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        memset(&parts.report, 0, sizeof parts.report);
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&parts.work, &parts.bank, axis, &parts.report));
+        const selfcal_report_t *got = selfcal_imu_report(&imu, axis);
+        TEST_ASSERT_NOT_NULL(got);
+        if (model.regressors == NULL) { /* weighed against the one with: see the test of the trend */
+            TEST_ASSERT_EQUAL_MEMORY(&parts.report.bias_mean, &got->bias_mean, sizeof(float));
+            TEST_ASSERT_EQUAL_MEMORY(&parts.report.bias_sd, &got->bias_sd, sizeof(float));
+            for (unsigned h = 0; h < model.hypotheses; h++) {
+                TEST_ASSERT_TRUE(parts.report.hypothesis[h].ln_evidence == got->hypothesis[h].ln_evidence);
+            }
+            selfcal_adequacy_report(&parts.adequacy, &model, &parts.report, NULL);
+            const selfcal_judgement_t judged = selfcal_judgement(&parts.adequacy, &parts.bank, axis);
+            TEST_ASSERT_EQUAL(judged.state, selfcal_imu_judgement(&imu, axis)->state);
+            TEST_ASSERT_TRUE(judged.score == selfcal_imu_judgement(&imu, axis)->score);
+            TEST_ASSERT_EQUAL(selfcal_reason(&model, &parts.report, judged.state), selfcal_imu_reason(&imu, axis));
+        }
+    }
+}
+
+static void run_both(float trend)
+{
+    uint32_t passed = 0; /* the missing ones too */
+    begin();
+    for (uint32_t at = 0; at < SAMPLES; at++) {
+        float reading[AXES];
+        const float side[] = {25.0F + 1e-4F * (float)at, NAN};
+        const uint32_t missing = draw_sample(at, reading);
+        passed += missing + 1U;
+        reading[0] += trend * (float)passed;
+        selfcal_imu_skip(&imu, missing);
+        TEST_ASSERT_EQUAL(0U, selfcal_imu_sample(&imu, reading, NULL, side) & SELFCAL_ALL_AXES);
+        take_by_hand(missing, reading, side);
+        if (at == SAMPLES / 2U || at + 1U == SAMPLES) {
+            TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, SELFCAL_ALL_AXES));
+            assert_same_reports();
+            assert_same_banks();
+        }
+    }
+    TEST_ASSERT_EQUAL(1U, imu.gate->gate.counters.alarms); /* the motion was one */
+    TEST_ASSERT_GREATER_THAN(500U, selfcal_count(&imu.bank));
+}
+
+static void test_it_is_what_its_parts_are(void)
+{
+    run_both(0.0F);
+}
+
+/* Where an axis has a trend its report with the column counts, and no other axis's does. */
+static void test_the_likelier_report_counts(void)
+{
+    model.regressors = &regressors;
+    pipe.columns = &selfcal_columns_code;
+    const float per_s = 4e-3F;
+    run_both(per_s / (float)BLOCK);
+    const selfcal_sent_coefficient_t *gx = selfcal_imu_coefficients(&imu, 0), *gy = selfcal_imu_coefficients(&imu, 1);
+    TEST_ASSERT_TRUE(gx->probability > 0.99F);
+    TEST_ASSERT_FLOAT_WITHIN(4.0F * gx->sd, per_s, gx->mean);
+    TEST_ASSERT_TRUE(gy->probability < 0.5F);
+    TEST_ASSERT_TRUE(isnan(selfcal_imu_coefficients(&imu, 3)->mean)); /* the column is not for it */
+}
+
+static void test_a_corrected_sample_is_the_reading_less_the_predicted_bias(void)
+{
+    run_both(0.0F);
+    float reading[AXES], bias = 0.0F, sd = 0.0F;
+    selfcal_corrected_t corrected;
+    (void)draw_sample(1U, reading);
+    selfcal_imu_skip(&imu, 2U * BLOCK - 1U);
+    (void)selfcal_imu_sample(&imu, reading, NULL, NULL);
+    TEST_ASSERT_TRUE(selfcal_imu_corrected(&imu, &corrected));
+    TEST_ASSERT_FALSE(selfcal_imu_corrected(&imu, &corrected)); /* no newer one */
+    /* The report rests on the intervals that had ended: whole seconds, and those of the one in progress then. */
+    const float since = (float)(kept.passed - kept.rests_on[2]) / (float)BLOCK;
+    TEST_ASSERT_TRUE(since >= 2.0F && since < 3.0F);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_predict(selfcal_imu_report(&imu, 2), &model, since, &bias, &sd));
+    TEST_ASSERT_TRUE(corrected.value[2] == reading[2] - bias);
+    TEST_ASSERT_TRUE(corrected.sd[2] == sd);
+}
+
+static unsigned char saved[sizeof memory[0] + sizeof imu];
+static size_t saved_bytes;
+
+static bool put(void *context, const void *bytes, size_t count)
+{
+    (void)context;
+    memcpy(saved + saved_bytes, bytes, count);
+    saved_bytes += count;
+    return true;
+}
+
+static void test_a_restored_pipe_goes_on_at_the_start_of_an_interval(void)
+{
+    run_both(0.0F);
+    const uint64_t before = selfcal_counters(&imu.bank)->samples;
+    saved_bytes = 0;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_save(&imu, put, NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_restore(&imu, saved, saved_bytes, 1001U));
+    TEST_ASSERT_EQUAL(0U, imu.bank.position);
+    TEST_ASSERT_TRUE(before == selfcal_counters(&imu.bank)->samples);
+    TEST_ASSERT_EQUAL(SELFCAL_REASON_MOVING, selfcal_imu_reason(&imu, 0)); /* until the gate has seen rest */
+    TEST_ASSERT_NULL(selfcal_imu_report(&imu, 0));
+    saved[saved_bytes / 2U] ^= 1U;
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_DAMAGED, selfcal_imu_restore(&imu, saved, saved_bytes, 0U));
+}
+
+/* An amount that the sensor adds moves bias, report and readings alike, and is kept when all else is forgotten. */
+static void test_what_the_sensor_adds_moves_with_it(void)
+{
+    run_both(0.0F);
+    const float bias = selfcal_imu_bias(&imu, 1), report = selfcal_imu_report(&imu, 1)->bias_mean;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_shift(&imu, 1, 0.5F));
+    TEST_ASSERT_EQUAL_FLOAT(bias + 0.5F, selfcal_imu_bias(&imu, 1));
+    TEST_ASSERT_EQUAL_FLOAT(report + 0.5F, selfcal_imu_report(&imu, 1)->bias_mean);
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_shift(&imu, AXES, 0.5F));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_forget(&imu));
+    TEST_ASSERT_EQUAL(0U, selfcal_count(&imu.bank));
+    TEST_ASSERT_EQUAL_FLOAT(0.5F, selfcal_shifted(&imu.bank, 1));
+    TEST_ASSERT_TRUE(isnan(selfcal_imu_bias(&imu, 1)));
+}
+
+static void test_what_does_not_go_together_is_refused(void)
+{
+    const size_t least = SELFCAL_MODEL_IMU_BYTES;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], least));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, memory[0], least - 8U));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, memory[0], 0U));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, (char *)memory[0] + 4, least));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_init(&imu, &model, NULL, least));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_init(&imu, NULL, memory[0], least));
+    model.regressors = &regressors; /* nobody forms their values */
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    model.regressors = NULL;
+    pipe.columns = &selfcal_columns_code;
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    pipe.columns = NULL;
+    pipe.changes = &selfcal_changes_code; /* the model handles nothing */
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+}
+
+/* The bank alone: nothing is watched or judged. */
+static void test_a_model_without_a_pipe_is_a_bank(void)
+{
+    model.pipe = NULL;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], SELFCAL_MODEL_BYTES));
+    TEST_ASSERT_FALSE(selfcal_imu_watch(&imu, true));
+    for (uint32_t at = 0; at < 100U * BLOCK; at++) {
+        float reading[AXES];
+        (void)draw_sample(at, reading);
+        (void)selfcal_imu_sample(&imu, reading, NULL, NULL);
+    }
+    TEST_ASSERT_EQUAL(100U, selfcal_count(&imu.bank));
+    TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, 1U << 2));
+    while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+    }
+    TEST_ASSERT_NOT_NULL(selfcal_imu_report(&imu, 2));
+    TEST_ASSERT_NULL(selfcal_imu_report(&imu, 1));
+    TEST_ASSERT_NULL(selfcal_imu_judgement(&imu, 2));
+    TEST_ASSERT_NULL(selfcal_imu_coefficients(&imu, 2));
+    TEST_ASSERT_EQUAL(SELFCAL_STATUS_MOTION_NOT_WATCHED, selfcal_imu_motion(&imu));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_work(&imu)); /* nothing is due */
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_ask(&imu, 1U << AXES)); /* no such axis */
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_it_is_what_its_parts_are);
+    RUN_TEST(test_the_likelier_report_counts);
+    RUN_TEST(test_a_corrected_sample_is_the_reading_less_the_predicted_bias);
+    RUN_TEST(test_a_restored_pipe_goes_on_at_the_start_of_an_interval);
+    RUN_TEST(test_what_the_sensor_adds_moves_with_it);
+    RUN_TEST(test_what_does_not_go_together_is_refused);
+    RUN_TEST(test_a_model_without_a_pipe_is_a_bank);
+    return UNITY_END();
+}
