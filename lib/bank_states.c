@@ -67,9 +67,14 @@ static void init_states(selfcal_t *self, unsigned char *memory) {
 /* -------------------------------------------------------------------------------------------------------------
  * gains */
 
+/* Whether two of the states are an oscillation's: never in a build without room for them. */
+static bool has_pair(const selfcal_term_node_t *node) {
+    return SELFCAL_TERMS_MAX > 1 && node->pair != 0U;
+}
+
 /* Both states of an oscillation have one: the first one's. */
 static selfcal_real_t beta_of(const selfcal_term_node_t *node, size_t a) {
-    return node->beta[node->pair != 0U && a == node->pair ? a - 1U : a];
+    return node->beta[has_pair(node) && a == node->pair ? a - 1U : a];
 }
 
 static selfcal_wide_t phi_of(const selfcal_term_node_t *node, size_t a) {
@@ -188,7 +193,7 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
             const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation;
             node->q[a] = (selfcal_real_t)(deviation * deviation * square);
             node->p[term_pair(a, a)] = deviation * deviation * square; /* x_0 = 0 */
-        } else if (term->kind == SELFCAL_OSCILLATION) {
+        } else if (term->kind == SELFCAL_OSCILLATION && a + 1U < SELFCAL_TERMS_MAX) {
             start_swing(self->model, node, a, term, markov_variance(law, term, square, second, dt_s));
         } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_wide_t rate = bandwidth_of(term, second) * dt_s; /* of an interval */
@@ -235,7 +240,7 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
         }
         gain.s += gain.kappa[a];
     }
-    if (node->pair != 0U) { /* m is the phi below */
+    if (has_pair(node)) { /* m is the phi below */
         const swing_t turn = turn_of(node);
         selfcal_wide_t *x = &gain.kappa[node->pair - 1U];
         const selfcal_wide_t more[2] = {turn.up * x[1], turn.down * x[0]};
@@ -251,7 +256,7 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
 }
 
 static bool in_pair(const selfcal_term_node_t *node, size_t a) {
-    return node->pair != 0U && (a == node->pair || a + 1U == node->pair);
+    return has_pair(node) && (a == node->pair || a + 1U == node->pair);
 }
 
 /* P of the next sample before its reading, less the noise of plain terms: the states go through an interval. */
@@ -272,14 +277,14 @@ static bool step(selfcal_term_node_t *node, size_t order, selfcal_wide_t r, cons
     const selfcal_wide_t theta = (selfcal_wide_t)node->theta;
     bool rests = true;
     selfcal_wide_t carried[SELFCAL_TERM_PAIRS] = {0.0};
-    if (node->pair != 0U) {
+    if (has_pair(node)) {
         carry(node, order, carried);
     }
     for (size_t a = 0; a < order; a++) {
         for (size_t b = 0; b <= a; b++) {
             selfcal_wide_t *p = &node->p[term_pair(a, b)];
             const selfcal_wide_t before = *p;
-            *p = (node->pair != 0U ? carried[term_pair(a, b)] : phi_of(node, a) * phi_of(node, b) * before) -
+            *p = (has_pair(node) ? carried[term_pair(a, b)] : phi_of(node, a) * phi_of(node, b) * before) -
                  gain->kappa[a] * gain->kappa[b] * gain->s;
             if (a == b) {
                 *p += (in_pair(node, a) ? 0.0 : (selfcal_wide_t)node->q[a]) +
@@ -393,7 +398,7 @@ static void filter_states(const selfcal_term_node_t *term, size_t order, const t
         out->weighted[i] = nu * inv_s;
         out->low[i] = r_fma_exact(nu, inv_s, -out->weighted[i]);
         selfcal_real_t turned[2] = {R(0.0), R(0.0)};
-        if (term->pair != 0U) {
+        if (has_pair(term)) {
             const selfcal_sum_t *first = &x[term->pair - 1U], *second = &x[term->pair];
             turned[0] = -term->beta[term->pair] * (second->hi + second->lo);
             turned[1] = term->q[term->pair] * (first->hi + first->lo);
@@ -472,11 +477,11 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     for (size_t a = 0; a < order; a++) {
         whole.of[a][a] = 1.0 - less[a];
     }
-    if (term->pair != 0U) {
+    if (has_pair(term)) {
         put_swing(&whole, term->pair, power(turn_of(term), count));
     }
     transform(term->p, order, &whole);
-    if (term->pair != 0U) {
+    if (has_pair(term)) {
         add_turned(term->p, term->pair, power(turn_of(term), count), (selfcal_wide_t)term->q[term->pair - 1U]);
     }
     for (size_t a = 0; a < order; a++) {
@@ -538,7 +543,7 @@ static void terms_now(const selfcal_t *self, size_t j, terms_now_t *now) {
         if (term->kind == SELFCAL_WALK) {
             now->per_prediction.of[a][a] = 1.0;
             now->after[term_pair(a, a)] = (selfcal_wide_t)(node->q[a] * averaged_walk_after(block));
-        } else if (term->kind == SELFCAL_OSCILLATION) {
+        } else if (term->kind == SELFCAL_OSCILLATION && a + 1U < SELFCAL_TERMS_MAX) {
             swing_now(self->model, term, a, markov_variance(law, term, square, second, dt_s), now);
         } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
@@ -571,7 +576,7 @@ static void spread_of(const selfcal_t *self, size_t j, selfcal_wide_t spread[SEL
     for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
         spread[term_pair(a, a)] -= in_pair(term, a) ? 0.0 : (selfcal_wide_t)term->q[a];
     }
-    if (term->pair != 0U) {
+    if (has_pair(term)) {
         add_turned(spread, term->pair, turn_of(term), -(selfcal_wide_t)term->q[term->pair - 1U]);
     }
     transform(spread, SELFCAL_TERMS_MAX, &now.per_prediction);
