@@ -22,7 +22,7 @@ static moments_t predict_law(const selfcal_model_t *model, const selfcal_law_t *
         selfcal_real_t fall = R(0.0), growth = R(0.0);
         for (unsigned j = 0; j < SELFCAL_ALPHA_MAX; j++) {
             const selfcal_decay_t *decay = &posterior->decay[j];
-            selfcal_real_t psi[SELFCAL_TERMS_MAX + 1U]; /* an oscillation writes two */
+            selfcal_real_t psi[SELFCAL_TERMS_MAX + 1U] = {R(0.0)}; /* an oscillation writes two */
             for (unsigned a = 0; a < terms_of(law); a++) {
                 const selfcal_term_t *term = &law->term[a]; /* a walk's bandwidth is 0 */
                 const selfcal_real_t alpha = term->stated ? R(1.0) : (selfcal_real_t)decay->alpha;
