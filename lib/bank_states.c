@@ -136,7 +136,7 @@ static selfcal_wide_t turned_both(swing_t swing, selfcal_wide_t v) {
 
 /* P goes to A P A'. */
 static void transform(selfcal_wide_t p[SELFCAL_TERM_PAIRS], size_t order, const matrix_t *a) {
-    selfcal_wide_t half[SELFCAL_TERMS_MAX][SELFCAL_TERMS_MAX];
+    selfcal_wide_t half[SELFCAL_TERMS_MAX][SELFCAL_TERMS_MAX] = {{0.0}};
     for (size_t i = 0; i < order; i++) {
         for (size_t j = 0; j < order; j++) {
             half[i][j] = 0.0;
