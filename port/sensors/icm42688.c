@@ -64,6 +64,7 @@ enum { TEST_SAMPLES = 32 };   /* at least */
 #define BACKOFF_MAX_US 10000000U
 #define BLIND_US 1000000U     /* from here on the processor's clock counts: a timestamp's turns are unsure */
 enum { PROVEN_SAMPLES = 1000 };
+enum { LEARNING = 64 };       /* samples that the period is learned from, before it is followed slowly */
 /* All axes as before: from the third in a row on withheld, the sixteenth is a fault. */
 enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16 };
 /* Timestamps out of place in a row: the packets do not follow each other after all. */
@@ -204,7 +205,7 @@ bool icm42688_init(icm42688_t *self, const icm42688_bus_t *bus, float rate_hz) {
         if (fabsf(rate_hz - rates[i].rate_hz) <= 1e-3F * rates[i].rate_hz) {
             self->rate = rates[i].code;
             self->period_us = rates[i].period_us;
-            self->ticks_q8 = rates[i].period_us * 240U; /* 30/32 of 256: the PLL's unit */
+            self->ticks_q16 = rates[i].period_us * 61440U; /* 30/32 of 65536: the PLL's unit */
             begin(self);
             return true;
         }
@@ -466,10 +467,10 @@ static uint32_t periods(const icm42688_t *self, uint64_t us, uint16_t stamp) {
     const uint64_t passed = us > self->last_us ? us - self->last_us : 0U;
     uint64_t count = (passed + self->period_us / 2U) / self->period_us;
     if (!self->blind && passed < BLIND_US) { /* whole turns of the timestamp from the clock, the rest from the timestamp */
-        const uint64_t ticks = passed * self->ticks_q8 / self->period_us / 256U;
+        const uint64_t ticks = (passed * self->ticks_q16 / self->period_us) >> 16;
         const uint32_t part = (uint16_t)(stamp - self->last_stamp);
         const uint64_t turns = ticks > part ? (ticks - part + 0x8000U) >> 16 : 0U;
-        count = (((turns << 16) + part) * 256U + self->ticks_q8 / 2U) / self->ticks_q8;
+        count = ((((turns << 16) + part) << 16) + self->ticks_q16 / 2U) / self->ticks_q16;
     }
     return count < 1U ? 1U : count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
 }
@@ -477,15 +478,18 @@ static uint32_t periods(const icm42688_t *self, uint64_t us, uint16_t stamp) {
 /* Whether the timestamp is where `count` periods after the last one have it, within a quarter. */
 static bool in_place(icm42688_t *self, uint16_t stamp, uint32_t count) {
     const uint16_t step = (uint16_t)(stamp - self->last_stamp);
-    const int16_t off = (int16_t)(uint16_t)(step - (uint16_t)((uint64_t)count * self->ticks_q8 / 256U));
-    const int32_t bound = (int32_t)(self->ticks_q8 / 1024U);
+    const uint16_t expected = (uint16_t)((uint64_t)count * self->ticks_q16 >> 16);
+    const int16_t off = (int16_t)(uint16_t)(step - expected);
+    const int32_t bound = (int32_t)(self->ticks_q16 >> 18);
     if (off >= bound || off <= -bound) {
         return false;
     }
     if (count == 1U) {
-        const uint32_t ticks = (uint32_t)((int32_t)self->ticks_q8 + 4 * off), nominal = self->period_us * 256U;
-        if (ticks > nominal - nominal / 6U && ticks < nominal + nominal / 6U) {
-            self->ticks_q8 = ticks;
+        const int64_t nominal = (int64_t)self->period_us << 16;
+        const int64_t error = ((int64_t)step << 16) - (int64_t)self->ticks_q16;
+        const int64_t ticks = (int64_t)self->ticks_q16 + error / (self->good < LEARNING ? 8 : 64);
+        if (ticks > nominal - nominal / 6 && ticks < nominal + nominal / 6) {
+            self->ticks_q16 = (uint32_t)ticks;
         }
     }
     return true;
@@ -554,7 +558,7 @@ bool icm42688_sample(icm42688_t *self, float reading[ICM42688_AXES], uint32_t *m
             continue;
         }
         for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
-            reading[axis] = axis < 3U ? (float)raw[axis] * (0.5F * GYRO_STEP) : (float)raw[axis] * (0.25F * ACCEL_STEP);
+            reading[axis] = (float)raw[axis] * (axis < 3U ? 0.5F * GYRO_STEP : 0.25F * ACCEL_STEP);
         }
         self->temperature = word_of(packet + 13);
         return true;

@@ -1,11 +1,11 @@
 /* ICM-42688-P over SPI: six axes in 20 bits from its FIFO, with temperature and timestamps.
  * Data sheet DS-000347. Limits of the self-test, and that a timestamp's unit is its PLL's: the maker's own driver.
  *
- * The sensor gathers packets of 20 bytes, 102 at most. The main loop reads them, so no interrupt is needed: a loop that
- * comes back within 100 ms at 1 kHz loses nothing. Packets follow each other; a timestamp that is not one period after
+ * The sensor gathers packets of 20 bytes, 102 at most. The main loop reads them, so no interrupt is needed. A loop that
+ * comes back within 100 ms loses nothing at 1 kHz. Packets follow each other: a timestamp that is not one period after
  * the last betrays a damaged packet. After an overflow, timestamps and the processor's clock count the missing samples.
- * A packet has no checksum, and the FIFO gives it once: a wrong bit in a reading passes. One in a header, a timestamp or
- * an unused bit costs its packet.
+ * A packet has no checksum, and the FIFO gives it once: a wrong bit in a reading passes. A wrong bit in a header, a
+ * timestamp or an unused bit costs its packet.
  * In 20 bits the ranges are 2000 deg/s and 16 g: 1/131.072 deg/s and 1/8192 g a step. */
 #ifndef ICM42688_H
 #define ICM42688_H
@@ -20,7 +20,7 @@ enum { ICM42688_AXES = 6, ICM42688_PACKET = 20, ICM42688_CHUNK = 8 }; /* gx gy g
 typedef struct {
     void *context;
     uint64_t (*time_us)(void *context); /* since start */
-    /* `count` bytes each way with chip select low around them, SPI mode 0 or 3. Bounded; false: it did not take place. */
+    /* `count` bytes each way with chip select low around them, SPI mode 0 or 3. Bounded; false: it did not happen. */
     bool (*transfer)(void *context, const uint8_t *out, uint8_t *in, size_t count);
 } icm42688_bus_t;
 
@@ -61,7 +61,7 @@ typedef struct {
     icm42688_state_t state;
     icm42688_fault_t fault;        /* the last one */
     uint32_t period_us;            /* nominal */
-    uint32_t ticks_q8;             /* of a period, in timestamps / 256 */
+    uint32_t ticks_q16;            /* of a period, in timestamps / 65536 */
     uint32_t backoff_us;
     uint32_t packets_seen;         /* since progress_us */
     uint32_t dropped;              /* packets since the last sample, none of them good */

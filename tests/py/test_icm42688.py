@@ -315,13 +315,13 @@ def test_a_rate_that_it_has_not(library: ctypes.CDLL) -> None:
 
 
 @pytest.mark.parametrize("pause_s", [0.09, 0.13, 0.35, 0.9])
-@pytest.mark.parametrize("error", [0.0, 0.01])
+@pytest.mark.parametrize("error", [0.0, 0.01, -0.01])
 def test_a_pause_of_the_main_loop(library: ctypes.CDLL, pause_s: float, error: float) -> None:
     """Up to 0.1 s nothing is missing; then what is missing is counted, exactly."""
     product = Product(library, 1000.0)
     product.part.clock_error = error
     product.until("running", 1.0)
-    product.run(0.2)
+    product.run(0.1)  # long enough to learn the period
     product.clock.time_us += 1e6 * pause_s
     product.run(0.2)
     product.assert_counted()
@@ -465,6 +465,39 @@ def test_offsets(library: ctypes.CDLL) -> None:
         assert not library.icm42688_offsets(product.memory, Six(*refused), Six())
     product.part.writes_fail = {(4, 0x7A)}
     assert not library.icm42688_offsets(product.memory, Six(0, 0, 1.0, 0, 0, 0), Six())
+
+
+@pytest.mark.parametrize("at", [(0, 0x80), (0, 0x20), (15, 0x04), (17, 0x10), (18, 0x20), (19, 0x01)])
+def test_a_wrong_bit_that_shows(library: ctypes.CDLL, at: tuple[int, int]) -> None:
+    """In the header, the timestamp or the unused low bits: this packet alone is missing, and the next ones count it."""
+    product = Product(library, 1000.0)
+    product.until("running", 1.0)
+    product.run(0.1)
+    before = len(product.taken)
+    product.clock.time_us += 4000.0
+    product.part.advance()
+    packet = bytearray(product.part.fifo[1])
+    packet[at[0]] ^= at[1]
+    product.part.fifo[1] = bytes(packet)
+    product.run(0.1)
+    product.assert_counted()
+    assert [missing for _, missing in product.taken[before:]].count(1) == product.counters.damaged == 1
+    assert sum(missing for _, missing in product.taken) == 1
+
+
+def test_a_packet_without_a_sample(library: ctypes.CDLL) -> None:
+    """The part's mark for no valid sample, -2^19 on an axis: missing."""
+    product = Product(library, 1000.0)
+    product.until("running", 1.0)
+    product.run(0.1)
+    product.clock.time_us += 4000.0
+    product.part.advance()
+    packet = bytearray(product.part.fifo[2])
+    packet[1:3], packet[17] = b"\x80\x00", packet[17] & 0x0F
+    product.part.fifo[2] = bytes(packet)
+    product.run(0.1)
+    product.assert_counted()
+    assert sum(missing for _, missing in product.taken) == 1
 
 
 @pytest.mark.parametrize("seed", [3, 4])
