@@ -466,7 +466,7 @@ static bool unpack(const uint8_t *packet, int32_t raw[ICM42688_AXES]) {
 static uint32_t periods(const icm42688_t *self, uint64_t us, uint16_t stamp) {
     const uint64_t passed = us > self->last_us ? us - self->last_us : 0U;
     uint64_t count = (passed + self->period_us / 2U) / self->period_us;
-    if (!self->blind && passed < BLIND_US) { /* whole turns of the timestamp from the clock, the rest from the timestamp */
+    if (!self->blind && passed < BLIND_US) { /* whole turns from the clock, the rest from the timestamp */
         const uint64_t ticks = (passed * self->ticks_q16 / self->period_us) >> 16;
         const uint32_t part = (uint16_t)(stamp - self->last_stamp);
         const uint64_t turns = ticks > part ? (ticks - part + 0x8000U) >> 16 : 0U;
