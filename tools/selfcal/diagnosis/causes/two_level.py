@@ -30,8 +30,8 @@ DWELLS = (15.0, 50.0, 150.0, 450.0)
 SIZES = (0.0, -1.5, -3.0)
 #: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
-#: Rounds of draws about the best, and draws of each; those of the posterior.
-ROUNDS, DRAWS, POSTERIOR = 6, 120, 600
+#: Rounds of draws about the best, and draws of each.
+ROUNDS, DRAWS = 6, 120
 #: Share of samples of another noise level at most: gaps have some, a change of the noise has more.
 UNEVEN_MOST = 0.05
 #: Places of a dwell time's posterior.
@@ -106,7 +106,7 @@ def looks(state: State, record: Record) -> list[Look]:
     value = switching(y, tried).ln_likelihood
     if net(float(value.max()) - none, 3, LN_LOOKS) < 1.0:
         return []
-    theta, gain, cloud = _best(y, tried[int(value.argmax())])
+    theta, gain = _best(y, tried[int(value.argmax())])
     upper = _smoothed(y, theta) > 0.5
     jumps = int(np.count_nonzero(np.diff(upper)))
     if jumps < JUMPS_LEAST:
@@ -125,17 +125,16 @@ def looks(state: State, record: Record) -> list[Look]:
     worth = net(gain - none, 3, LN_LOOKS)
     if worth < 1.0:
         return []
-    level = math.exp(theta[0]) * (upper - 0.5)
-    places = np.minimum(np.arange(state.y.size) // block, level.size - 1)
+    levels = (upper - 0.5)[np.minimum(np.arange(state.y.size) // block, upper.size - 1)]
     dt = state.dt * block
-    measure = partial(_amplitude, y, theta, cloud, state.unit)
+    measure = partial(_amplitude, state, levels)
     estimate = {
         "amplitude": mixture(np.ones(1), np.exp(theta[:1]), 0.05 * math.exp(theta[0]), state.unit),
         "dwell_s": _dwell(sum(time for time, _ in stays), sum(count for _, count in stays), dt),
         **{key: _dwell(*stay, dt) for key, stay in zip(("dwell_low_s", "dwell_high_s"), stays, strict=True)},
         "jumps": jumps,
     }
-    changes = {"y": state.y - level[places], "redrawn": True}
+    changes = {"y": state.y - math.exp(theta[0]) * levels, "redrawn": True}
     return [Look("two_level", gain - none, worth, estimate, changes, measure=measure)]
 
 
@@ -153,8 +152,8 @@ def _law(state: State) -> float:
     return max(0.0, state.best.ln_likelihood - walk.ln_likelihood)
 
 
-def _best(y: Array, theta: Array) -> tuple[Array, float, Array]:
-    """The likeliest parameters from `theta` on, their ln likelihood, and the draws' root of the covariance."""
+def _best(y: Array, theta: Array) -> tuple[Array, float]:
+    """The likeliest parameters from `theta` on, and their ln likelihood."""
     random = np.random.default_rng(1)
     spread = np.diag([0.3, 0.8, 0.8, 0.8, 0.03])
     middle, value = theta, float(switching(y, theta[None, :]).ln_likelihood[0])
@@ -170,17 +169,13 @@ def _best(y: Array, theta: Array) -> tuple[Array, float, Array]:
         apart = drawn - middle
         covariance = (weight[:, None] * apart).T @ apart / weight.sum()
         spread = np.linalg.cholesky(1.5 * covariance + 1e-5 * np.eye(theta.size))
-    return middle, value, spread
+    return middle, value
 
 
-def _amplitude(y: Array, theta: Array, spread: Array, unit: str) -> dict[str, Any]:
-    """Drawn about the likeliest parameters, each weighed by its likelihood; priors are flat in the logarithms."""
-    random = np.random.default_rng(2)
-    z = random.standard_normal((POSTERIOR, theta.size)) * 1.3
-    drawn = theta + z @ spread.T
-    ln_weight = switching(y, drawn).ln_likelihood + 0.5 * (z**2).sum(axis=1) / 1.3**2
-    sizes = np.exp(drawn[:, 0])
-    return {"amplitude": mixture(np.exp(ln_weight - ln_weight.max()), sizes, 0.01 * sizes, unit)}
+def _amplitude(state: State, levels: Array) -> dict[str, Any]:
+    """The coefficient of the decoded `levels` [n], -0.5 and 0.5, over every near drift."""
+    weight, means, sds = (of[0] for of in state.posterior(levels))
+    return {"amplitude": mixture(weight, means[:, 0], sds[:, 0], state.unit)}
 
 
 def _stays(upper: Mask) -> list[tuple[float, float]]:
