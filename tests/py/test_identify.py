@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -434,3 +435,29 @@ def test_noise_of_half_a_step_and_more_passes_the_lattice(tmp_path: Path, level:
         n = 0.05 * math.sqrt((sd**2 + 1.0 / 12.0) / 10.0)
         # beside the statistical error the rounding's variance swings by exp(-2 pi^2 sd^2), 0.7 % at half a step
         assert axis["parameters"]["constant"]["N"]["median"] == pytest.approx(n, rel=4.0 / math.sqrt(1200.0) + 0.01)
+
+
+@pytest.mark.parametrize("lsb", [0.0, 0.02])
+def test_memory_of_a_long_recording(tmp_path: Path, lsb: float) -> None:
+    """24 bytes a reading of six axes, once the record is long: the reading, a third of the stamps, the work of an axis.
+    One axis jumps, so that the search for its cause is in it. `lsb`: on a lattice that is no coarser than the noise,
+    with gaps."""
+    rng = np.random.default_rng(8)
+    peaks = {}
+    for n in (40_000, 120_000):
+        axes = {name: 0.05 * rng.standard_normal(n) for name in ("gx", "gy", "gz", "ax", "ay", "az")}
+        axes["gy"][n // 2 :] += 0.1
+        kept = rng.random(n) < (0.999 if lsb else 2.0)
+        columns = {
+            name: ("deg/s" if name[0] == "g" else "m/s^2", np.rint(y[kept] / lsb) * lsb if lsb else y[kept])
+            for name, y in axes.items()
+        }
+        log = tmp_path / "log.npz"
+        save(log, columns, 100.0, t=(np.arange(n) / 100.0)[kept])
+        tracemalloc.start()
+        identify(log)
+        peaks[n] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    growth = (peaks[120_000] - peaks[40_000]) / (80_000 * 6)
+    print(f"{growth:.1f} bytes a reading")
+    assert growth <= 24.0

@@ -48,7 +48,7 @@ def usable_blocks(
     """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them.
     `counted`: the samples kept out by reason, from those that the averaging knows."""
     z = None if columns is None else columns.astype(np.float64)
-    blocks = block_means(samples.astype(np.float64), missing_before, tables.block, group, z)
+    blocks = block_means(samples, missing_before, tables.block, group, z)
     blocks = replace(blocks, kept_out=counted(blocks.kept_out))
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = REPORT_MIN + len(tables.regressors)
@@ -78,7 +78,7 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
 
 
 def block_means(
-    samples: NDArray[np.float64],
+    samples: NDArray[np.floating[Any]],
     missing_before: NDArray[np.int64],
     block: int,
     group: Group,
@@ -89,7 +89,8 @@ def block_means(
     reasons = kept_out(samples, group)
     usable = ~np.logical_or.reduce(list(reasons.values()))
     counts = {"missing": int(missing_before.sum()), **{what: int(mask.sum()) for what, mask in reasons.items()}}
-    at = np.arange(samples.size) + np.cumsum(missing_before)
+    at = np.cumsum(missing_before)
+    at += np.arange(samples.size)
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
     at -= at[np.argmax(usable)]
@@ -97,7 +98,7 @@ def block_means(
     count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
     if not usable.all():
         samples, at, columns = samples[usable], at[usable], columns[usable]
-    index = at // block
+    index = np.floor_divide(at, block, out=at)
     end = int(np.searchsorted(index, count))
     values, index, rows = samples[:end], index[:end], columns[:end]
     used = np.bincount(index, minlength=count)
@@ -110,7 +111,11 @@ def block_means(
         r = np.where(used * 2 >= block, block / used, 1.0)
     good = np.isfinite(mean)[index]
     freedom = int(good.sum()) - int(np.isfinite(mean).sum())
-    squares = float(((values - raw[index])[good] ** 2).sum())
+    scatter = raw[index]
+    np.subtract(values, scatter, out=scatter)
+    if not good.all():
+        scatter = scatter[good]
+    squares = float(np.square(scatter, out=scatter).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
     return Blocks(mean[first:], r[first:], within, counts, z[first:])

@@ -78,6 +78,9 @@ def _step(unique: NDArray[np.floating[Any]]) -> float:
     if not gaps.size:
         return 0.0
     least = float(gaps.min())
-    steps = np.rint(gaps / least)
+    steps = gaps / least
+    np.rint(steps, out=steps)
     q = float(gaps.sum() / steps.sum())
-    return q if np.all(np.abs(gaps - steps * q) < 0.02 * q) else 0.0
+    steps *= q
+    gaps -= steps
+    return q if max(float(gaps.max()), -float(gaps.min())) < 0.02 * q else 0.0

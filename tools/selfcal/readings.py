@@ -146,7 +146,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     recurring = recurring_of(sound, recording.rate_hz)
     if recurring is not None:
         values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
-    lattice = lattice_of(sound[np.isfinite(sound)], recording.rate_hz)
+    lattice = lattice_of(_known(sound), recording.rate_hz)
     stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
         values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
@@ -168,6 +168,12 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     return Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
 
 
+def _known(values: Array) -> Array:
+    """Those of the values that are finite; no copy where all are."""
+    finite = np.isfinite(values)
+    return values if finite.all() else values[finite]
+
+
 def _stretches(mask: Mask) -> list[tuple[int, int]]:
     """First row and the row after the last of every stretch of a mask [n]."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
@@ -184,17 +190,20 @@ def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tup
     """Rows [n] in which values [n], NaN where they are none, show that the sensor moved, and its motion. A gap is no
     longer than those that matter."""
     rate = recording.rate_hz
-    place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
-    place -= place[0]
-    even = np.full(int(place[-1]) + 1, np.nan)
-    even[place] = values
-    mask = np.zeros(even.size, bool)
+    place: Rows | None = None
+    even = values
+    if recording.missing_before.any():
+        place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
+        place -= place[0]
+        even = np.full(int(place[-1]) + 1, np.nan)
+        even[place] = values
     found = loud(even, rate, lattice.step if lattice is not None else 0.0)
     if found is None:
-        return mask[place], None
+        return np.zeros(values.size, bool), None
+    mask = np.zeros(even.size, bool)
     for begin_s, end_s in found.intervals:
         mask[round(begin_s * rate) : round(end_s * rate)] = True
-    mask = mask[place]
+    mask = mask if place is None else mask[place]
     return mask, replace(found, intervals=tuple(_intervals(recording, mask)))
 
 
@@ -206,7 +215,8 @@ def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
     off = recording.off_grid_s
     if off is None or off.size < 60:
         return recording, ()
-    time = recording.time_s + off
+    time = recording.time_s
+    time += off
     found = rate_changes(time) or _small_change(time, recording)
     if not found:
         return recording, ()
@@ -222,17 +232,19 @@ def _small_change(time: Array, recording: Recording) -> list[Change]:
     off = recording.off_grid_s
     assert off is not None
     k = np.arange(off.size)
-    off = off - np.interp(k, [0, k[-1]], [off[0], off[-1]])
+    off = off - (off[0] + (off[-1] - off[0]) / k[-1] * k)
     edge = max(10, off.size // 50)
     at = edge + int(np.argmax(np.abs(off[edge:-edge])))
+    step = 1.0 / recording.rate_hz
+    bend = float(np.abs(off).max())
+    if bend < 3.0 * step:
+        return []
     halves = (slice(None, at), slice(at, None))
     lines = [np.polyfit(k[half], off[half], 1) for half in halves]
     bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
     scatter = float((off - bent).std())
-    step = 1.0 / recording.rate_hz
     change = float(lines[1][0] - lines[0][0]) / step
-    bend = float(np.abs(off).max())
-    if abs(change) < CLOCK_LEAST or bend < 3.0 * step or bend < 5.0 * scatter:
+    if abs(change) < CLOCK_LEAST or bend < 5.0 * scatter:
         return []
     # Random times walk off any grid. The slopes of pieces show how far.
     slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]

@@ -980,15 +980,18 @@ def _checked(
     rate: float | None,
     meta: Mapping[str, Any],
     fields: Sequence[_Field],
-    table: Sequence[NDArray[np.float64]],
+    table: list[NDArray[np.float64]],
     fail: _Fail,
     header: _Header,
     started: float,
 ) -> Recording:
-    """The recording of raw columns `table`, float64[n] each, NaN where there is no sample. `fail(row, field, what)`
-    raises for a row of the file. `started`: what was taken off the stamps, in their unit."""
+    """The recording of raw columns `table`, float64[n] each, NaN where there is no sample. It empties `table`: no
+    second copy stays. `fail(row, field, what)` raises for a row of the file. `started`: what was taken off the stamps,
+    in their unit."""
     columns: dict[str, Column] = {}
-    for number, (field, raw) in enumerate(zip(fields, table, strict=True)):
+    rows = table[0].size
+    for number, field in enumerate(fields):
+        raw = table.pop(0)
         if np.isinf(raw).any():
             fail(int(np.argmax(np.isinf(raw))), number, "infinite")
         with np.errstate(over="ignore"):
@@ -997,7 +1000,6 @@ def _checked(
             fail(int(np.argmax(np.isinf(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
         columns[field.name] = Column(field.name, field.unit, values)
     _check_truth(path, meta)
-    rows = table[0].size
     stamps = columns.pop("t", None)
     time = started_s = None
     noise_s = 0.0
@@ -1023,6 +1025,7 @@ def _checked(
         noise_s = float(
             np.abs(units.convert(np.spacing(np.abs(stamps.values).max(keepdims=True)), stamps.unit, "s"))[0]
         )
+        stamps = None
     return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time)
 
 
@@ -1046,7 +1049,7 @@ def _on_clocks(
 
     def clock_at(at: NDArray[np.int64], rate: float | None) -> Clock:
         if time is not None:
-            return clock_of(path, time[at], noise_s, rate, lambda row, what: fail(int(at[row]), what))
+            return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what))
         assert rate is not None
         return clock_of_rows(at, rate)
 
@@ -1095,12 +1098,12 @@ def _on_clocks(
                 column, values=column.values[known], clock=replace(clock, start_s=clock.start_s - begins)
             )
         elif name in axes:
-            made[name] = replace(column, values=column.values[at])
+            made[name] = replace(column, values=_at(column.values, at))
             missing[name] = rows - int(known.sum())
         else:
             place = np.arange(rows, dtype=np.float64) if time is None else time
             values = column.values if known.all() else np.interp(place, place[known], column.values[known])
-            made[name] = replace(column, values=values[at])
+            made[name] = replace(column, values=_at(values, at))
     told = ", ".join(f"{name} {count}" for name, count in missing.items() if count)
     if told:
         header.notes.append(f"of {rows} rows cells without a number, taken as missing samples: {told}")
@@ -1115,6 +1118,11 @@ def _on_clocks(
         started_s=started_s,
         notes=notes,
     )
+
+
+def _at(values: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Values in these rows, in order and each once; no copy where they are all."""
+    return values if rows.size == values.size else values[rows]
 
 
 def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:

@@ -80,7 +80,7 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         dt = min(min(one.before_s, one.after_s) for one in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     window = max(1, min(_WINDOW, steps.size // 4))
-    typical = float(np.median(time[window:] - time[:-window])) / window
+    typical = float(np.median(time[window:] - time[:-window], overwrite_input=True)) / window
     lattice = _lattice(steps, max(4.0 * noise_s, 1e-9 * typical))
     if lattice > _COARSE * typical:
         try:
@@ -90,12 +90,18 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
                 raise  # a stated rate decides, and is checked by who knows it
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
-    positive = steps[steps > 0.0]
-    first = float(np.median(positive[positive < 1.5 * np.median(positive)])) if rate is None else 1.0 / rate
+    first = _usual(steps) if rate is None else 1.0 / rate
     dt, missing = _fine(time, steps, first)
     if rate is None and (typical > _MEAN * first or missing.any()) and not _even(time, dt):
         return _mean_grid(steps)
     return dt, missing
+
+
+def _usual(steps: NDArray[np.float64]) -> float:
+    """The median of the steps that are no gaps and no repeats."""
+    positive = steps[steps > 0.0]
+    usual = positive < 1.5 * np.median(positive)
+    return float(np.median(positive if usual.all() else positive[usual], overwrite_input=True))
 
 
 def _even(time: NDArray[np.float64], dt: float) -> bool:
@@ -151,7 +157,7 @@ def rate_changes(time: NDArray[np.float64]) -> list[Change]:
     if not middle.min() > 0.0:
         return []
     # Quantiles of coarse stamps jump by a step of their lattice, means move with gaps: a change of rate does both.
-    near = np.abs(pieces - middle) < 0.5 * middle
+    near = (pieces > 0.5 * middle) & (pieces < 1.5 * middle)
     value = np.log(middle[:, 0])
     mean = np.log((pieces * near).sum(axis=1) / near.sum(axis=1))
     parts = _constant(value, mean)
@@ -246,10 +252,11 @@ def _mean_step(time: NDArray[np.float64], step: float) -> float:
 
 def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
     """Step (s) of the lattice that all time stamps lie on; 0 where there is none."""
-    ordered = np.sort(steps[steps > tolerance])
+    ordered = steps[steps > tolerance]
+    ordered.sort()
     if ordered.size == 0:
         return 0.0
-    starts = np.flatnonzero(np.diff(ordered, prepend=-np.inf) > tolerance)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(ordered) > tolerance) + 1])
     if starts.size > 1000:
         return 0.0
     distinct = np.add.reduceat(ordered, starts) / np.diff(starts, append=ordered.size)
@@ -414,7 +421,8 @@ def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
     index = np.arange(time.size)
 
     def span(dt: float) -> float:
-        left = time - index * dt
+        left = index * dt
+        np.subtract(time, left, out=left)
         return float(left.max() - left.min())
 
     middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)

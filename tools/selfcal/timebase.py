@@ -60,12 +60,16 @@ class Clock:
     @property
     def place(self) -> NDArray[np.int64]:
         """int64[n]: place on the grid of each sample, the missing ones counted."""
-        return np.arange(self.missing_before.size) + np.cumsum(self.missing_before)
+        place = np.cumsum(self.missing_before)
+        place += np.arange(place.size)
+        return place
 
     @property
     def time_s(self) -> NDArray[np.float64]:
         """float64[n]: time of each sample on the grid since the recording's first, s."""
-        return self.start_s + self.place / self.rate_hz
+        time = self.place / self.rate_hz
+        time += self.start_s
+        return time
 
     def of_rows(self, rows: NDArray[np.int64], begin_s: float, *, moving: bool = False) -> Clock:
         """The clock of these samples of it, in a recording that begins `begin_s` later. `moving`: the others are left
@@ -128,7 +132,8 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
 def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
     states it. Raises UserError, by `fail` for a row."""
-    start, time = float(time[0]), time - time[0]
+    start = float(time[0])
+    time = time - start if start else time
     if not np.isfinite(time[-1]):
         raise UserError(f"{path}: column 't' spans more than a number can hold")
     found, missing = _sampling(path, time, noise_s, rate, fail)
@@ -139,7 +144,8 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
-    off_grid = time - (np.arange(time.size) + np.cumsum(missing) - missing[0]) / rate
+    grid = Clock(rate, missing, start_s=-missing[0] / rate).time_s
+    off_grid = np.subtract(time, grid, out=grid)
     return Clock(rate, missing, off_grid, start)
 
 
@@ -148,7 +154,7 @@ def _sampling(
 ) -> tuple[float, NDArray[np.int64]]:
     """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
     steps = np.diff(time)
-    if (steps < 0.0).any():
+    if steps.min() < 0.0:
         fail(int(np.argmax(steps < 0.0)) + 1, "time runs backwards")
     repeats = steps == 0.0
     few = time.size < _REPEATS_FROM or np.count_nonzero(repeats) < _REPEATS_LEAST * time.size

@@ -169,9 +169,12 @@ def convert(value: float, unit: str, to: str) -> float: ...
 @overload
 def convert(value: NDArray[np.float64], unit: str, to: str) -> NDArray[np.float64]: ...
 def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | NDArray[np.float64]:
-    """`value` (any shape) of `unit` in `to`; temperatures as points on their scales. Raises UserError as `factor`."""
+    """`value` (any shape) of `unit` in `to`, itself if they are one; temperatures as points on their scales. Raises
+    UserError as `factor`."""
     scale = factor(unit, to)
     shift = parse(unit).zero - parse(to).zero
+    if scale == 1.0 and shift == 0.0:
+        return value  # an array itself, not a copy
     return value * scale if shift == 0.0 else value * scale + shift / parse(to).size
 
 

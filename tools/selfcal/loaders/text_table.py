@@ -165,7 +165,11 @@ class TextTable:
         if rows < 2:
             what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
             raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
-        return [None if part is None else np.concatenate(part) for part in parts]
+        whole: list[NDArray[np.float64] | None] = []
+        while parts:  # no column stays in both forms
+            part = parts.pop(0)
+            whole.append(None if part is None else np.concatenate(part))
+        return whole
 
     def _header(self, knows: Callable[[Sequence[str]], bool]) -> tuple[str, int, int]:
         """The header line, its number, and the first row's; the lines after it are the rest."""
