@@ -42,8 +42,9 @@ PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
 LONGEST_LAG = 1.0 / 3.0
 #: A lag or a play that changes the column by less than this share of it is none.
 ALIKE_COLUMN = 0.1
-#: Forms that are refitted: those that score best.
-REFITTED = 3
+#: Forms that are refitted: those that score best. After the first one only forms whose score is within so many nats of
+#: what a form needs to be taken, or to be as likely as the best.
+REFITTED, REFIT_ADDS = 3, 3.0
 #: A drift of less: where a form has pulled the drift up, its score is too small there.
 STIFFER = 1.5
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
@@ -284,6 +285,9 @@ def _tried(state: State, channel: Channel) -> dict[str, _Tried]:
         if not left:
             break
         k = max(left, key=lambda k: _worth(channel, options[k], gains[k]))
+        known = max((_worth(channel, option, gain) for gain, option, _ in done.values()), default=-math.inf)
+        if done and _worth(channel, options[k], gains[k]) < max(known - ALIKE, NET_LEAST) - REFIT_ADDS:
+            break
         gain, fit = state.with_columns(blocks[k])
         gains = np.maximum(gains, state.scores(blocks, fit))
         of_form = [j for j, one in enumerate(options) if one.form == options[k].form]
@@ -291,22 +295,14 @@ def _tried(state: State, channel: Channel) -> dict[str, _Tried]:
         if better != k and gains[better] > gain:
             k = better
             gain, fit = state.with_columns(blocks[k])
+        if channel.slow:
+            gain = min(gain, state.rich_gain(options[k].columns))
         done[options[k].form] = (gain, options[k], fit)
-    found: dict[str, _Tried] = {}
-    for form in channel.forms:
-        of_form = [j for j, one in enumerate(options) if one.form == form]
-        if not of_form:
-            continue
-        if form in done:
-            gain, option, fit = done[form]
-            if channel.slow:
-                gain = min(gain, state.rich_gain(option.columns))
-        else:
-            k = max(of_form, key=lambda j: gains[j])
-            gain, option, fit = float(gains[k]), options[k], state.best
-        found[form] = _Tried(option, gain, _worth(channel, option, gain), fit)
     # A form whose score alone is known is refitted by who takes it: only a finding needs that.
-    return {form: one for form, one in found.items() if form in done}
+    return {
+        form: _Tried(option, gain, _worth(channel, option, gain), fit)
+        for form, (gain, option, fit) in ((form, done[form]) for form in channel.forms if form in done)
+    }
 
 
 def _worth(channel: Channel, option: Option, gain: float) -> float:
