@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from selfcal.blocks import Blocks
 from selfcal.checks import judge
 from selfcal.engines.library import Bank
 from selfcal.model import Model, Prior
+from selfcal.recording import save
 from selfcal.tables import make_tables
+from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records
 
@@ -177,3 +180,12 @@ def test_intervals_hold_the_truth_of_a_drift_that_forgets_within_a_block() -> No
     print(shares, flagged / TRUTHS)
     assert all(LEAST <= count <= MOST for count in held.values()), shares
     assert flagged <= int(binom.isf(1e-3, TRUTHS, 0.02))
+
+
+def test_a_drift_beyond_the_grid_is_no_finding(tmp_path: Path) -> None:
+    """A walk of 5 N in a bank interval: `identify` flags it, and every sample shows that nothing is wrong with it."""
+    for k in range(case_records(1, 20)):
+        samples, _ = readings("random_walk", {"N": 0.003, "K": 0.015}, np.random.default_rng([500, k]), 20_000)
+        save(tmp_path / "walk.npz", {"gx": ("deg/s", samples)}, float(BLOCK))
+        found = diagnose(tmp_path / "walk.npz")["axes"]["gx"]
+        assert found["verdict"] == "adequate", found["findings"]

@@ -80,13 +80,13 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
     if means is None or looks[0].findings or not means.findings:
         return looks[0]
     strongest = max(means.findings, key=lambda one: one.look.net)
-    if not strongest.look.changes and _moves_within(looks[0].state, means.state.dt):
+    if not strongest.look.changes and moves_within(looks[0].state, means.state.dt):
         return looks[0]
     least = NET_LEAST if strongest.look.changes else -math.log(P_FAMILY)
     return means if strongest.look.net >= least + LN_TWICE else looks[0]
 
 
-def _moves_within(state: State, block_s: float) -> bool:
+def moves_within(state: State, block_s: float) -> bool:
     """Whether the drift moves so far within a block, s, that no model of point drift and white noise has its means.
 
     Means of a walk are a walk at points and white noise less a sixth of its step: none is left beyond sqrt(6) N."""
