@@ -185,7 +185,7 @@ def test_intervals_hold_the_truth_of_a_drift_that_forgets_within_a_block() -> No
 def test_a_drift_beyond_the_grid_is_no_finding(tmp_path: Path) -> None:
     """A walk of 5 N in a bank interval: `identify` flags it, and every sample shows that nothing is wrong with it."""
     for k in range(case_records(1, 20)):
-        samples, _ = readings("random_walk", {"N": 0.003, "K": 0.015}, np.random.default_rng([500, k]), 20_000)
+        samples, _ = readings("random_walk", {"N": 0.003, "K": 0.015}, np.random.default_rng([900, k]))
         save(tmp_path / "walk.npz", {"gx": ("deg/s", samples)}, float(BLOCK))
         found = diagnose(tmp_path / "walk.npz")["axes"]["gx"]
         assert found["verdict"] == "adequate", found["findings"]
