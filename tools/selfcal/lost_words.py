@@ -57,23 +57,25 @@ class Recurring:
 
 def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
     """The value that recurs most surely in readings [n], NaN where there is none."""
-    rows = np.flatnonzero(np.isfinite(values))
-    y = values[rows]
+    known = np.isfinite(values)
+    y = values if known.all() else values[known]
     if y.size < 8 * AROUND:
         return None
-    steps = np.abs(np.diff(y))
+    steps = np.diff(y)
+    np.abs(steps, out=steps)
     # Lost words are in fewer than two fifths of the steps; on a lattice coarser than the noise most steps are none.
     some = steps[:: max(1, steps.size // STEPS)]
     sigma = max(float(np.median(some)) / 0.6745, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
     if not sigma > 0.0:
         return None
     far = _far(y, steps, sigma, rate_hz)
+    del steps, some  # as long as the record
     found = (*far, 1.0) if far is not None else _within(y, sigma, lattice_of(y, rate_hz))
     if found is None:
         return None
     value, nats, share = found
     mask = np.zeros(values.size, bool)
-    mask[rows] = _lost(y, value, share, rate_hz)
+    mask[known] = _lost(y, value, share, rate_hz)
     return Recurring(value, mask, min(1e6, nats))
 
 
