@@ -25,6 +25,7 @@ from selfcal.loaders import FORMATS, Format, child, format_of
 from selfcal.loaders.table import Hints
 from selfcal.recording import Recording, load
 from selfcal.verbs.convert import convert
+from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
 from conftest import ROOT, case_records, run
@@ -45,7 +46,28 @@ COUNTS = {"blackbox": {"g": np.radians(0.1), "a": 9.80665 / 2048}}
 
 @pytest.fixture(scope="module")
 def drawn() -> logs.Drawn:
-    return logs.Drawn(seconds=20.0, seed=2)
+    return logs.Drawn(seconds=8.0, seed=2)
+
+
+def forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
+    """As the product's child, without the start of a new Python for each file."""
+    number = os.fork()
+    if number == 0:
+        code = 70
+        try:
+            for stream in (1, 2):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+            child.answer(one.module, path, place, hints)
+            code = 0
+        finally:
+            os._exit(code)
+    status = os.waitpid(number, 0)[1]
+    return os.waitstatus_to_exitcode(status)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child, "_spawned", forked)
 
 
 def in_si(recording: Recording, name: str) -> np.ndarray:
@@ -81,26 +103,34 @@ def test_a_log_opens_as_it_is(name: str, drawn: logs.Drawn, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", logs.WRITERS)
 def test_numbers_of_a_log(name: str, tmp_path: Path) -> None:
-    """20 min: N and K of gy lie in their 90 % intervals as often as these state. In `make test` one log of each kind of
-    reader, and no count."""
-    records = case_records(0, 20)
+    """20 min: N and K of gy within 4.5 sd, a chance of 7e-6, and in two of three 90 % intervals; the temperature's
+    coefficient of gx within 4 sd. In `make test` N and K of two logs."""
+    records = case_records(0, 3)
     if not records and name not in ("ulog", "euroc"):
         pytest.skip("in make cases")
+    # Rounding to a count is white noise.
+    count = COUNTS.get(name, {"g": 0.0})["g"]
+    white = np.sqrt(logs.N**2 + count**2 / 12.0 / 100.0)
     held = dict.fromkeys(("N", "K"), 0)
     for seed in range(max(1, records)):
         log = logs.WRITERS[name](logs.Drawn(seed=100 + seed), tmp_path)
         axis = identify(log, axes=("gy",), suspicion=False)["axes"]["gy"]
-        # Rounding to a count is white noise.
-        count = COUNTS.get(name, {"g": 0.0})["g"]
-        white = np.sqrt(logs.N**2 + count**2 / 12.0 / 100.0)
         for key, truth in (("N", white), ("K", logs.K)):
             found = axis["parameters"]["random_walk"][key]
             size = np.radians(1.0) if found["unit"].startswith("deg") else 1.0
-            assert abs(found["median"] * size - truth) < 5.0 * found["sd"] * size
+            assert abs(found["median"] * size - truth) < 4.5 * found["sd"] * size
             held[key] += found["q05"] * size <= truth <= found["q95"] * size
     if records:
-        print(name, held, "of", records)
-        assert all(binom.cdf(count, records, 0.9) > 1e-3 for count in held.values())
+        assert binom.cdf(sum(held.values()), 2 * records, 0.9) > 1e-3, held
+    if records and name not in COLD:
+        (finding,) = (
+            one
+            for one in diagnose(log, axes=("gx",), decimate=1.0)["axes"]["gx"]["findings"]
+            if one["cause"] == "temperature"
+        )
+        found = finding["estimate"]["coefficient"]
+        size = np.radians(1.0) if found["unit"].startswith("deg") else 1.0
+        assert abs(found["median"] * size - logs.PER_DEG) < 4.0 * found["sd"] * size
 
 
 @pytest.mark.parametrize("form", ["ros1", "ros2"])
@@ -112,12 +142,14 @@ def test_several_imus_are_listed(form: str, drawn: logs.Drawn, tmp_path: Path) -
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     for source in ("/left/imu", "/right/imu"):
-        assert f"--source '{source}' (gx gy gz ax ay az; 100 Hz, 19.99 s)" in line
+        assert f"--source '{source}' (gx gy gz ax ay az; 100 Hz, 7.99 s)" in line
     recording = load(log, source=["/right/imu"])
     assert in_si(recording, "gy") == pytest.approx(-drawn.gyro[:, 1])
     assert ("--source", "/right/imu") in recording.options
     with pytest.raises(UserError, match=r"there is no source '/up/imu'; give --source '/left/imu'"):
         load(log, source=["/up/imu"])
+    with pytest.raises(UserError, match="no axis is in '/imu/temperature'"):
+        load(log, source=["/imu/temperature"])
     with pytest.raises(UserError, match=r"axis '..' is in more than one of the sources"):
         load(log, source=["/left/imu", "/right/imu"])
 
@@ -191,9 +223,11 @@ def test_frames_by_a_database(suffix: str, drawn: logs.Drawn, tmp_path: Path) ->
     for name, truth, count in (("gy", drawn.gyro[:, 1], 1e-4), ("az", drawn.accel[:, 2], 1e-3)):
         assert np.abs(in_si(recording, name) - truth).max() <= 0.5001 * count
     assert np.abs(recording.columns["temp"].values - drawn.temp).max() < 0.02
-    if suffix != ".log":
+    if suffix == ".blf":
         with pytest.raises(UserError, match=r"name the database of its signals with --dbc FILE\.dbc"):
             load(log)
+    if suffix != ".blf":
+        return
     other = tmp_path / "other.dbc"
     other.write_text(logs.DBC.replace("BO_ 2", "BO_ 3").replace("BO_ 5", "BO_ 6"), encoding="utf-8")
     with pytest.raises(UserError, match="no frame in it is a message of"):
@@ -252,6 +286,42 @@ def test_a_topic_without_stamps_is_refused(drawn: logs.Drawn, tmp_path: Path) ->
     assert load(log, rate=100.0).samples == 300
 
 
+def test_messages_out_of_order_and_a_restart(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Threads write a few messages late: they are put in order. A clock that begins anew is refused in one line."""
+    n = drawn.t.size
+    late = np.arange(n).reshape(-1, 8)[:, ::-1].ravel()
+
+    class Reordered(logs.Drawn):
+        places = late
+
+        @property
+        def ns(self) -> np.ndarray:
+            return super().ns[self.places]
+
+    log = logs.write_ros1(Reordered(seconds=8.0, seed=2), tmp_path, {"/imu": (drawn.gyro[late], drawn.accel[late])})
+    assert in_si(load(log), "gx") == pytest.approx(drawn.gyro[:, 0])
+    log.unlink()
+    Reordered.places = np.concatenate([np.arange(n // 2), np.arange(n // 2)])
+    log = logs.write_ros1(Reordered(seconds=8.0, seed=2), tmp_path)
+    with pytest.raises(UserError, match="time runs backwards"):
+        load(log)
+
+
+def test_a_log_without_units(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """A line that says what to type, which works."""
+    import h5py
+
+    log = tmp_path / "plain.h5"
+    with h5py.File(log, "w") as file:
+        file["t"], file["gyro"] = drawn.t, np.degrees(drawn.gyro)
+    with pytest.raises(
+        UserError, match=r"column 'gx' has no unit: write gx\[deg/s\] in the header or give --unit gx=deg/s"
+    ):
+        load(log)
+    units = {"t": "s", **{f"g{axis}": "deg/s" for axis in "xyz"}}
+    assert in_si(load(log, units=units), "gz") == pytest.approx(drawn.gyro[:, 2])
+
+
 def test_a_driver_that_takes_turns(drawn: logs.Drawn, tmp_path: Path) -> None:
     """One topic with the gyro and the accelerometer in turn, the other's values 0: zeros are no readings."""
     gyro, accel = drawn.gyro.copy(), drawn.accel.copy()
@@ -269,14 +339,13 @@ def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch
         load(log)
 
 
-@pytest.mark.parametrize("output", ["x.npz", "x.csv"])
-@pytest.mark.parametrize("name", ["ros2", "phyphox"])
+@pytest.mark.parametrize(("name", "output"), [("ros2", "x.npz"), ("phyphox", "x.csv")])
 def test_convert(name: str, output: str, drawn: logs.Drawn, tmp_path: Path) -> None:
     """What is written reads back: the same axes at the same rates."""
     log = logs.WRITERS[name](drawn, tmp_path)
     done = run("convert", log, "-o", tmp_path / output)
     assert done.returncode == 0, done.stderr
-    assert "2,000 rows, 100 Hz, 20 s" in done.stdout
+    assert "800 rows, 100 Hz, 8 s" in done.stdout
     before, after = load(log), load(tmp_path / output)
     assert list(before.columns) == list(after.columns)
     for column in before.columns:
@@ -312,22 +381,6 @@ def test_the_page_your_log(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------------- hostile
 
 
-def forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
-    """As the product's child, without the start of a new Python for each file."""
-    number = os.fork()
-    if number == 0:
-        code = 70
-        try:
-            for stream in (1, 2):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-            child.answer(one.module, path, place, hints)
-            code = 0
-        finally:
-            os._exit(code)
-    status = os.waitpid(number, 0)[1]
-    return os.waitstatus_to_exitcode(status)
-
-
 def mutated(random: np.random.Generator, whole: bytes) -> bytes:
     """A copy that is cut, has bytes changed, a piece twice or left out, or 0xff in a place."""
     data = bytearray(whole)
@@ -359,16 +412,15 @@ BINARY = (
 
 
 @pytest.mark.parametrize("name", BINARY)
-def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path) -> None:
     """A recording, or a line that the user can read; in seconds."""
     random = np.random.default_rng([7, len(name)])
     log = logs.WRITERS[name](logs.Drawn(seconds=0.5, seed=3), tmp_path)
-    monkeypatch.setattr(child, "_spawned", forked)
     whole = log.read_bytes()
     one = format_of(log)
     if one is not None:
         import_module(f"selfcal.loaders.{one.module}").read(log, {})  # so that each child has the library
-    refused, copies = 0, case_records(20, 1000)
+    refused, copies = 0, case_records(10, 1000)
     for _ in range(copies):
         log.write_bytes(mutated(random, whole))
         begun = time.monotonic()
@@ -393,7 +445,6 @@ def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path, monkeypatch: 
     ],
 )
 def test_a_reader_is_bounded(does: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(child, "_spawned", forked)
     monkeypatch.setattr(child, "_LEAST_S", 1.0)
 
     def read(path: Path, hints: Hints) -> list[object]:

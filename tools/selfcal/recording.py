@@ -383,6 +383,7 @@ def _load(
     """The sensors of one file that are meant, and the temperatures beside them, each by its own clock."""
     with reading(path, "not a sound recording"):
         form = format_of(path, frames="dbc" in hints)
+        tables: list[Table] = []
         if form is None:
             parts = _text_parts(path, rate, header, skip_bad)
         else:
@@ -392,7 +393,7 @@ def _load(
             else:
                 tables = import_module(f"selfcal.loaders.{form.module}").read(path, hints)
             parts = [part for table in tables for part in _table_parts(path, rate, header, table, len(tables) > 1)]
-        if not parts:
+        if not parts or (len(tables) > 1 and not any(part.axes for part in parts)):
             there = ", ".join(f"{one.source}: {', '.join(one.members)}" for one in tables)
             raise UserError(
                 f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}';"
@@ -414,6 +415,8 @@ def _named(*names: str) -> str:
 def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:
     """Number of stamps, and the seconds that they span; of a foreign unit, 0."""
     stamps = stamps[np.isfinite(stamps)] if stamps.dtype.kind == "f" else stamps
+    if not stamps.size:
+        return 0, 0.0
     unit = units.plain(unit or "s")
     size = units.factor(unit, "s") if units.known(unit) and units.same_kind(unit, "s") else 0.0
     return stamps.size, float(int(stamps[-1]) - int(stamps[0]) if stamps.dtype.kind in "iu" else np.ptp(stamps)) * size

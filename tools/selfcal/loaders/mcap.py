@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.errors import UserError
 from selfcal.limits import MOST_COLUMNS
+from selfcal.loaders.headings import TIMES
 from selfcal.loaders.ros import LAYOUTS, Topic, no_topic
 from selfcal.loaders.table import Hints, Table, of_arrays
 
@@ -40,7 +40,8 @@ class _Fields:
         fields = dict(_flat(message))
         stamp = _stamp(fields)
         if not self.names:
-            self.names = [name for name in fields if not name.startswith(_STAMPS)][:MOST_COLUMNS]
+            inner = tuple(f"{name}/" for name in _STAMPS)
+            self.names = [name for name in fields if not name.startswith(inner)][:MOST_COLUMNS]
         self.values.extend(fields.get(name, np.nan) for name in self.names)
         self.stamped = self.stamped and stamp is not None
         self.stamps.append(stamp or 0)
@@ -50,14 +51,20 @@ class _Fields:
         """The table of a topic of this name."""
         values = np.array(self.values).reshape(-1, len(self.names))
         notes = []
-        if not self.stamped:
+        units = {name: self.units.get(name, self.units.get(name.rpartition("/")[2])) for name in self.names}
+        counted = not self.stamped and any(
+            units[name] is not None and name.lower() in ("t", *TIMES) for name in self.names
+        )
+        if not (self.stamped or counted):
             notes.append(f"{topic}: its messages have no stamps: the times at which they were published are taken")
         if any(name.startswith(_BY_CONVENTION) and name not in self.units for name in self.names):
             notes.append(f"{topic}: units by the convention of ROS, rad/s and m/s^2")
-        columns: dict[str, Any] = {"t[ns]": np.array(self.stamps if self.stamped else self.published)}
-        for place, name in enumerate(self.names):
-            unit = self.units.get(name, self.units.get(name.rpartition("/")[2]))
-            columns[name if unit is None else f"{name}[{unit}]"] = values[:, place]
+        columns: dict[str, Any] = {}
+        if not counted:
+            columns["t[ns]"] = np.array(self.stamps if self.stamped else self.published)
+        for place, (name, unit) in enumerate(units.items()):
+            if counted or name.lower() not in ("t", *TIMES):
+                columns[name if unit is None else f"{name}[{unit}]"] = values[:, place]
         return of_arrays(topic, columns, notes=tuple(notes))
 
 
@@ -101,6 +108,8 @@ def read(path: Path, _: Hints) -> list[Table]:
                     if isinstance(one, Topic) and one.kind == kind:
                         one.take(message.data, cdr=channel.message_encoding == "cdr")
                 continue
+            if channel.message_encoding not in ("json", "protobuf"):
+                continue
             if channel.id not in decoders:
                 decoders[channel.id] = _decoder(schema, channel)
             if topic not in found:
@@ -114,17 +123,14 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
-    """What makes a mapping of a message. Raises UserError."""
+    """What makes a mapping of a message in JSON or protobuf."""
     if channel.message_encoding == "json":
         return _json
-    if channel.message_encoding == "protobuf":
-        from mcap_protobuf.decoder import DecoderFactory
+    from mcap_protobuf.decoder import DecoderFactory
 
-        decode = DecoderFactory().decoder_for("protobuf", schema)
-        assert decode is not None
-
-        return lambda data: _messages(decode(data))
-    raise UserError(f"{channel.topic}: messages in {channel.message_encoding} are not read")
+    decode = DecoderFactory().decoder_for("protobuf", schema)
+    assert decode is not None
+    return lambda data: _messages(decode(data))
 
 
 def _json(data: bytes) -> Mapping[str, Any]:

@@ -22,6 +22,9 @@ from selfcal.loaders.table import Hints, Table, of_arrays
 LAYOUTS = {"sensor_msgs/msg/Imu": 37, "sensor_msgs/msg/Temperature": 2}
 #: Place of the first axis, and its unit, by the first letter of the axes here.
 _AXES = {"g": (13, "rad/s"), "a": (25, "m/s^2")}
+_ROS_1 = b"#ROSBAG V2.0"
+#: Places by which messages may lie out of the order of their stamps, as threads write them.
+_DISORDER = 64
 #: Share of accelerations of exactly 0 from which on a topic has the gyro and the accelerometer in turn.
 _IN_TURN = 0.1
 
@@ -47,6 +50,9 @@ class Topic:
         """The table of a topic of this name."""
         values = np.array(self.values).reshape(-1, LAYOUTS[self.kind])
         stamps = np.array(self.stamps, np.int64)
+        order = np.argsort(stamps, kind="stable")
+        if np.abs(order - np.arange(order.size)).max(initial=0) <= _DISORDER:
+            stamps, values = stamps[order], values[order]
         notes: tuple[str, ...] = ()
         columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {}
         if stamps.any():
@@ -85,7 +91,10 @@ def read(path: Path, _: Hints) -> list[Table]:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-    first = path.is_file() and path.read_bytes()[:12] == b"#ROSBAG V2.0"
+    first = False
+    if path.is_file():
+        with path.open("rb") as stream:
+            first = stream.read(len(_ROS_1)) == _ROS_1
     topics: dict[tuple[str, str], Topic] = {}
     with (Reader1 if first else Reader2)(path) as bag:
         kinds = {one.id: one.msgtype for one in bag.connections}

@@ -51,6 +51,8 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
     for name in wanted:
         if name not in sources:
             raise UserError(f"{path}: there is no source '{short(name)}'; {_listed(sources, axes, list(sources))}")
+    if wanted and not any(axes[name] for name in wanted):
+        raise UserError(f"{path}: no axis is in '{short(wanted[0])}'; {_listed(sources, axes, list(sources))}")
     kept, dropped = (list(wanted), []) if wanted else _by_rate(path, sources, axes, sensors)
     repeated = [a for k, name in enumerate(kept) for a in axes[name] for other in kept[:k] if a in axes[other]]
     if repeated:
