@@ -23,6 +23,8 @@ import typer
 from selfcal.cli import app
 from selfcal.diagnosis.extend import HEAD
 from selfcal.verbs.codegen import codegen
+from selfcal.verbs.identify import identify
+from selfcal.verbs.simulate import simulate
 
 from conftest import CASE_RECORDS, SHARED_DATA
 from conftest import COMMAND as PROGRAM
@@ -235,8 +237,8 @@ def shell(command: str, folder: Path) -> str:
 
 
 def test_the_product_is_built_and_prints_as_printed(tmp_path: Path) -> None:
-    """lib/README.md as printed: its program as C99, as C++17 and by CMake, each with the output that stands there. The
-    program itself has no warning."""
+    """lib/README.md as printed: its program as C99, as C++17 and by CMake, each with the output that stands there, and
+    for a Cortex-M4F. The program itself has no warning."""
     for name in ("lib", "tools"):
         (tmp_path / name).symlink_to(ROOT / name)
     document = ROOT / "lib" / "README.md"
@@ -253,6 +255,36 @@ def test_the_product_is_built_and_prints_as_printed(tmp_path: Path) -> None:
     assert_alike(said, shell(feed.replace("./product", "build/product"), tmp_path))
     strict = "-Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror -fsyntax-only -Ilib -Itables product.c"
     shell(f"cc -std=c99 {strict}; c++ -std=c++17 -x c++ {strict}", tmp_path)
+    shell(f"arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -std=c99 {strict}", tmp_path)
+
+
+def test_the_product_computes_what_identify_computes(tmp_path: Path) -> None:
+    """lib/README.md's product on the axes of its log that are not retired, against `identify --gate`. Both interpolate
+    between nodes. selfcal.h bounds that at SELFCAL_OFF_GRID, of each: 0.05 nat of a law, so 0.2 nat of the odds of two
+    and 0.05 of a probability; 0.05 sd of the mean; 3 % of the sd."""
+    axes = ("gx", "gy", "gz", "ax")
+    simulate(None, tmp_path / "all.csv", seed=1)
+    rows = [line.split(",")[: 1 + len(axes)] for line in (tmp_path / "all.csv").read_text().splitlines()]
+    log = tmp_path / "log.csv"
+    log.write_text("".join(",".join(row) + "\n" for row in rows), encoding="utf-8")
+    codegen(None, tmp_path, rate=10.0, axes=axes)
+    program = tmp_path / "product.c"
+    program.write_text(blocks(ROOT / "lib" / "README.md", "c")[0], encoding="utf-8")
+    sources = [program, tmp_path / "selfcal_model.c", *sorted((ROOT / "lib").glob("*.c"))]
+    flags = ["-std=c99", "-O2", "-ffp-contract=off", f"-I{ROOT / 'lib'}", f"-I{tmp_path}"]
+    subprocess.run(["cc", *flags, *map(str, sources), "-lm", "-o", str(tmp_path / "product")], check=True)
+    fed = "".join(" ".join(row[1:]) + "\n" for row in rows[1:])
+    said = subprocess.run([tmp_path / "product"], input=fed, check=True, capture_output=True, text=True).stdout
+    found = identify(log, gate=True)["axes"]
+    row = re.compile(r"(\w+): reason 0, bias (\S+) \+- (\S+), P (\S+) (\S+) (\S+)")
+    told = [match.groups() for line in said.splitlines() if (match := row.fullmatch(line))]
+    assert [axis for axis, *_ in told] == list(axes)
+    for axis, *numbers in told:
+        mean, sd, *chances = map(float, numbers)
+        bias = found[axis]["bias_now"]
+        assert mean == pytest.approx(bias["mean"], abs=2 * 0.05 * sd + 1e-5)
+        assert sd == pytest.approx(bias["sd"], rel=2 * 0.03, abs=1e-5)
+        assert chances == pytest.approx(list(found[axis]["hypotheses"].values()), abs=0.05)
 
 
 def test_the_product_refuses_tables_of_another_rate(tmp_path: Path) -> None:

@@ -53,7 +53,9 @@ class Learning:
         if self.gate.last()["measured"] >= self.learn_at:
             self.learn_at *= 2
             for axis in range(self.axes):
-                self.gate.noise(axis, *self.gate.measured(axis))
+                noise = self.gate.measured(axis)
+                if all(value > 0.0 for value in noise):  # else a record without noise, as of a dead axis
+                    self.gate.noise(axis, *noise)
         return rest
 
 
