@@ -1,42 +1,47 @@
-/* The way of a sample: gate, columns, intake, bank, judgement, changes; and the reports that are due. What a model
- * names lies in front of the bank in the caller's memory. */
+/* The way of a sample: gate, columns, intake, bank, judgement, changes; and the reports that are due. What a pipe
+ * names lies in front of the bank in the caller's memory, whose size selfcal_imu_init() has seen to be enough. */
 #include "imu.h"
 
 #include "selfcal_frames.h"
 
-/* The next part of the caller's memory; NULL: too small. */
-static void *carve(selfcal_imu_t *imu, size_t bytes) {
-    unsigned char *const part = imu->memory;
-    if (part == NULL || bytes > imu->size) {
-        imu->memory = NULL;
+/* The caller's memory, as far as it is not given away. */
+typedef struct {
+    unsigned char *next;
+    size_t left;
+} room_t;
+
+/* The next part; NULL: too small, and none follows. */
+static void *carve(room_t *room, size_t bytes) {
+    unsigned char *const part = room->next;
+    if (part == NULL || bytes > room->left) {
+        room->next = NULL;
         return NULL;
     }
-    imu->memory = part + bytes;
-    imu->size -= bytes;
+    room->next = part + bytes;
+    room->left -= bytes;
     return part;
 }
 
-/* Makes the parts that the model names. */
-static bool carve_all(selfcal_imu_t *imu, const selfcal_model_t *model) {
-    const selfcal_pipe_t *pipe = model->pipe;
-    if (pipe != NULL && pipe->gate_code != NULL) {
-        imu->gate = carve(imu, SELFCAL_PART(sizeof *imu->gate));
+/* Makes the parts that the pipe names. */
+static void carve_all(selfcal_imu_t *imu, room_t *room) {
+    const selfcal_pipe_t *pipe = imu->pipe;
+    if (pipe->gate_code != NULL) {
+        imu->gate = carve(room, SELFCAL_PART(sizeof *imu->gate));
     }
-    if (pipe != NULL && pipe->columns != NULL) {
-        imu->columns = carve(imu, SELFCAL_PART(sizeof *imu->columns));
+    if (pipe->columns != NULL) {
+        imu->columns = carve(room, SELFCAL_PART(sizeof *imu->columns));
     }
-    if (pipe != NULL && pipe->judging != NULL) {
-        imu->judge = carve(imu, SELFCAL_PART(sizeof *imu->judge));
+    if (pipe->judging != NULL) {
+        imu->judge = carve(room, SELFCAL_PART(sizeof *imu->judge));
     }
-    if (pipe != NULL && pipe->changes != NULL) {
-        imu->changes = carve(imu, SELFCAL_CHANGES_SIZE(model->nodes, model->axes));
+    if (pipe->changes != NULL) {
+        imu->changes = carve(room, SELFCAL_CHANGES_SIZE(pipe->model->nodes, pipe->model->axes));
     }
-    return imu->memory != NULL;
 }
 
 /* All but the bank begins anew. */
 static selfcal_status_t begin_all(selfcal_imu_t *imu) {
-    const selfcal_pipe_t *pipe = imu->bank.model->pipe;
+    const selfcal_pipe_t *pipe = imu->pipe;
     selfcal_status_t status = SELFCAL_OK;
     if (imu->columns != NULL) {
         status = pipe->columns->begin(imu);
@@ -54,33 +59,30 @@ static selfcal_status_t begin_all(selfcal_imu_t *imu) {
 }
 
 /* Whether the pipe has all that the tables want. */
-static bool goes_together(const selfcal_model_t *model) {
-    const selfcal_pipe_t *pipe = model->pipe;
-    const bool forms = pipe != NULL && pipe->columns != NULL;
-    if (forms != (model->regressors != NULL)) {
-        return false;
-    }
-    return pipe == NULL || ((pipe->gate_code == NULL || pipe->gate != NULL) && pipe->rate_hz > 0.0F &&
-                            (pipe->changes == NULL || pipe->judging != NULL));
+static bool goes_together(const selfcal_pipe_t *pipe) {
+    return (pipe->columns != NULL) == (pipe->model->regressors != NULL) && pipe->rate_hz > 0.0F &&
+           (pipe->gate_code == NULL || pipe->gate != NULL) && (pipe->changes == NULL || pipe->judging != NULL);
 }
 
-selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_model_t *model, void *memory, size_t size) {
-    if (imu == NULL || model == NULL) {
+selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory, size_t size) {
+    if (imu == NULL || pipe == NULL || pipe->model == NULL || memory == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
     memset(imu, 0, sizeof *imu);
-    if (!goes_together(model)) {
+    imu->pipe = pipe;
+    if (!goes_together(pipe)) {
         return SELFCAL_BAD_MODEL;
     }
-    imu->memory = memory;
-    imu->size = size;
-    if (memory == NULL || (uintptr_t)memory % sizeof(selfcal_wide_t) != 0U || !carve_all(imu, model)) {
-        return memory == NULL ? SELFCAL_BAD_ARGUMENT : SELFCAL_BAD_MEMORY;
+    room_t room = {memory, size};
+    carve_all(imu, &room);
+    if ((uintptr_t)memory % sizeof(selfcal_wide_t) != 0U || room.next == NULL) {
+        return SELFCAL_BAD_MEMORY;
     }
+    imu->memory = room.next;
     for (size_t axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
         imu->bias[axis] = NAN;
     }
-    selfcal_status_t status = selfcal_init(&imu->bank, model, imu->memory, imu->size);
+    selfcal_status_t status = selfcal_init(&imu->bank, pipe->model, imu->memory, room.left);
     status = status == SELFCAL_OK ? begin_all(imu) : status;
     if (status == SELFCAL_OK && imu->gate != NULL && !selfcal_imu_watch(imu, true)) {
         status = SELFCAL_BAD_MODEL;
@@ -94,12 +96,12 @@ void selfcal_imu_keep(selfcal_imu_t *imu, selfcal_kept_t *kept) {
 }
 
 bool selfcal_imu_watch(selfcal_imu_t *imu, bool on) {
-    imu->watching = on && imu->gate != NULL && imu->bank.model->pipe->gate_code->begin(imu);
+    imu->watching = on && imu->gate != NULL && imu->pipe->gate_code->begin(imu);
     return imu->watching;
 }
 
 void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count) {
-    const selfcal_pipe_t *pipe = imu->bank.model->pipe;
+    const selfcal_pipe_t *pipe = imu->pipe;
     if (count == 0U) {
         return;
     }
@@ -117,7 +119,7 @@ void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count) {
 
 /* Something has changed: the last reports of such an axis are of the past. */
 static uint32_t handle_changes(selfcal_imu_t *imu) {
-    const uint32_t changed = imu->bank.model->pipe->changes->handle(imu);
+    const uint32_t changed = imu->pipe->changes->handle(imu);
     for (uint8_t axis = 0; changed != 0U && axis < imu->bank.model->axes; axis++) {
         if ((changed >> axis & 1U) != 0U) {
             imu->reason[axis] = SELFCAL_REASON_NO_REPORT;
@@ -128,7 +130,7 @@ static uint32_t handle_changes(selfcal_imu_t *imu) {
 
 uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const float channels[], const float side[]) {
     const selfcal_model_t *model = imu->bank.model;
-    const selfcal_pipe_t *pipe = model->pipe;
+    const selfcal_pipe_t *pipe = imu->pipe;
     const float *values = imu->columns != NULL ? pipe->columns->form(imu, reading, channels) : NULL;
     uint32_t found = 0;
     if (imu->watching && !pipe->gate_code->rests(imu, reading)) {
@@ -185,7 +187,7 @@ static void take_report(selfcal_imu_t *imu) {
     const uint8_t axis = imu->report.axis;
     selfcal_adequacy_state_t state = SELFCAL_NOT_JUDGED;
     if (imu->judge != NULL) {
-        state = imu->bank.model->pipe->judging->report(imu);
+        state = imu->pipe->judging->report(imu);
     }
     imu->reason[axis] = selfcal_reason(imu->bank.model, &imu->report, state);
     imu->bias[axis] = imu->report.bias_mean;
@@ -203,7 +205,7 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
     if (imu->kept != NULL && !imu->work.gathered) {
         imu->kept->gathered_at = imu->kept->passed - imu->bank.position;
     }
-    const selfcal_status_t status = imu->columns != NULL ? imu->bank.model->pipe->columns->step(imu)
+    const selfcal_status_t status = imu->columns != NULL ? imu->pipe->columns->step(imu)
                                                          : selfcal_report_step(&imu->work, &imu->report);
     if (status == SELFCAL_BUSY) {
         return status;
@@ -257,7 +259,7 @@ selfcal_status_t selfcal_imu_shift(selfcal_imu_t *imu, uint8_t axis, float amoun
     }
     imu->bias[axis] += amount;
     if (imu->watching) {
-        imu->bank.model->pipe->gate_code->shift(imu, axis, amount);
+        imu->pipe->gate_code->shift(imu, axis, amount);
     }
     if (imu->kept != NULL) {
         selfcal_report_t *report = &imu->kept->report[axis];
@@ -281,7 +283,7 @@ selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu) {
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         shifted[axis] = selfcal_shifted(&imu->bank, axis);
     }
-    const selfcal_status_t status = selfcal_init(&imu->bank, model, imu->memory, imu->size);
+    const selfcal_status_t status = selfcal_init(&imu->bank, model, imu->memory, SIZE_MAX);
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         (void)selfcal_shift(&imu->bank, axis, shifted[axis]);
         imu->bias[axis] = NAN;
@@ -301,8 +303,7 @@ selfcal_status_t selfcal_imu_save(const selfcal_imu_t *imu, selfcal_write_t writ
 
 selfcal_status_t selfcal_imu_restore(selfcal_imu_t *imu, const void *snapshot, size_t length, uint64_t gap) {
     selfcal_t *bank = &imu->bank;
-    const selfcal_status_t status =
-        selfcal_restore(bank, bank->model, imu->memory, imu->size, snapshot, length);
+    const selfcal_status_t status = selfcal_restore(bank, imu->pipe->model, imu->memory, SIZE_MAX, snapshot, length);
     if (status == SELFCAL_OK) {
         /* Up to the start of a bank interval: it holds whole windows of the gate. */
         (void)selfcal_moving(bank);

@@ -27,10 +27,6 @@ static selfcal_reason_t reason_of(const selfcal_imu_t *imu, uint8_t axis, bool i
     return is_faulty ? SELFCAL_REASON_BAD_SAMPLE : stuck(&imu->bank, axis) ? SELFCAL_REASON_STUCK : known;
 }
 
-static float rate_of(const selfcal_model_t *model) {
-    return model->pipe != NULL ? model->pipe->rate_hz : (float)model->block / model->dt_s;
-}
-
 bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
     selfcal_kept_t *kept = imu->kept;
     const selfcal_model_t *model = imu->bank.model;
@@ -44,11 +40,11 @@ bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
         float bias = NAN, sd = NAN;
         if (reason == SELFCAL_REASON_NONE || reason == SELFCAL_REASON_INADEQUATE ||
             reason == SELFCAL_REASON_NOT_IDENTIFIED) {
-            const float elapsed_s = (float)(kept->passed - kept->rests_on[axis]) / rate_of(model);
+            const float elapsed_s = (float)(kept->passed - kept->rests_on[axis]) / imu->pipe->rate_hz;
             (void)selfcal_predict(&kept->report[axis], model, elapsed_s, &bias, &sd);
         }
         if (imu->columns != NULL) { /* the report's bias holds for the values at its end */
-            bias = model->pipe->columns->moved(imu, axis, bias);
+            bias = imu->pipe->columns->moved(imu, axis, bias);
         }
         corrected->value[axis] = kept->reading[axis] - bias;
         corrected->sd[axis] = sd;

@@ -4,7 +4,7 @@
 static bool begin_gate(selfcal_imu_t *imu) {
     imu->gate->learn_at = SELFCAL_GATE_MEASURED_MIN;
     imu->gate->at_once = 0U;
-    return selfcal_gate_init(&imu->gate->gate, imu->bank.model->pipe->gate) == SELFCAL_OK;
+    return selfcal_gate_init(&imu->gate->gate, imu->pipe->gate) == SELFCAL_OK;
 }
 
 static void skip_gate(selfcal_imu_t *imu, uint64_t count) {

@@ -16,7 +16,7 @@ static selfcal_adequacy_state_t report(selfcal_imu_t *imu) {
     const uint8_t axis = imu->report.axis;
     float used[SELFCAL_REGRESSORS_MAX] = {0.0F};
     if (imu->columns != NULL) {
-        model->pipe->columns->used(imu, axis, used);
+        imu->pipe->columns->used(imu, axis, used);
     }
     selfcal_adequacy_report(&self->adequacy, model, &imu->report, used);
     self->judged[axis] = selfcal_judgement(&self->adequacy, &imu->bank, axis);

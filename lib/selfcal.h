@@ -257,25 +257,6 @@ typedef struct {
     bool variance_changes;
 } selfcal_handling_t;
 
-/* What selfcal_imu_t has beside the bank. Each `code` is NULL where the model has no such part. */
-typedef struct selfcal_gate_code selfcal_gate_code_t;
-extern const selfcal_gate_code_t selfcal_gate_code;
-typedef struct selfcal_columns_code selfcal_columns_code_t;
-extern const selfcal_columns_code_t selfcal_columns_code;
-typedef struct selfcal_judging_code selfcal_judging_code_t;
-extern const selfcal_judging_code_t selfcal_judging_code;
-typedef struct selfcal_changes_code selfcal_changes_code_t;
-extern const selfcal_changes_code_t selfcal_changes_code;
-typedef struct selfcal_gate_config selfcal_gate_config_t;
-typedef struct {
-    float rate_hz;                         /* of the samples */
-    const selfcal_gate_config_t *gate;     /* of gate_code */
-    const selfcal_gate_code_t *gate_code;  /* keeps motion out */
-    const selfcal_columns_code_t *columns; /* forms the values of the regressors: with them, and only then */
-    const selfcal_judging_code_t *judging; /* judges the model */
-    const selfcal_changes_code_t *changes; /* handles steps and changes of the noise; with judging */
-} selfcal_pipe_t;
-
 typedef struct {
     uint32_t id;        /* checksum of the tables: a snapshot or a monitor tells models apart by it */
     float dt_s;         /* bank interval, 1e-6 to 1e6 */
@@ -289,8 +270,28 @@ typedef struct {
     const selfcal_forgetting_t *forgetting; /* likewise */
     const selfcal_states_code_t *states;    /* &selfcal_states_code if a law is a sum, else NULL */
     const selfcal_handling_t *handling;     /* NULL: nothing is handled, and none of its cost */
-    const selfcal_pipe_t *pipe;             /* for selfcal_imu_t; NULL: the bank alone */
 } selfcal_model_t;
+
+/* A model with what selfcal_imu_t has beside the bank; NULL: no such part. It stands by itself, so that a program which
+ * takes the bank alone does not link the parts. */
+typedef struct selfcal_gate_code selfcal_gate_code_t;
+extern const selfcal_gate_code_t selfcal_gate_code;
+typedef struct selfcal_columns_code selfcal_columns_code_t;
+extern const selfcal_columns_code_t selfcal_columns_code;
+typedef struct selfcal_judging_code selfcal_judging_code_t;
+extern const selfcal_judging_code_t selfcal_judging_code;
+typedef struct selfcal_changes_code selfcal_changes_code_t;
+extern const selfcal_changes_code_t selfcal_changes_code;
+typedef struct selfcal_gate_config selfcal_gate_config_t;
+typedef struct {
+    const selfcal_model_t *model;
+    float rate_hz;                         /* of the samples */
+    const selfcal_gate_config_t *gate;     /* of gate_code */
+    const selfcal_gate_code_t *gate_code;  /* keeps motion out */
+    const selfcal_columns_code_t *columns; /* forms the values of the regressors: with them, and only then */
+    const selfcal_judging_code_t *judging; /* judges the model */
+    const selfcal_changes_code_t *changes; /* handles steps and changes of the noise; with judging */
+} selfcal_pipe_t;
 
 /* ------------------------------------------------------------------------------------------------------------- bank */
 
@@ -934,7 +935,7 @@ uint16_t selfcal_crc12(const uint8_t *data, size_t length);
 /* ------------------------------------------------------------------------------------------------------------ pipe
  * The way of a sample in one call: gate, columns, bank, judgement, changes, whatever the model names.
  *
- *     selfcal_imu_init(&imu, &selfcal_model, memory, sizeof memory);
+ *     selfcal_imu_init(&imu, &selfcal_model_pipe, memory, sizeof memory);
  *     each sample:  selfcal_imu_sample(&imu, reading, NULL, NULL);
  *     now and then: selfcal_imu_ask(&imu, SELFCAL_ALL_AXES);
  *     idle:         selfcal_imu_work(&imu);
@@ -943,10 +944,10 @@ uint16_t selfcal_crc12(const uint8_t *data, size_t length);
 
 typedef struct selfcal_imu selfcal_imu_t; /* of its members, `bank`, `computing` and `gate` may be looked at */
 
-/* Begin over `memory`, aligned to 8 bytes. `size`: SELFCAL_MODEL_IMU_BYTES of the generated header. Model and memory
+/* Begin over `memory`, aligned to 8 bytes. `size`: SELFCAL_MODEL_IMU_BYTES of the generated header. Tables and memory
  * must outlive the use. A gate that the model has watches from the first sample on. Fails as selfcal_init() does.
- * SELFCAL_BAD_MODEL also if the parts that the model names do not go together. */
-selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_model_t *model, void *memory, size_t size);
+ * SELFCAL_BAD_MODEL also if the parts that the pipe names do not go together. */
+selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory, size_t size);
 
 /* From here on the last report of each axis is kept, for selfcal_imu_report() and selfcal_imu_corrected(). Without it
  * the last report of all. `kept` must outlive the use. */

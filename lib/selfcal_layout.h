@@ -563,14 +563,14 @@ struct selfcal_kept {
 };
 
 struct selfcal_imu {
-    /* in the caller's memory; NULL: the model does not name it */
+    /* in the caller's memory; NULL: the pipe does not name it */
     selfcal_watched_t *gate;
     selfcal_imu_columns_t *columns;
     selfcal_imu_judge_t *judge;
     selfcal_changes_t *changes; /* with what was learned before a change behind it */
     selfcal_kept_t *kept;       /* or NULL */
+    const selfcal_pipe_t *pipe;
     void *memory;               /* of the bank */
-    size_t size;
     uint16_t due;   /* reports, a bit for each axis */
     bool watching;  /* the gate is on */
     bool computing; /* a report is worked out */

@@ -68,18 +68,6 @@ static const selfcal_hypothesis_t hypotheses[] = {
     {.law = &law_gauss_markov, .ln_probability = -1.09861229F, .rho = &grid_16, .alpha = &grid_12},
 };
 
-const selfcal_gate_config_t selfcal_model_gate = {
-    SELFCAL_MODEL_AXES, 273U, 0.0001F, 16U, 240U, 20U,
-    {2.86216701F, 2.86216701F, 2.86216701F, 0.572433402F, 0.572433402F, 0.572433402F}, {true, true, true, false, false, false},
-};
-
-static const selfcal_pipe_t pipe = {
-    SELFCAL_MODEL_RATE_HZ, &selfcal_model_gate, &selfcal_gate_code,
-    NULL,
-    SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,
-    SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,
-};
-
 const char *const selfcal_model_axis_name[] = {"gx", "gy", "gz", "ax", "ay", "az"};
 
 const selfcal_model_t selfcal_model = {
@@ -91,5 +79,16 @@ const selfcal_model_t selfcal_model = {
     NULL,
     NULL,
     NULL,
-    &pipe,
+};
+
+const selfcal_gate_config_t selfcal_model_gate = {
+    SELFCAL_MODEL_AXES, 273U, 0.0001F, 16U, 240U, 20U,
+    {2.86216701F, 2.86216701F, 2.86216701F, 0.572433402F, 0.572433402F, 0.572433402F}, {true, true, true, false, false, false},
+};
+
+const selfcal_pipe_t selfcal_model_pipe = {
+    &selfcal_model, SELFCAL_MODEL_RATE_HZ, &selfcal_model_gate, &selfcal_gate_code,
+    NULL,
+    SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,
+    SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,
 };

@@ -38,6 +38,7 @@
 #define SELFCAL_MODEL_GATE 1
 
 extern const selfcal_model_t selfcal_model;
+extern const selfcal_pipe_t selfcal_model_pipe;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 #if SELFCAL_MODEL_CHANNELS > 0
 extern const char *const selfcal_model_channel_name[SELFCAL_MODEL_CHANNELS];

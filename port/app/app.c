@@ -15,7 +15,7 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
     app->port = port;
     app->period_ms = period_ms;
     app->due_ms = period_ms;
-    const selfcal_status_t status = selfcal_imu_init(&app->imu, &selfcal_model, app->memory, sizeof app->memory);
+    const selfcal_status_t status = selfcal_imu_init(&app->imu, &selfcal_model_pipe, app->memory, sizeof app->memory);
     if (status != SELFCAL_OK) {
         return status;
     }

@@ -39,13 +39,13 @@ void setUp(void)
     state = 20261126U;
     gate_config = selfcal_model_gate;
     gate_config.window = WINDOW;
-    pipe = *selfcal_model.pipe;
+    pipe = selfcal_model_pipe;
+    pipe.model = &model;
     pipe.rate_hz = (float)BLOCK;
     pipe.gate = &gate_config;
     model = selfcal_model;
     model.block = BLOCK;
     model.dt_s = 1.0F;
-    model.pipe = &pipe;
 }
 
 void tearDown(void) {}
@@ -66,7 +66,7 @@ static uint32_t draw_sample(uint32_t at, float reading[])
 static void begin(void)
 {
     memset(&parts, 0, sizeof parts);
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
     selfcal_imu_keep(&imu, &kept);
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&parts.bank, &model, memory[1], sizeof memory[1]));
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_init(&parts.gate, &gate_config));
@@ -227,7 +227,7 @@ static void test_a_restored_pipe_goes_on_at_the_start_of_an_interval(void)
     const uint64_t before = selfcal_counters(&imu.bank)->samples;
     saved_bytes = 0;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_save(&imu, put, NULL));
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_restore(&imu, saved, saved_bytes, 1001U));
     TEST_ASSERT_EQUAL(0U, imu.bank.position);
     TEST_ASSERT_TRUE(before == selfcal_counters(&imu.bank)->samples);
@@ -255,27 +255,27 @@ static void test_what_the_sensor_adds_moves_with_it(void)
 static void test_what_does_not_go_together_is_refused(void)
 {
     const size_t least = SELFCAL_MODEL_IMU_BYTES;
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], least));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, memory[0], least - 8U));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, memory[0], 0U));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &model, (char *)memory[0] + 4, least));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_init(&imu, &model, NULL, least));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], least));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &pipe, memory[0], least - 8U));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &pipe, memory[0], 0U));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &pipe, (char *)memory[0] + 4, least));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_init(&imu, &pipe, NULL, least));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_init(&imu, NULL, memory[0], least));
     model.regressors = &regressors; /* nobody forms their values */
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
     model.regressors = NULL;
     pipe.columns = &selfcal_columns_code;
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
     pipe.columns = NULL;
     pipe.changes = &selfcal_changes_code; /* the model handles nothing */
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
 }
 
 /* The bank alone: nothing is watched or judged. */
-static void test_a_model_without_a_pipe_is_a_bank(void)
+static void test_a_pipe_without_parts_is_a_bank(void)
 {
-    model.pipe = NULL;
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &model, memory[0], SELFCAL_MODEL_BYTES));
+    pipe = (selfcal_pipe_t){.model = &model, .rate_hz = (float)BLOCK};
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], SELFCAL_MODEL_BYTES));
     TEST_ASSERT_FALSE(selfcal_imu_watch(&imu, true));
     for (uint32_t at = 0; at < 100U * BLOCK; at++) {
         float reading[AXES];
@@ -304,6 +304,6 @@ int main(void)
     RUN_TEST(test_a_restored_pipe_goes_on_at_the_start_of_an_interval);
     RUN_TEST(test_what_the_sensor_adds_moves_with_it);
     RUN_TEST(test_what_does_not_go_together_is_refused);
-    RUN_TEST(test_a_model_without_a_pipe_is_a_bank);
+    RUN_TEST(test_a_pipe_without_parts_is_a_bank);
     return UNITY_END();
 }

@@ -15,7 +15,7 @@ static const selfcal_hypothesis_t all_laws[] = {
     {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
     {&named_law[RANDOM_WALK], 0.0F, &grid, NULL, NULL}};
 static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL, NULL,
-                                     NULL, NULL};
+                                     NULL};
 static const char *const names[] = {"ay", "gx"};
 enum { GX = 0x201, AY = 0x205, GX_H0 = 0x220, AY_H0 = 0x240, GX_COEFFICIENTS = 0x20A }; /* of node 0 */
 

@@ -213,6 +213,7 @@ def _header(model: Model, tables: Tables, start: str) -> str:
 #define SELFCAL_MODEL_GATE {int(gate_table(model, tables) is not None)}
 
 extern const selfcal_model_t selfcal_model;
+extern const selfcal_pipe_t selfcal_model_pipe;
 extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 #if SELFCAL_MODEL_CHANNELS > 0
 extern const char *const selfcal_model_channel_name[SELFCAL_MODEL_CHANNELS];
@@ -266,8 +267,6 @@ def _source(model: Model, tables: Tables) -> str:
     if handling != NOT_HANDLED:
         given = ", ".join([_f(handling.outlier_sd), *(str(b).lower() for b in handling.as_tuple[1:])])
         parts += [f"static const selfcal_handling_t handling = {{{given}}};", ""]
-    parts += _gate(model, tables)
-    parts += _pipe(model, tables)
     names = ", ".join(f'"{axis.name}"' for axis in tables.axes)
     channels = ", ".join(f'"{name}"' for name, _ in tables.channels)
     parts += [
@@ -283,11 +282,10 @@ def _source(model: Model, tables: Tables) -> str:
         f"    {'&forgetting' if tables.half_life_s else 'NULL'},",
         f"    {'&selfcal_states_code' if tables.term_nodes else 'NULL'},",
         f"    {'&handling' if handling != NOT_HANDLED else 'NULL'},",
-        "    &pipe,",
         "};",
         "",
     ]
-    return "\n".join(parts)
+    return "\n".join([*parts, *_gate(model, tables), *_pipe(model, tables)])
 
 
 def _f(value: float) -> str:
@@ -369,8 +367,8 @@ def _gate(model: Model, tables: Tables) -> list[str]:
 def _pipe(model: Model, tables: Tables) -> list[str]:
     gate = "&selfcal_model_gate, &selfcal_gate_code" if gate_table(model, tables) is not None else "NULL, NULL"
     return [
-        "static const selfcal_pipe_t pipe = {",
-        f"    SELFCAL_MODEL_RATE_HZ, {gate},",
+        "const selfcal_pipe_t selfcal_model_pipe = {",
+        f"    &selfcal_model, SELFCAL_MODEL_RATE_HZ, {gate},",
         f"    {'&selfcal_columns_code' if tables.regressors else 'NULL'},",
         "    SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,",
         "    SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,",
