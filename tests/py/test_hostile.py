@@ -296,7 +296,7 @@ def test_headers_that_take_long(tmp_path: Path, line: str) -> None:
 @pytest.mark.parametrize("name", ["log.rda", "log.mat"])
 def test_a_bomb_of_arrays(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """More unpacked than is allowed is not unpacked."""
-    monkeypatch.setattr("selfcal.array_files.MOST_UNPACKED_BYTES", 10_000)
+    monkeypatch.setattr("selfcal.loaders.table.MOST_UNPACKED_BYTES", 10_000)
     path = tmp_path / name
     if name == "log.mat":
         savemat(path, {"gx": np.zeros(100_000)}, do_compression=True)
