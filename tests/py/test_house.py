@@ -88,3 +88,36 @@ def test_a_user_in_cpp17(product: Path) -> None:
     subprocess.run(["c++", *flags, "user.cpp", *objects, "-lm", "-o", "user"], cwd=product, check=True)
     told = subprocess.run([product / "user"], check=True, capture_output=True, text=True).stdout
     assert float(told) == pytest.approx(0.5, abs=0.02)
+
+
+PIPE = """#include "selfcal_model.h"
+static double memory[SELFCAL_MODEL_IMU_BYTES / sizeof(double) + 1U];
+static selfcal_imu_t imu;
+int main(void) {
+    float reading[SELFCAL_MODEL_AXES] = {0.0F};
+    if (selfcal_imu_init(&imu, &selfcal_model_pipe, memory, sizeof memory) != SELFCAL_OK) return 1;
+    return (int)selfcal_imu_sample(&imu, reading, 0, 0);
+}
+"""
+OPTIONAL = {"selfcal_gate_push", "selfcal_adequacy_push", "selfcal_changes_handle", "selfcal_form"}
+
+
+def test_only_what_is_named_is_linked(product: Path) -> None:
+    """The bank alone, the pipe of a model with a gate, and the same without a judgement: by nm."""
+    (product / "pipe.c").write_text(PIPE)
+    (product / "bank.c_").write_text(USER)
+    sections = ["-std=c99", "-O1", "-ffunction-sections", "-fdata-sections"]
+    sources = [path.name for path in sorted(product.glob("*.c")) if path.name not in ("pipe.c", "selfcal_model.c")]
+    subprocess.run(["cc", *sections, "-c", *sources], cwd=product, check=True)
+    objects = [f"{Path(name).stem}.o" for name in sources]
+    for program, flag, named in (
+        (["-x", "c++", "bank.c_"], "", set()),
+        (["pipe.c"], "", {"selfcal_gate_push", "selfcal_adequacy_push"}),
+        (["pipe.c"], "-DSELFCAL_MODEL_JUDGED=0", {"selfcal_gate_push"}),
+    ):
+        flags = [flag] if flag else []
+        subprocess.run(["cc", *sections, *flags, "-c", "selfcal_model.c"], cwd=product, check=True)
+        linked = ["-x", "none", *objects, "selfcal_model.o", "-Wl,--gc-sections", "-lm", "-lstdc++", "-o", "program"]
+        subprocess.run(["cc", "-O1", *flags, *program, *linked], cwd=product, check=True)
+        symbols = subprocess.run(["nm", "program"], cwd=product, check=True, capture_output=True, text=True).stdout
+        assert OPTIONAL & {line.split()[-1] for line in symbols.splitlines()} == named
