@@ -35,6 +35,23 @@ def noise(random: np.random.Generator, law: str, n: int, rate: float) -> Array:
     return np.asarray(white + lfilter([1.0], [1.0, -phi], kick))
 
 
+def of_one(random: np.random.Generator, n: int, walk: float = 0.01, time_s: float = 250.0) -> Array:
+    """[n] at 1 Hz: white noise of 1 beside a walk or a Gauss-Markov drift of 0.3."""
+    white = random.standard_normal(n)
+    if random.random() < 0.5:
+        return white + walk * random.standard_normal(n).cumsum()
+    keep, drift, x = math.exp(-1.0 / time_s), np.zeros(n), 0.3 * random.standard_normal()
+    for k in range(n):
+        drift[k] = x
+        x = keep * x + 0.3 * math.sqrt(1.0 - keep**2) * random.standard_normal()
+    return np.asarray(white + drift)
+
+
+def fitted(y: Array) -> State:
+    """The state of a gyro at 1 Hz."""
+    return State("gx", "deg/s", y, 1.0, 0.0, np.ones(y.size)).refit()
+
+
 def recorded(y: Array, rate: float) -> tuple[State, Record]:
     level = float(np.median(y))
     state = State("gx", "deg/s", y - level, 1.0 / rate, level, np.ones(y.size)).refit()

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from drifts import fitted, of_one
 from scipy.special import logsumexp
 
 from selfcal.diagnosis import loop, score
@@ -17,28 +18,11 @@ from selfcal.diagnosis.finding import HeldOut
 from selfcal.diagnosis.fit import passed
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, Regressor, State
-from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.diagnosis.statemodel import Terms
 
 from conftest import case_records
 
 SAMPLES = 3000
-
-
-def drawn(random: np.random.Generator, n: int) -> Array:
-    """White noise of 1 beside a walk or a Gauss-Markov drift."""
-    white = random.standard_normal(n)
-    if random.random() < 0.5:
-        found: Array = white + 0.012 * random.standard_normal(n).cumsum()
-        return found
-    keep, drift, x = math.exp(-1.0 / 300.0), np.zeros(n), 0.3 * random.standard_normal()
-    for k in range(n):
-        drift[k] = x
-        x = keep * x + 0.3 * math.sqrt(1.0 - keep**2) * random.standard_normal()
-    return np.asarray(white + drift)
-
-
-def fitted(y: Array) -> State:
-    return State("gx", "deg/s", y, 1.0, 0.0, np.ones(y.size)).refit()
 
 
 def record_of(*states: State) -> Record:
@@ -59,7 +43,7 @@ def test_the_evidence_is_that_of_the_dense_covariance() -> None:
     Its prior of the bias is wide instead of flat, which leaves 1e-4; the filter's steady gain leaves as much."""
     random = np.random.default_rng(61)
     n, rho, size = 70, 0.3, 0.7
-    y = drawn(random, n) + 3.0
+    y = of_one(random, n, 0.012, 300.0) + 3.0
     column = np.where(np.arange(n) < 40, 0.0, 1.0)
     state = State("gx", "deg/s", y, 1.0, 0.0, np.ones(n), (Regressor("c", "step", column, "1", {}),))
     marks = [30, 50, 70]
@@ -89,7 +73,7 @@ def test_a_right_step_gains_and_a_false_one_does_not(late: bool) -> None:
     random = np.random.default_rng([62, late])
     records, right, false = case_records(12, 100), [], []
     for _ in range(records):
-        y = drawn(random, SAMPLES)
+        y = of_one(random, SAMPLES, 0.012, 300.0)
         place = round(SAMPLES * (random.uniform(0.6, 0.9) if late else random.uniform(0.1, 0.4)))
         for size, gains in ((2.5, right), (0.0, false)):
             state = fitted(y + size * step.raised(SAMPLES, place))
@@ -111,7 +95,7 @@ def test_a_right_step_gains_and_a_false_one_does_not(late: bool) -> None:
 def test_samples_that_one_model_leaves_out_are_scored_by_neither() -> None:
     """Wild samples are drawn so large that one of them alone would decide the score."""
     random = np.random.default_rng(63)
-    y = drawn(random, SAMPLES)
+    y = of_one(random, SAMPLES, 0.012, 300.0)
     y[random.choice(SAMPLES, 12, replace=False)] += 300.0
     state = fitted(y)
     kept = np.where(np.abs(y) > 100.0, np.nan, y)
@@ -134,9 +118,9 @@ def test_what_harms_has_no_name(constant: bool) -> None:
     random = np.random.default_rng([64, constant])
     records, named = case_records(2, 40), 0
     for _ in range(records):
-        other = drawn(random, SAMPLES)
+        other = of_one(random, SAMPLES, 0.012, 300.0)
         size = np.where(np.arange(SAMPLES) < SAMPLES // 2, 0.4, -0.1)
-        y = drawn(random, SAMPLES) + (0.15 if constant else size) * (other - other.mean())
+        y = of_one(random, SAMPLES, 0.012, 300.0) + (0.15 if constant else size) * (other - other.mean())
         states = {
             name: State(name, "deg/s", values - values.mean(), 1.0, 0.0, np.ones(SAMPLES))
             for name, values in (("gx", y), ("gy", other))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drifts import fitted, of_one
 from scipy.stats import binom
 
 from selfcal.checks import against
@@ -30,23 +31,6 @@ from conftest import case_records
 SAMPLES = 1500
 
 
-def drawn(random: np.random.Generator, n: int) -> Array:
-    """White noise of 1 beside a walk or a Gauss-Markov drift."""
-    white = random.standard_normal(n)
-    if random.random() < 0.5:
-        found: Array = white + 0.01 * random.standard_normal(n).cumsum()
-        return found
-    keep, drift, x = math.exp(-1.0 / 250.0), np.zeros(n), 0.3 * random.standard_normal()
-    for k in range(n):
-        drift[k] = x
-        x = keep * x + 0.3 * math.sqrt(1.0 - keep**2) * random.standard_normal()
-    return np.asarray(white + drift)
-
-
-def fitted(y: Array) -> State:
-    return State("gx", "deg/s", y, 1.0, 0.0, np.ones(y.size)).refit()
-
-
 def record_of(state: State, channels: dict[str, Array] | None = None) -> Record:
     return Record(1.0, {"gx": state}, channels or {}, {}, np.ones(state.y.size, bool))
 
@@ -60,7 +44,7 @@ def test_the_family_is_no_surer_than_it_states() -> None:
     """Of records that the model made, no more than a share p has a probability below p."""
     random = np.random.default_rng(51)
     records = case_records(12, 300)
-    p = np.array([judged(fitted(drawn(random, SAMPLES)), seed=k).p for k in range(records)])
+    p = np.array([judged(fitted(of_one(random, SAMPLES)), seed=k).p for k in range(records)])
     for level in (0.05, 0.2):
         count = int((p < level).sum())
         print(f"family: {count} of {records} below {level}")
@@ -95,7 +79,7 @@ def test_the_coherence_with_a_channel_needs_no_form(hidden: bool) -> None:
     records = case_records(4, 100)
     for _ in range(records):
         supply = random.standard_normal(n)
-        y = drawn(random, n)
+        y = of_one(random, n)
         lagged, x = np.zeros(n), 0.0
         for k in range(n):  # a first-order lag of 20 samples
             x += (supply[k] - x) / 20.0
@@ -135,7 +119,7 @@ def test_a_check_of_identify_is_a_finding() -> None:
 
 
 def result(random: np.random.Generator, look: Look | None, unfinished: str = "") -> Diagnosed:
-    state = fitted(drawn(random, 400))
+    state = fitted(of_one(random, 400))
     findings = [] if look is None else [Finding(look, 1, state, state)]
     return Diagnosed(state, state, record_of(state), findings, unfinished=unfinished)
 
@@ -160,7 +144,7 @@ def test_neither_look_overrules_the_other() -> None:
 
 
 def test_the_allan_deviation_is_the_picture_of_its_statistic() -> None:
-    state = fitted(drawn(np.random.default_rng(56), 400))
+    state = fitted(of_one(np.random.default_rng(56), 400))
     for name, title in (
         ("allan_of_64_samples", "Allan deviation"),
         ("allan_64s", "Allan deviation"),
