@@ -334,50 +334,129 @@ def test_a_killed_monitor_leaves_a_log_that_can_be_read(tmp_path: Path, suffix: 
 
 
 CANDUMP_L = "({}) can0 200#C02709000080B588\n"
+CSV_HEAD = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
 
 
 @pytest.mark.parametrize(
-    ("suffix", "head", "line", "stamp", "said"),
+    ("suffix", "head", "line", "stamp"),
     [
-        (".log", "", CANDUMP_L, "nan", "frame {} has the time stamp nan"),
-        (".log", "", CANDUMP_L, "-inf", "frame {} has the time stamp -inf"),
-        (".log", "", CANDUMP_L, "1e400", "frame {} has the time stamp inf"),
-        (".log", "", CANDUMP_L, "noon", "frame {} cannot be read"),
-        (".log", "", " ({})  can0  200   [8]  C0 27 09 00 00 80 B5 88\n", "nan", "line {} is no frame"),
-        (
-            ".csv",
-            "timestamp,arbitration_id,extended,remote,error,dlc,data\n",
-            "{},0x200,0,0,0,8,wCcJAACAtYg=\n",
-            "nan",
-            "frame {} has the time stamp nan",
-        ),
+        (".log", "", CANDUMP_L, "nan"),
+        (".log", "", CANDUMP_L, "-inf"),
+        (".log", "", CANDUMP_L, "1e400"),
+        (".log", "", CANDUMP_L, "noon"),
+        (".log", "", " ({})  can0  200   [8]  C0 27 09 00 00 80 B5 88\n", "nan"),
+        (".csv", CSV_HEAD, "{},0x200,0,0,0,8,wCcJAACAtYg=\n", "nan"),
     ],
 )
-def test_a_stamp_that_is_no_time_is_named(
-    suffix: str, head: str, line: str, stamp: str, said: str, tmp_path: Path
-) -> None:
-    """At once in the first frame. Later it is left out and counted, or it is damage after the frames before it. A clean
-    log has neither."""
+def test_a_stamp_that_is_no_time_is_left_out(suffix: str, head: str, line: str, stamp: str, tmp_path: Path) -> None:
+    """Its line is counted, the first one too. A clean log has none, and one of none but such is refused."""
     log = tmp_path / f"frames{suffix}"
     stamps = ["1700000000.1", "1700000000.2", "1700000000.4", "1700000000.5"]
-    log.write_text(head + "".join(map(line.format, stamps)), encoding="ascii")
-    with FrameLog(log) as clean:
-        while not clean.closed:
-            clean.recv(1.0)
-        assert clean.damage == ""
-    log.write_text(head + "".join(map(line.format, [stamp, *stamps])), encoding="ascii")
-    with pytest.raises(UserError) as caught:
+    for place in (None, 0, 3, 4):
+        made = [*stamps]
+        if place is not None:
+            made.insert(place, stamp)
+        log.write_text(head + "".join(map(line.format, made)), encoding="ascii")
+        assert len(frames_of(log)) == 4
+        assert malformed(log) == (place is not None)
+    log.write_text(head + 3 * line.format(stamp), encoding="ascii")
+    with pytest.raises(UserError, match=r"there is no frame in its 3 lines$"):
         FrameLog(log)
-    assert said.format(1) in str(caught.value)
-    log.write_text(head + "".join(map(line.format, [*stamps[:3], stamp, *stamps[3:]])), encoding="ascii")
-    with FrameLog(log) as damaged:
-        frames = []
-        while not damaged.closed:
-            frames.append(damaged.recv(1.0))
-        if suffix == ".log":
-            assert len(frames) == 4 and damaged.malformed == 1 and not damaged.damage
-        else:
-            assert len(frames) == 3 and said.format(4) in damaged.damage
+
+
+# ------------------------------------------------------------------------------------------------------- damaged lines
+
+
+def malformed(path: Path) -> int:
+    with FrameLog(path) as log:
+        while not log.closed:
+            log.recv(1.0)
+        return log.malformed
+
+
+def rows_of(folder: Path, form: str, sent: list[can.Message]) -> tuple[list[str], list[str]]:
+    """Header and frames of a log of text, a line each; the header is all before the first frame."""
+    if form == "view.log":
+        return [], [screen(frame, "stamps") for frame in sent]
+    if form == "gvret.csv":
+        data = [",".join(f"{byte:02X}" for byte in frame.data) for frame in sent]
+        rows = [f"0,{frame.arbitration_id:08X},false,Rx,0,8,{data[k]}," for k, frame in enumerate(sent)]
+        return ["Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8"], rows
+    log = folder / form
+    with can.Logger(str(log)) as writer:
+        for frame in sent:
+            writer(frame)
+    rows = [row for row in log.read_text().splitlines() if "TriggerBlock" not in row or row.startswith("Begin")]
+    return rows[: -len(sent)], rows[-len(sent) :]
+
+
+FORMS = ("frames.asc", "frames.csv", "frames.log", "frames.trc", "view.log", "gvret.csv")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_damaged_lines_are_counted_and_left_out(form: str, tmp_path: Path) -> None:
+    """Of every form of text: each frame whose line is whole comes, in order. Truth: the lines that the test spoils, by
+    bytes that no form has, and by cuts amid the identifier; the first and the last line are among them."""
+    chance = random.Random(form)
+    sent = [message(line) for line in lines(stream(46, 2))]
+    for k, frame in enumerate(sent):
+        frame.timestamp = 100.0 + k / 50.0
+    head, rows = rows_of(tmp_path, form, sent)
+    assert len(rows) == len(sent)
+    path = tmp_path / f"x{form}"
+    for share in (0.0, 0.02, 0.4):
+        for _ in range(case_records(2, 40)):
+            bad = {k for k in range(len(rows)) if chance.random() < share}
+            bad |= {0, len(rows) - 1} if share else set()
+            spoilt = [*rows]
+            for k in bad:
+                spoilt[k] = chance.choice(("\0\xff\0", "\x01" * 70_000, "#" + rows[k][:9], "z" * 40, rows[k][:12]))
+            path.write_text("\n".join(head + spoilt) + "\n", encoding="latin-1")
+            found = frames_of(path)
+            whole = [frame for k, frame in enumerate(sent) if k not in bad]
+            assert [one[:2] for one in found] == [(frame.arbitration_id, bytes(frame.data)) for frame in whole]
+            assert malformed(path) == sum(1 + (len(spoilt[k]) > 65_536) for k in bad)
+
+
+def test_the_view_states_the_damaged_lines(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Seven of them, and the end is no failure. A log of damage alone is refused in one line."""
+    sent = [message(line) for line in lines(stream(47, 2))]
+    head, rows = rows_of(tmp_path, "frames.asc", sent)
+    log = tmp_path / "spoilt.asc"
+    log.write_text("\n".join([*head, *("z" if k % 9 == 4 and k < 60 else row for k, row in enumerate(rows))]) + "\n")
+    outcome = verb.monitor(read=log)
+    assert not outcome.contact_lost and outcome.received == len(sent) - 7
+    assert ", 7 malformed" in capfd.readouterr().err
+    log.write_text("\n".join([*head, *("z" for _ in rows)]) + "\n")
+    with pytest.raises(UserError) as caught:
+        verb.monitor(read=log)
+    none = f"there is no frame in its {len(rows)} lines"
+    assert str(caught.value) == f"{log}: no frame log as python-can writes it: {none}"
+
+
+def test_sound_lines_without_a_frame_are_none(tmp_path: Path) -> None:
+    """Vector's and PEAK's programs write events and comments between frames. Truth: lines of their descriptions."""
+    asc = tmp_path / "events.asc"
+    asc.write_text(
+        "date Thu Nov 26 10:00:00.000 am 2026\nbase hex  timestamps absolute\ninternal events logged\n"
+        "// version 13.0.0\nBegin Triggerblock Thu Nov 26 10:00:00.000 am 2026\n   0.000000 Start of measurement\n"
+        "   0.010000 1  200             Rx   d 8 C0 27 09 00 00 80 B5 88\n"
+        "   0.015000 CAN 1 Status:chip status error active\n"
+        "   0.016000 1  Statistic: D 16 R 0 XD 0 XR 0 E 0 O 0 B 0.4%\n"
+        "   0.017000 SV: 2 0 1 ::Sys::Value = 81\n   0.018000 log trigger event\n"
+        "   0.020000 1  200             Rx   d 8 C0 27 09 00 00 80 B5 88  Length = 244015 BitCount = 126 ID = 512\n"
+        "End TriggerBlock\n"
+    )
+    trc = tmp_path / "events.trc"
+    trc.write_text(
+        ";$FILEVERSION=1.1\n;$STARTTIME=45000.5\n;\n"
+        "     1)        10.0  Rx         0200  8  C0 27 09 00 00 80 B5 88\n"
+        "     2)        11.0  Warng  FFFFFFFF  4  00 00 00 08  BUSHEAVY\n; a comment\n"
+        "     3)        12.0  Rx         0200  8  C0 27 09 00 00 80 B5 88\n"
+    )
+    for path in (asc, trc):
+        assert len(frames_of(path)) == 2
+        assert malformed(path) == 0
 
 
 def test_a_full_disk_is_one_line() -> None:

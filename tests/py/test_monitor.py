@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -21,6 +22,7 @@ from selfcal.dbc_file import PLACE_NAMES
 from selfcal.errors import UserError
 from selfcal.live import View
 from selfcal.model import Model
+from selfcal.verbs.identify import identify
 from selfcal.verbs.monitor import monitor
 from selfcal.wire import REASONS, AxisReport, Decoder, Link, names_of, open_bus
 
@@ -45,6 +47,24 @@ def test_counts_and_log_over_a_serial_line(tmp_path: Path) -> None:
     with can.LogReader(str(log)) as reader:
         logged = [(frame.arbitration_id, bytes(frame.data)) for frame in reader]
     assert logged == [(int(line[1:4], 16), bytes.fromhex(line[5:])) for line in sent]
+
+
+def test_its_document_has_all_keys_of_a_recording_s(tmp_path: Path) -> None:
+    """Live and of a log alike: what reads the JSON of `identify` reads this. Truth: the document of a recording."""
+    rows = "".join(f"{k / 10.0},{k % 7}.5\n" for k in range(900))
+    (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}")
+    of_samples = identify(tmp_path / "log.csv", suspicion=False)
+    sent = lines(stream(24, 3))
+    with serial_line(text_of(sent)) as path:
+        monitor(channel=path, log=tmp_path / "frames.log", duration=3.0, json=tmp_path / "live.json")
+    monitor(read=tmp_path / "frames.log", json=tmp_path / "read.json")
+    for name in ("live.json", "read.json"):
+        document = json.loads((tmp_path / name).read_text())
+        assert set(document) - {"node"} == set(of_samples)
+        assert set(document["recording"]) == set(of_samples["recording"])
+        assert set(document["axes"]["gx"]) >= set(of_samples["axes"]["gx"])
+        assert document["recording"]["since_power_on_s"] is None  # no message of a module has it
+    assert document["recording"]["path"] == str(tmp_path / "frames.log")
 
 
 def test_a_channel_that_falls_silent_is_opened_again() -> None:

@@ -43,7 +43,23 @@ class Identified:
         return not against(self.judged.checks)
 
 
-def recording_entry(recording: Recording) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Telemetry:
+    """What a document says of samples that only a module has seen, as of a `Recording`. None: the module does not state
+    it. `duration_s` is the time of the last report."""
+
+    path: str
+    rate_hz: float
+    samples: int | None
+    duration_s: float
+    start_s: float = 0.0
+    since_power_on_s: float | None = None
+    paths: tuple[Path, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
     """What a document says of its recording."""
     return {
         "path": str(recording.path),
@@ -65,7 +81,10 @@ def as_typed(recording: Mapping[str, Any]) -> str:
 
 
 def to_document(
-    recording: Recording, found: Mapping[str, Identified | UserError], *, all_failed: Path | str | None = None
+    recording: Recording | Telemetry,
+    found: Mapping[str, Identified | UserError],
+    *,
+    all_failed: Path | str | None = None,
 ) -> dict[str, Any]:
     """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
     if no axis has a result; the reasons are then written to `all_failed`."""
@@ -107,15 +126,15 @@ def to_document(
     }
 
 
-def of_errors(schema: str, recording: Recording, reasons: Mapping[str, str]) -> dict[str, Any]:
+def of_errors(schema: str, recording: Recording | Telemetry, reasons: Mapping[str, str]) -> dict[str, Any]:
     """The document of a recording no axis of which has a result."""
     axes = {name: {"error": reason} for name, reason in reasons.items()}
     return {"schema": schema, "recording": recording_entry(recording), "axes": axes}
 
 
-def _own_rate(recording: Recording, name: str) -> dict[str, float]:
+def _own_rate(recording: Recording | Telemetry, name: str) -> dict[str, float]:
     """The sampling rate of an axis that has its own."""
-    own = recording.columns[name].clock
+    own = recording.columns[name].clock if isinstance(recording, Recording) else None
     return {} if own is None else {"rate_hz": own.rate_hz}
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from selfcal.errors import UserError, short
+from selfcal.errors import UserError
 
 if TYPE_CHECKING:
     import can
@@ -35,6 +35,22 @@ CANDUMP = re.compile(
     r"\[(?P<length>\d+)\](?P<data>\s+remote request|(?:\s+[0-9A-F]{2})*)\s*(?:'.*'?)?\s*"
 )
 GVRET = "Time Stamp,ID,Extended,"
+#: Lines that are looked at for candump's screen form: the first may be damaged.
+CANDUMP_WITHIN = 20
+#: Characters of a line at most: the rest of a longer one counts as another line.
+LONGEST_LINE = 1 << 16
+#: Sound lines without a frame, by suffix.
+PASSED = {
+    ".asc": re.compile(
+        r"//|(begin|end)\s+triggerblock|date\s|base\s|(no\s+)?internal\s+events|"
+        r"\d+\.\d+\s+(can\s+)?(\d+\s+)?(?![0-9a-f]+x?\s)[a-z][a-z0-9_:-]+",
+        re.ASCII | re.IGNORECASE,
+    ),
+    ".csv": re.compile(rf"timestamp,arbitration_id,|{GVRET}"),
+    ".trc": re.compile(r";|\d+\)?\s+[\d.]+\s+(\d\s+)?(Warng|Error|ST|EC|ER|EV)\s", re.ASCII),
+}
+#: Bytes of a frame at most, but for CAN FD.
+LONGEST_FRAME = 8
 
 
 class _NoFrame(ValueError):
@@ -101,8 +117,8 @@ def check_suffix(path: Path | str) -> None:
 class FrameLog:
     """The frames of a log, `speed` times as fast as they came; None: as fast as they are read.
 
-    `closed` at its end; `damage` says why that came early, if it did. `malformed` counts damaged lines of a text log:
-    they are left out, but for the first.
+    `closed` at its end; `damage` says why that came early, if it did. `malformed` counts the damaged lines of a text:
+    they are left out. A binary log ends at its first damage.
     """
 
     def __init__(self, path: Path | str, speed: float | None = None) -> None:
@@ -110,7 +126,6 @@ class FrameLog:
 
         logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers tell of lines that they leave out
         self.path = Path(path)
-        self.malformed = 0
         self.closed = False
         self.damage = ""
         self._speed = speed
@@ -125,14 +140,23 @@ class FrameLog:
         if self.path.suffix.lower() == ".blf":
             _check_blf(self.path)
         try:
-            self._reader: Any = _foreign_reader(self.path) or can.LogReader(self.path)
+            self._lines = None if self.path.suffix.lower() == ".blf" else _Lines(self.path)
+            self._reader: Any = can.LogReader(self.path) if self._lines is None else _reader_of(self._lines)
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = self._next()
         except Exception as error:  # python-can's readers raise what they stumble over
             raise UserError(f"{path}: no frame log as python-can writes it: {self._said(error)}") from error
         if self._waiting is None:
             self.close()
+            if self.malformed:
+                lines = f"{self.malformed} line{'s' if self.malformed > 1 else ''}"
+                raise UserError(f"{path}: no frame log as python-can writes it: there is no frame in its {lines}")
             raise UserError(f"{path}: there is no frame in this log")
+
+    @property
+    def malformed(self) -> int:
+        """Damaged lines of a text so far."""
+        return 0 if self._lines is None else self._lines.malformed
 
     def recv(self, timeout: float) -> can.Message | None:
         """The next frame when it is due, or None after `timeout` seconds or at the end."""
@@ -157,22 +181,22 @@ class FrameLog:
         return frame
 
     def _next(self) -> can.Message | None:
-        """The next frame of the file; None at its end. Raises _NoFrame, and whatever python-can's readers do."""
-        import can
-
+        """The next frame of the file; None at its end. Raises _NoFrame, and whatever python-can's readers do: of a text
+        only where a reader does not get on."""
         while True:
             try:
                 frame = next(self._frames, None)
-                if frame is not None and not math.isfinite(frame.timestamp):
-                    raise _NoFrame(f"frame {self._read + 1} has the time stamp {frame.timestamp:g}")
+                if frame is not None:
+                    _check_frame(frame, self._read + 1)
             except Exception:
-                # Other readers of python-can do not go on after a line that they stumble over.
-                if not self._read or not isinstance(self._reader, _Lines | can.CanutilsLogReader):
+                if self._lines is None or not self._lines.restart():
                     raise
-                self.malformed += 1
                 self._frames = iter(self._reader)
                 continue
-            self._read += frame is not None
+            if frame is not None:
+                self._read += 1
+                if self._lines is not None:
+                    self._lines.taken()
             return frame
 
     def _said(self, error: Exception) -> str:
@@ -208,36 +232,102 @@ def _is_cut(path: Path) -> bool:
         return file.read(1) not in b"\r\n"
 
 
+def _check_frame(frame: can.Message, number: int) -> None:
+    """Raises _NoFrame for one that python-can's readers make of a damaged place."""
+    if not math.isfinite(frame.timestamp):
+        raise _NoFrame(f"frame {number} has the time stamp {frame.timestamp:g}")
+    plain = not (frame.is_fd or frame.is_remote_frame or frame.is_error_frame)
+    if plain and (len(frame.data) != frame.dlc or frame.dlc > LONGEST_FRAME):
+        raise _NoFrame(f"frame {number} has {len(frame.data)} bytes and the length {frame.dlc}")
+
+
 class _Lines:
-    """A reader of one frame a line, as python-can's are used. Raises _NoFrame for a line that is none."""
+    """The lines of a text log, as python-can's readers take a file. `malformed` counts those of which no frame comes.
 
-    def __init__(self, path: Path, frame: Callable[[str], can.Message], skip: int) -> None:
-        self._file: TextIO = path.open(encoding="ascii", errors="replace")
-        self._numbered = enumerate(self._file, start=1)
-        self._frame = frame
-        self._skip = skip
+    A reader that stumbled over a line begins anew with the next one: an empty line takes the place of its header.
+    """
 
-    def __iter__(self) -> Iterator[can.Message]:
-        for number, line in self._numbered:
-            if number > self._skip and line.strip():
-                try:
-                    yield self._frame(line)
-                except (ValueError, IndexError) as error:
-                    raise _NoFrame(f"line {number} is no frame: {short(line.strip())}") from error
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.malformed = 0
+        self._suffix = path.suffix.lower()
+        self._passed = PASSED.get(self._suffix)
+        self._file: TextIO = path.open(encoding="utf-8", errors="replace")
+        self._line = self._held = ""  # handed out last, until a frame comes of it; to be handed out next
+        self._read, self._restarted = 0, -1
+        self._empty = self._suffix == ".csv"  # its reader passes by the first line unseen
+        self._header = self._suffix == ".asc"  # its reader passes by the first line that is no header
 
-    def stop(self) -> None:
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        if self._empty:
+            self._empty = False
+            return "\n"
+        self._judge()
+        line, self._held = self._held or self._file.readline(LONGEST_LINE), ""
+        if self._header and line[:1].isdigit():
+            self._header, self._held = False, line
+            return "\n"
+        if not line:
+            raise StopIteration
+        self._read += 1
+        self._line = line
+        return line
+
+    def taken(self) -> None:
+        """A frame has come of the last line."""
+        self._line = ""
+
+    def restart(self) -> bool:
+        """Be ready for a reader that begins anew. False if none would get on."""
+        self._judge()
+        if self._restarted == self._read:
+            return False
+        self._restarted, self._empty = self._read, True
+        return True
+
+    def _judge(self) -> None:
+        """Count the last line if it is damaged."""
+        line, self._line = self._line.strip(), ""
+        self.malformed += bool(line) and not (self._passed is not None and self._passed.match(line))
+
+    def close(self) -> None:
         self._file.close()
 
 
-def _foreign_reader(path: Path) -> _Lines | None:
-    """A reader for forms that python-can's readers of this suffix do not take; None for theirs."""
-    with path.open("rb") as file:
-        first = file.readline(200).decode("ascii", "replace")
-    if path.suffix.lower() == ".csv" and first.startswith(GVRET):
-        return _Lines(path, _of_gvret, skip=1)
-    if path.suffix.lower() == ".log" and CANDUMP.fullmatch(first):
-        return _Lines(path, _of_candump, skip=0)
-    return None
+class _Foreign:
+    """A reader of one frame a line, for forms that python-can has no reader of."""
+
+    def __init__(self, lines: _Lines, frame: Callable[[str], can.Message]) -> None:
+        self._lines, self._frame = lines, frame
+
+    def __iter__(self) -> Iterator[can.Message]:
+        return (self._frame(line) for line in self._lines if line.strip())
+
+    def stop(self) -> None:
+        self._lines.close()
+
+
+def _reader_of(lines: _Lines) -> Any:
+    """The reader of a text log: python-can's, or our own."""
+    import can
+
+    suffix = lines.path.suffix.lower()
+    with lines.path.open("rb") as file:
+        first = [file.readline(LONGEST_LINE).decode("ascii", "replace") for _ in range(CANDUMP_WITHIN)]
+    if suffix == ".csv" and first[0].startswith(GVRET):
+        return _Foreign(lines, _of_gvret)
+    if suffix == ".log" and any(CANDUMP.fullmatch(line) for line in first):
+        return _Foreign(lines, _of_candump)
+    readers: dict[str, Callable[..., Any]] = {
+        ".asc": can.ASCReader,
+        ".csv": can.CSVReader,
+        ".log": can.CanutilsLogReader,
+        ".trc": can.TRCReader,
+    }
+    return readers[suffix](lines)
 
 
 def _of_candump(line: str) -> can.Message:

@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
 from selfcal.checks import Judged
 from selfcal.dbc_file import NODES, Names
-from selfcal.document import Identified, check_writable, to_document, write_json
+from selfcal.document import Identified, Telemetry, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import UserError
 from selfcal.framelog import FrameLog, FrameWriter, check_suffix
@@ -264,22 +263,17 @@ def _document(
     """The last complete reports as `identify` gives its results. Checks need the samples, which are not here."""
     status, why = decoder.status, reasons(decoder.status, decoder.corrected)
     interval, block = status.get("bank_interval", math.nan), status.get("bank_block", math.nan)
-    run = SimpleNamespace(
+    run = Telemetry(
         path=name,
         rate_hz=block / interval if interval > 0.0 else math.nan,
         samples=int(status["samples"]) if "samples" in status else None,
         duration_s=max(reports[-1].time_s for reports in history.values()),
-        start_s=0.0,
-        columns={axis: SimpleNamespace(clock=None) for axis in history},
-        paths=(),
-        options=(),
-        notes=(),
     )
     found = {
         axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
         for axis, reports in history.items()
     }
-    document = to_document(cast(Any, run), found)
+    document = to_document(run, found)
     document["node"] = node
     for axis, entry in document["axes"].items():
         entry["adequate"] = None
