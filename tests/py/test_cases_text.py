@@ -449,6 +449,86 @@ def test_bad_lines_are_skipped_and_counted(tmp_path: Path, bad: str) -> None:
         load(log, skip_bad=True)
 
 
+def rows_of(n: int, dt: float, seed: int) -> list[str]:
+    return [f"{k * dt:.6f},{value:.5f}" for k, value in enumerate(white(n, 0.1, seed))]
+
+
+@pytest.mark.parametrize("bad", [b"\0\0\0\0", b"\0\1garb,age", b"\xff\xfe,0.2", b"3.0,0\0002", b"12.3,1.2e5.3"])
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_skipped_line_is_a_missing_sample(bad: bytes, stamped: bool, tmp_path: Path) -> None:
+    """Bytes that are no text too, by stamps and by places alike. Truth: the grid that the rows were written on. A
+    single skipped row of many must not stretch it. Without --skip-bad the line is named."""
+    rate, n = 25.0, 7000
+    rows = [row if stamped else row.split(",")[1] for row in rows_of(n, 1.0 / rate, 3)]
+    spoilt = bad if stamped else bad.split(b",")[-1]
+    if not stamped and spoilt == b"0.2":
+        spoilt = b"\xff" + spoilt
+    places = (0, 1234, 1235, 5000, n - 2)
+    for count in (1, 5):
+        lines = [row.encode() for row in rows]
+        for place in places[-count:]:
+            lines[place] = spoilt
+        log = tmp_path / "log.csv"
+        log.write_bytes((b"t[s],gx[deg/s]\n" if stamped else b"gx[deg/s]\n") + b"\n".join(lines) + b"\n")
+        with pytest.raises(UserError, match=rf"line {places[-count] + 2}: "):
+            load(log, None if stamped else rate)
+        recording = load(log, None if stamped else rate, skip_bad=True)
+        assert recording.rate_hz == pytest.approx(rate, rel=1e-9)
+        inside = [place for place in places[-count:] if place]
+        assert int(recording.missing_before.sum()) == len(inside)
+        first = min(set(range(n)) - set(places[-count:]))
+        at = recording.clock.place + first
+        assert set(range(first, n)) - set(at.tolist()) == set(inside)
+        text = "1 line is no row and was skipped" if count == 1 else "5 lines are no rows and were skipped"
+        assert recording.notes == (text,)
+
+
+@pytest.mark.parametrize(("rate", "stamps"), [(10.0, "%.6f"), (128.0, "%.6f"), (819.2, "%.4f"), (50.0, "%.5f")])
+def test_damaged_stamps_are_named_and_skipped(rate: float, stamps: str, tmp_path: Path) -> None:
+    """A digit too many or another one. The message names this line, and not the next one; --skip-bad skips it. Truth:
+    the grid that the rows were written on."""
+    n = 4000
+    texts = [stamps % (k / rate) for k in range(n)]
+    values = white(n, 0.1, 4)
+    log = tmp_path / "log.csv"
+
+    def write(damaged: dict[int, str]) -> None:
+        cells = [damaged.get(k, text) for k, text in enumerate(texts)]
+        rows = (f"{cell},{value:.5f}" for cell, value in zip(cells, values, strict=True))
+        log.write_text("t[s],gx[deg/s]\n" + "\n".join(rows) + "\n")
+
+    write({})
+    clean = load(log, skip_bad=True)
+    assert not clean.missing_before.any()
+    damaged = {700: "9" + texts[700], 1500: "0.01", 1501: "0.01", 2222: "1e3", 3000: "-" + texts[3000]}
+    for count in (1, len(damaged)):
+        some = dict(list(damaged.items())[:count])
+        write(some)
+        with pytest.raises(UserError, match="line 702: column 't': the time stamp is later than the next one"):
+            load(log)
+        recording = load(log, skip_bad=True)
+        assert recording.rate_hz == pytest.approx(clean.rate_hz, rel=1e-6)
+        were = "5 lines were" if count > 1 else "1 line was"
+        assert recording.notes == (f"{were} skipped for a damaged time stamp", *clean.notes)
+        assert recording.samples == n - count
+        assert int(recording.missing_before.sum()) == count
+
+
+def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
+    """A clock that begins anew, a block of rows written twice, two sensors' stamps in turn: refused with --skip-bad as
+    without, and nothing is taken out."""
+    log = tmp_path / "log.csv"
+    rows = rows_of(600, 0.04, 5)
+    anew = rows + rows
+    twice = rows[:300] + rows[280:]
+    in_turn = [row for k, one in enumerate(rows) for row in (one, f"{5000.0 + 0.04 * k},0.1")]
+    for made in (anew, twice, in_turn):
+        log.write_text("t[s],gx[deg/s]\n" + "\n".join(made) + "\n")
+        for skip_bad in (False, True):
+            with pytest.raises(UserError, match="column 't': time runs backwards"):
+                load(log, skip_bad=skip_bad)
+
+
 def test_a_file_of_other_lines_is_refused_all_the_same(tmp_path: Path) -> None:
     """Nothing is kept of lines that are skipped beyond their number, and that has an end."""
     log = tmp_path / "log.csv"

@@ -56,7 +56,8 @@ ADEQUACY = {"inadequate": "red", "adequate": "green"}
 class Source(Protocol):
     """Where frames come from."""
 
-    malformed: int
+    @property
+    def malformed(self) -> int: ...
     closed: bool
 
 

@@ -43,7 +43,7 @@ from selfcal.loaders.table import Hints, Member, Table, parse_meta
 from selfcal.loaders.text_table import TextTable, is_clock, is_date
 from selfcal.loaders.texts import Text, texts_in
 from selfcal.output import together, whole
-from selfcal.timebase import Clock, clock_of, clock_of_rows, has_own_clock, unwrapped
+from selfcal.timebase import Clock, clock_of, clock_of_rows, damaged_stamps, few, has_own_clock, unwrapped
 
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
@@ -793,7 +793,7 @@ def _text_parts(path: Path, rate: float | None, header: _Header, skip_bad: bool)
     for text in texts_in(path):
         try:
             with ExitStack() as files:
-                table = TextTable(text.path, files, header.knows_in(text), opened=text.open)
+                table = TextTable(text.path, files, header.knows_in(text), skip_bad=skip_bad, opened=text.open)
         except UserError:
             if text.optional:
                 continue
@@ -847,18 +847,21 @@ class _Text:
             )
         fields = [field for field, column in zip(fields, read, strict=True) if column is not None]
         columns = [column for column in read if column is not None]
-        if meta.get("rows", columns[0].size) != columns[0].size:
+        if meta.get("rows", columns[0].size + table.skipped) != columns[0].size + table.skipped:
             what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
             raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
         if table.skipped:
-            header.notes.append(f"{table.skipped} lines are no rows and were skipped")
+            one = table.skipped == 1
+            header.notes.append(
+                "1 line is no row and was skipped" if one else f"{table.skipped} lines are no rows and were skipped"
+            )
         if "rate_hz" not in meta and (stated := table.stated_rate()) is not None:
             meta["rate_hz"] = stated
 
         def fail(row: int, field: int | None, what: str) -> NoReturn:
             table.fail(row, None if field is None else fields[field].name, what)
 
-        return _checked(path, self.rate, meta, fields, columns, fail, header, table.origin_s)
+        return _checked(path, self.rate, meta, fields, columns, fail, header, table.origin_s, table.places)
 
 
 def _meta_beside(path: Path) -> Mapping[str, Any]:
@@ -987,10 +990,24 @@ def _checked(
     fail: _Fail,
     header: _Header,
     started: float,
+    places: NDArray[np.int64] | None = None,
 ) -> Recording:
     """The recording of raw columns `table`, float64[n] each, NaN where there is no sample. It empties `table`: no
     second copy stays. `fail(row, field, what)` raises for a row of the file. `started`: what was taken off the stamps,
-    in their unit."""
+    in their unit. `places` int64[n]: of each row among the lines, some of which were skipped; rows with a damaged stamp
+    are skipped then too."""
+    if places is not None:
+        kept = _with_stamps(fields, table)
+        if kept.size < places.size:
+            count, places = places.size - kept.size, places[kept]
+            table[:] = [column[kept] for column in table]
+            were = "s were" if count > 1 else " was"
+            header.notes.append(f"{count} line{were} skipped for a damaged time stamp")
+            fail_whole = fail
+
+            def fail(row: int, field: int | None, what: str) -> NoReturn:
+                fail_whole(int(kept[row]), field, what)
+
     columns: dict[str, Column] = {}
     rows = table[0].size
     for number, field in enumerate(fields):
@@ -1029,7 +1046,19 @@ def _checked(
             np.abs(units.convert(np.spacing(np.abs(stamps.values).max(keepdims=True)), stamps.unit, "s"))[0]
         )
         stamps = None
-    return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time)
+    return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time, places)
+
+
+def _with_stamps(fields: Sequence[_Field], table: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
+    """The rows of raw columns whose stamps can be true; all of them where too many cannot."""
+    every = np.arange(table[0].size)
+    for field, raw in zip(fields, table, strict=True):
+        if field.name == "t" and np.isfinite(raw).any() and not np.isinf(raw).any():
+            known = np.flatnonzero(np.isfinite(raw))
+            seconds = units.convert(raw[known] - raw[known[0]], field.unit, "s")
+            sound = np.delete(known, damaged_stamps(unwrapped(seconds * field.lsb)[0]))
+            return sound if few(every.size - sound.size, every.size) else every
+    return every
 
 
 def _on_clocks(
@@ -1043,6 +1072,7 @@ def _on_clocks(
     started_s: float | None,
     header: _Header,
     fail: Callable[[int, str], NoReturn],
+    places: NDArray[np.int64] | None,
 ) -> Recording:
     """The recording of columns with NaN in `rows` rows at the stamps `time`, s, or at `rate` without any.
 
@@ -1051,10 +1081,12 @@ def _on_clocks(
     """
 
     def clock_at(at: NDArray[np.int64], rate: float | None) -> Clock:
+        lines = at if places is None else places[at]
         if time is not None:
-            return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what))
+            skipped = np.diff(lines, prepend=lines[0]) - np.diff(at, prepend=at[0]) if places is not None else None
+            return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what), skipped)
         assert rate is not None
-        return clock_of_rows(at, rate)
+        return clock_of_rows(lines, rate)
 
     axes: dict[str, NDArray[np.bool_]] = {}
     for name, column in columns.items():

@@ -6,6 +6,7 @@ Stamps may be coarse or fine (`sampling.py`), come in bursts, or be those of a 3
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
@@ -31,6 +32,11 @@ _SHORT_SHARE, _SHORT, _BURSTS = 0.3, 0.45, 20
 #: Mean steps, times the samples of a burst, by which stamps in bursts may stray from a steady count; bursts' distances
 #: beyond which there is a gap.
 _STRAY, _BURST_GAP = 5.0, 8.0
+
+#: Damaged stamps: rows a stamp at least, in a row at most, and rows to either side that show which of them it is.
+_DAMAGED_APART, _DAMAGED_MOST, _DAMAGED_WITHIN = 20, 3, 16
+#: Share of a step by which it may miss the length that skipped lines give it: stamps are rounded.
+_EXACT = 1e-6
 
 #: Raises UserError for a row and what is wrong there.
 Fail = Callable[[int, str], NoReturn]
@@ -112,6 +118,60 @@ def unwrapped(time: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
     return time, 0
 
 
+def few(rows: int, of: int) -> bool:
+    """Whether so many rows may be damaged ones."""
+    return rows * _DAMAGED_APART <= of
+
+
+def damaged_stamps(time: NDArray[np.float64]) -> NDArray[np.int64]:
+    """int64[k]: the fewest rows without which the stamps [n] rise; where they repeat often, do not fall.
+
+    A digit that is wrong makes single stamps too early or too late. None where it takes many rows, or many in a row."""
+    steps = np.diff(time)
+    repeats = steps == 0.0
+    strict = not _repeats_often(repeats)
+    wrong = (steps <= 0.0) if strict else (steps < 0.0)
+    none = np.empty(0, np.int64)
+    if not wrong.any() or not few(int(np.count_nonzero(wrong)), 2 * time.size):
+        return none
+    near = np.zeros(time.size + 1, bool)
+    for row in np.flatnonzero(wrong):
+        near[max(0, row + 1 - _DAMAGED_WITHIN) : row + 1 + _DAMAGED_WITHIN] = True
+    near[-1] = False
+    edges = np.flatnonzero(np.diff(near, prepend=False))
+    found = []
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        rows = np.delete(np.arange(first, last), _rising(time[first:last].tolist(), strict))
+        if (rows[_DAMAGED_MOST:] - rows[:-_DAMAGED_MOST] == _DAMAGED_MOST).any():
+            return none
+        found.append(rows)
+    damaged = np.concatenate(found)
+    left = np.diff(np.delete(time, damaged))
+    sound = left.size > 0 and bool((left > 0.0).all() if strict else (left >= 0.0).all())
+    return damaged if sound and few(damaged.size, time.size) else none
+
+
+def _rising(values: list[float], strict: bool) -> list[int]:
+    """Places of the longest subsequence that rises, or does not fall."""
+    ends: list[float] = []
+    at: list[int] = []
+    before: list[int] = []
+    for place, value in enumerate(values):
+        k = bisect_left(ends, value) if strict else bisect_right(ends, value)
+        before.append(at[k - 1] if k else -1)
+        ends[k : k + 1], at[k : k + 1] = [value], [place]
+    found = at[-1:]
+    while before[found[-1]] >= 0:
+        found.append(before[found[-1]])
+    return found[::-1]
+
+
+def _repeats_often(repeats: NDArray[np.bool_]) -> bool:
+    """Whether stamps are coarser than the sampling interval: repeats bool[n - 1] are no fault then."""
+    rows = repeats.size + 1
+    return rows >= _REPEATS_FROM and int(np.count_nonzero(repeats)) >= _REPEATS_LEAST * rows
+
+
 def has_own_clock(rows: NDArray[np.int64]) -> bool:
     """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
     if rows.size < 3:
@@ -129,14 +189,31 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
     return Clock(rate / every, np.maximum(np.diff(place, prepend=-1) - 1, 0), None, float(rows[0]) / rate)
 
 
-def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
+def clock_of(
+    path: object,
+    time: NDArray[np.float64],
+    noise_s: float,
+    rate: float | None,
+    fail: Fail,
+    skipped: NDArray[np.int64] | None = None,
+) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
-    states it. Raises UserError, by `fail` for a row."""
+    states it. `skipped` [n]: lines without a stamp just before each. Raises UserError, by `fail` for a row."""
     start = float(time[0])
     time = time - start if start else time
     if not np.isfinite(time[-1]):
         raise UserError(f"{path}: column 't' spans more than a number can hold")
-    found, missing = _sampling(path, time, noise_s, rate, fail)
+    rows = np.arange(time.size) if skipped is None else _with_skipped(time, skipped, noise_s)
+    if rows[-1] < time.size:
+        found, missing = _sampling(path, time, noise_s, rate, fail)
+    else:
+        every = np.interp(np.arange(rows[-1] + 1), rows, time)
+
+        def fail_row(row: int, what: str) -> NoReturn:
+            fail(int(np.searchsorted(rows, row)), what)
+
+        found, missing = _sampling(path, every, noise_s, rate, fail_row)
+        missing = np.diff((np.cumsum(missing) + np.arange(missing.size))[rows], prepend=missing[0] - 1) - 1
     lossy = 2 * np.count_nonzero(missing) > missing.size
     if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
@@ -149,16 +226,27 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     return Clock(rate, missing, off_grid, start)
 
 
+def _with_skipped(time: NDArray[np.float64], skipped: NDArray[np.int64], noise_s: float) -> NDArray[np.int64]:
+    """int64[n]: places of the stamps [n] with a row for each skipped line that fills its step exactly."""
+    steps = np.diff(time, prepend=time[0])
+    usual = float(np.median(steps[1:]))
+    fills = np.abs(steps - (skipped + 1) * usual) <= max(4.0 * noise_s, _EXACT * usual)
+    rows = np.arange(time.size)
+    rows += np.cumsum(np.where(fills, skipped, 0))
+    return rows
+
+
 def _sampling(
     path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
 ) -> tuple[float, NDArray[np.int64]]:
     """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
     steps = np.diff(time)
     if steps.min() < 0.0:
-        fail(int(np.argmax(steps < 0.0)) + 1, "time runs backwards")
+        row = int(next(iter(damaged_stamps(time)), np.argmax(steps < 0.0) + 1))
+        early = row > 0 and time[row] <= time[row - 1]
+        fail(row, "time runs backwards" if early else "the time stamp is later than the next one")
     repeats = steps == 0.0
-    few = time.size < _REPEATS_FROM or np.count_nonzero(repeats) < _REPEATS_LEAST * time.size
-    if repeats.any() and (few or repeats.all()):
+    if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
     bursts = _bursts(time, steps, rate)
     if bursts is not None and not repeats.any():

@@ -11,7 +11,6 @@ from __future__ import annotations
 import gzip
 import math
 import re
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -50,6 +49,8 @@ _MISSING = re.compile(r"(nan?|n/a|null|none)?", re.ASCII | re.IGNORECASE)
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
+#: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
+_NO_TEXT = re.compile("[\0\udc80-\udcff]")
 #: Lines that may be skipped at least, and their share at most, before a file is no recording.
 _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
@@ -85,7 +86,7 @@ class TextTable:
         Raises UserError."""
         self.path = path
         self._before: list[str] = []
-        self._lines = _Lines(path, *(_opened(path, files) if opened is None else opened(files)))
+        self._lines = _Lines(path, *(_opened(path, files) if opened is None else opened(files)), skip_bad)
         header, number, self._row = self._header(knows)
         self._batch = self._lines.rest or self._lines.more()
         if not self._batch:
@@ -93,6 +94,8 @@ class TextTable:
         self._separator = self._separated(header, self._batch[0], number)
         self._decimal: str | None = None
         self._skip_bad, self._skipped = skip_bad, list[int]()
+        #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
+        self.places: NDArray[np.int64] | None = None
         self._origin: datetime | None = None
         self.where = f"line {number}: "
         self.keys = [self._heading(cell, number, place) for place, cell in enumerate(self._headings(header))]
@@ -117,9 +120,7 @@ class TextTable:
 
     def fail(self, row: int, column: str | None, what: str) -> NoReturn:
         """Raise UserError for a row (from 0), and a column of it, of the table that `columns` gave."""
-        # Line `row` of those kept; skipped line k has k kept ones fewer before it than lines.
-        row += bisect_right([at - k for k, at in enumerate(self._skipped)], row)
-        self._fail(row, column, what)
+        self._fail(row if self.places is None else int(self.places[row]), column, what)
 
     def _fail(self, line: int, column: str | None, what: str) -> NoReturn:
         column = "" if column is None else f"column '{column}': "
@@ -136,6 +137,7 @@ class TextTable:
         index = [self.keys.index(key) for key, _ in names]
         parts: list[list[NDArray[np.float64]] | None] = [[] for _ in index]
         lines, rows, blank, batch = 0, 0, False, self._batch
+        places: list[NDArray[np.int64]] = []
         while batch:
             if self._lines.unfinished and batch[0].strip():
                 # A line that was cut within its last number would be taken for another value.
@@ -153,18 +155,23 @@ class TextTable:
                     f"{self.path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns, those "
                     "that --column names"
                 )
+            skipped = len(self._skipped)
             table = self._parse(batch[:filled], [index[place] for place in wanted], _place(wanted, time))
             if table is None:
                 table = self._scan(batch[:filled], lines, index, names, optional, time, parts)
                 wanted = [place for place in wanted if parts[place] is not None]
             for place, column in zip(wanted, table.T, strict=True):
                 cast(list[NDArray[np.float64]], parts[place]).append(np.ascontiguousarray(column))
+            if self._skip_bad:
+                left_out = np.array(self._skipped[skipped:], np.int64) - lines
+                places.append(np.delete(np.arange(lines, lines + filled), left_out))
             lines += len(batch) if self._skip_bad else filled
             rows += len(table)
             batch = self._lines.more()
         if rows < 2:
             what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
             raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
+        self.places = np.concatenate(places) if self._skip_bad else None
         whole: list[NDArray[np.float64] | None] = []
         while parts:  # no column stays in both forms
             part = parts.pop(0)
@@ -198,6 +205,8 @@ class TextTable:
 
     def _begins(self, batch: list[str], header: int, row: int, text: str) -> tuple[str, int, int]:
         """The header `text` in line `header` of the first batch, the first row in line `row`, both from 0."""
+        if no_text := _NO_TEXT.search(text):
+            raise UserError(_of_no_text(self.path, header + 1, no_text[0]))
         self._lines.rest = batch[row:]
         self._before = batch[:header]
         return text, header + 1, row + 1
@@ -234,6 +243,8 @@ class TextTable:
 
     def _parse(self, lines: list[str], index: Sequence[int], time: int | None) -> NDArray[np.float64] | None:
         """float64[lines, index] of lines, the fast way; None if it takes the slow one. `time`: a column of dates."""
+        if self._lines.no_text:
+            return None  # which lines have it is for the slow way
         if not lines or not index:
             return np.empty((len(lines), len(index)))
         text = "\n".join(" ".join(line.split()) for line in lines) if self._separator == " " else "\n".join(lines)
@@ -303,6 +314,8 @@ class TextTable:
             return math.nan
 
     def _row_of(self, line: str) -> list[str]:
+        if self._lines.no_text and _NO_TEXT.search(line):
+            raise _Bad(None, "not text")
         cells = self._cells(line)
         if len(cells) != len(self.keys):
             what = f"{len(cells)} cells where the header has {len(self.keys)}" if line.strip() else "an empty line"
@@ -428,14 +441,21 @@ def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
     return cast(BinaryIO, raw), 0
 
 
-class _Lines:
-    """The lines of a text, a block at a time. `number`: lines before the last block; `rest`: not used yet, of it."""
+def _of_no_text(path: Path, line: int, sign: str) -> str:
+    return f"{path}: line {line}: not text (byte 0x{ord(sign) & 0xFF:02x}); it must be UTF-8"
 
-    def __init__(self, path: Path, stream: BinaryIO, packed: int) -> None:
+
+class _Lines:
+    """The lines of a text, a block at a time. `number`: lines before the last block; `rest`: not used yet, of it.
+
+    `no_text`: the last block has bytes that are no text; without `skip_bad` they are a UserError."""
+
+    def __init__(self, path: Path, stream: BinaryIO, packed: int, skip_bad: bool) -> None:
         self.path, self.stream = path, stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
         self._packed, self._unpacked = packed, 0
+        self._skip_bad, self.no_text = skip_bad, False
 
     def more(self) -> list[str]:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
@@ -464,13 +484,13 @@ class _Lines:
 
     def _text(self, data: bytes) -> str:
         skip = 3 if self._start and data.startswith(b"\xef\xbb\xbf") else 0
-        bad = data.find(b"\0")
         try:
-            text = data[skip:].decode("utf-8")
-        except UnicodeDecodeError as error:
-            bad = min(bad, error.start + skip) if bad >= 0 else error.start + skip
-        if bad >= 0:
-            line = self._next + data.count(10, 0, bad) + 1
-            raise UserError(f"{self.path}: line {line}: not text (byte 0x{data[bad]:02x}); it must be UTF-8")
+            text, self.no_text = data[skip:].decode("utf-8"), b"\0" in data
+        except UnicodeDecodeError:
+            text, self.no_text = data[skip:].decode("utf-8", "surrogateescape"), True
+        if self.no_text and not self._skip_bad:
+            found = _NO_TEXT.search(text)
+            assert found is not None
+            raise UserError(_of_no_text(self.path, self._next + text.count("\n", 0, found.start()) + 1, found[0]))
         self._start = False
         return text
