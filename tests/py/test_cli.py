@@ -1,5 +1,6 @@
 """The command: every fault of the user is one line on stderr and exit code 2, whatever raised it."""
 
+import inspect
 import json
 import os
 import re
@@ -7,11 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import typer
 
 import selfcal
+from selfcal import cli
 from selfcal.loaders import READ
 
 from conftest import CALLED, COMMAND, ROOT, run
@@ -208,6 +212,25 @@ def test_bad_recordings(tmp_path: Path, verb: str, text: str, expected: str) -> 
     """The step's list; every other kind is in test_recording.py."""
     (tmp_path / "bad.csv").write_text(text)
     assert one_error(verb, "bad.csv", cwd=tmp_path).startswith(expected)
+
+
+@pytest.mark.parametrize("verb", ["identify", "diagnose", "compare", "convert", "replay", "monitor", "rivals", "worth"])
+def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> None:
+    """Truth: the table in tools/README.md. A monitor's `start` is its `--from`."""
+    named = {"start": "start_s", "end": "end_s", "since_power_on": "since_power_on_s", "axis": "axes"}
+    named |= {"column": "columns", "unit": "units", "from": "start", "no_suspicion": "suspicion"}
+    function = getattr(import_module(f"selfcal.verbs.{verb}"), verb)
+    keywords = set(inspect.signature(function).parameters)
+    command = typer.main.get_command(cli.app)
+    assert isinstance(command, typer.core.TyperGroup)
+    options = {
+        max(one.opts, key=len).strip("-").replace("-", "_")
+        for one in command.commands[verb].params
+        if one.param_type_name == "option"
+    }
+    ensemble = {"records", "results", "samples", "scheduler", "seed", "truth"} if verb == "rivals" else set()
+    known = {named.get(option, option) for option in options - ensemble - {"help"}}
+    assert known <= keywords, known - keywords
 
 
 def test_interrupt_is_clean() -> None:

@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-from selfcal.diagnosis.fit import Series, finish, fit, ln_likelihood, slopes
+from selfcal.diagnosis.causes.periodic import BANDS_MOST
+from selfcal.diagnosis.fit import COLUMNS_MOST, Series, finish, fit, ln_likelihood, shifts, slopes
 from selfcal.diagnosis.fit import run as run_filter
 from selfcal.diagnosis.statemodel import Terms, matrices
 from selfcal.errors import UserError
@@ -93,6 +95,55 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     sums = run_filter(series, terms, theta)[0][0]
     assert ln_likelihood(sums) == pytest.approx(expected, abs=2e-4)
     assert sums.coefficients()[0] == pytest.approx(c, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("columns", [COLUMNS_MOST, COLUMNS_MOST + 1, 62, 97])
+def test_more_columns_than_a_pass_takes(columns: int) -> None:
+    """Any number of columns. Truth: a filter whitens each column by itself, and its sums are their products.
+    Passes of other widths take the gain for settled at other samples: it is off by 1e-7 there, a sum of 300 by 3e-5."""
+    random, n = np.random.default_rng(columns), 300
+    y, z = random.standard_normal(n), np.vstack([np.ones(n), random.standard_normal((columns - 1, n))])
+    y[40:55] = np.nan
+    terms, theta = Terms(walk=True, color="ma"), np.array([-2.0, 0.3])
+    series = Series(y, 0.1, np.ones(n), z)
+    (half, whole), white, s = run_filter(series, terms, theta, (n // 2, n), innovations=True)
+    for place in (0, 1, columns // 2, columns - 1):
+        _, alone, s_alone = run_filter(Series(y, 0.1, np.ones(n), z[place : place + 1]), terms, theta, (), True)
+        np.testing.assert_allclose(white[:, [0, 1 + place]], alone, atol=1e-6)
+        np.testing.assert_allclose(s, s_alone, atol=1e-6)
+    for sums, end in ((half, n // 2), (whole, n)):
+        used = np.nan_to_num(white[:end])
+        np.testing.assert_allclose(sums.G, used.T @ used, atol=1e-4)
+    found = shifts(series, terms, theta)
+    np.testing.assert_allclose(found.sums.G, whole.G, atol=1e-4)
+    one = shifts(Series(y, 0.1, np.ones(n), z[-1:]), terms, theta)
+    np.testing.assert_allclose(found.B[:, [0, -1]], one.B, atol=1e-4)
+
+
+def test_every_term_at_once_is_a_filter() -> None:
+    """The largest model that the looks build: all its states fit. Truth: a likelihood that is a number."""
+    bands = tuple((0.5 + 0.3 * k, 0.01, -2.0) for k in range(BANDS_MOST))
+    terms = Terms(walk=True, markov=True, flicker=True, oscillation=True, color="ma", bands=bands)
+    n = 1 << 16
+    series = Series(np.random.default_rng(1).standard_normal(n), 1e-3, np.ones(n), np.ones((1, n)))
+    theta = np.array([(low + high) / 2.0 for low, high in terms.limits(series.dt)])
+    assert matrices(terms, theta, series.dt, 1e9).F.shape == (24, 24)
+    assert math.isfinite(ln_likelihood(run_filter(series, terms, theta)[0][0]))
+
+
+def test_a_model_of_six_columns_leaves_room_for_a_transient(tmp_path: Path) -> None:
+    """Three periodic regressors and two exponentials after power-on: the suspicion is named. Truth: the record."""
+    tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    tree["regressors"] = [
+        {"name": f"line{k}", "kind": "periodic", "frequency_hz": f, "sd": {"gyro": 0.1}}
+        for k, f in enumerate((0.11, 0.171, 0.233))
+    ]
+    model = tmp_path / "six.yaml"
+    model.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+    t = np.arange(4800) / 4.0
+    y = 0.2 + 0.05 * np.random.default_rng(4).standard_normal(t.size) + 0.8 * np.exp(-t / 12) + 0.5 * np.exp(-t / 240)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 4.0)
+    assert identify(tmp_path / "log.npz", model=model)["axes"]["gx"]["suspicion"] == "turn_on"
 
 
 def test_a_column_of_zeros_has_no_coefficient() -> None:

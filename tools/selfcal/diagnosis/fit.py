@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from selfcal import _likelihood
 from selfcal.diagnosis import work
 from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array, Mask, Terms, matrices
 
+#: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
+COLUMNS_MOST = 39
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
 #: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
@@ -156,13 +158,42 @@ def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
-    work.count(series.y.size, len(series.columns))
     m = matrices(terms, theta, series.dt, series.duration_s)
     at = list(marks) or [series.y.size]
-    found: tuple[Array, Array, Array, Array, Array, Array] = _likelihood.run(
-        series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, innovations
-    )
-    return found
+
+    def of(columns: Array) -> tuple[Array, ...]:
+        work.count(series.y.size, len(columns))
+        found: tuple[Array, ...] = _likelihood.run(
+            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, innovations
+        )
+        return found
+
+    G, D, n, x, white, s = _whole(series.columns, of, {0: (1, 2), 3: (1,), 4: (1,)})
+    return G, D, n, x, white, s
+
+
+def _whole(
+    columns: Array, of: Callable[[Array], tuple[Array, ...]], by_column: Mapping[int, tuple[int, ...]]
+) -> tuple[Array, ...]:
+    """The arrays of a pass over all columns [p, n]. A pass `of` too many is one of every pair of their parts: the
+    filter whitens each column by itself. `by_column`: array by its place -> its axes of length 1 + p."""
+    if len(columns) <= COLUMNS_MOST:
+        return of(columns)
+    parts = np.array_split(np.arange(len(columns)), math.ceil(len(columns) / (COLUMNS_MOST // 2)))
+    whole: list[Array] = []
+    for pair in combinations(parts, 2):
+        chosen = np.concatenate(pair)
+        found = of(np.ascontiguousarray(columns[chosen]))
+        rows = np.concatenate([[0], 1 + chosen])
+        if not whole:
+            whole = [one.copy() for one in found]
+            for place, axes in by_column.items():
+                shape = [1 + len(columns) if axis in axes else size for axis, size in enumerate(found[place].shape)]
+                whole[place] = np.zeros(shape)
+        for place, axes in by_column.items():
+            at = [rows if axis in axes else np.arange(size) for axis, size in enumerate(whole[place].shape)]
+            whole[place][np.ix_(*at)] = found[place]
+    return tuple(whole)
 
 
 @dataclass(frozen=True)
@@ -180,8 +211,13 @@ class Shifts:
 def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
     m = matrices(terms, theta, series.dt, series.duration_s)
-    G, D, A, B, impulse = _likelihood.shifts(series.y, series.columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver)
-    return Shifts(Sums(G, D, float(series.n), np.empty(0)), A, B, impulse)
+
+    def of(columns: Array) -> tuple[Array, ...]:
+        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver)
+        return tuple(np.asarray(one) for one in found)
+
+    G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
+    return Shifts(Sums(G, float(D), float(series.n), np.empty(0)), A, B, impulse)
 
 
 def ln_likelihood(sums: Sums) -> float:
