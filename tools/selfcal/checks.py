@@ -66,7 +66,7 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
 
     `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
     recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
-    `outliers`, if one value recurs too often: the share left out, and the value `at` which.
+    `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
     `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
     `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
     `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
@@ -82,8 +82,8 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
         share = float(readings.clipped.mask.mean())
         checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}
     if readings.recurring is not None:
-        share = float(readings.recurring.mask.mean())
-        checks["outliers"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.recurring.value * factor}
+        often = readings.recurring
+        checks["outliers"] = {"value": often.share, "limit": 0.0, "passed": False, "at": often.value * factor}
     if readings.held is not None and not readings.held.even:
         checks["held_samples"] = {"value": 1.0 - 1.0 / readings.held.ratio, "limit": 0.0, "passed": False}
     if readings.moved is not None:

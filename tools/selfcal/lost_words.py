@@ -20,8 +20,16 @@ from selfcal.lattice import Lattice, lattice_of
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Readings that are one value: how many at least, the evidence, nats, and the least share of others.
-LEAST, NATS, OTHERS = 5, 16.0, 2.0
+#: Readings that are one value: how many at least, the evidence, nats, and the share up to which they are left out.
+#: Of a value with more, either the value or the others may be the noise.
+LEAST, NATS, MOST = 5, 16.0, 2.0 / 3.0
+#: Share of the readings from which on the commonest value has no part in the steps that show the noise, and ln of its
+#: count over the expected one then, at least: on a lattice near the noise unequal codes have less.
+COMMON, COMMON_EXCESS = 0.2, 0.7
+#: Share from which on a value beside the lattice of the others shows, and distinct values of theirs, at least.
+SHOWS, CODES = 0.02, 8
+#: Readings of a value whose neighbours are looked at, at most.
+SAMPLED = 50_000
 #: Far ones: candidates that are looked at, neighbours on either side that make their level, how far off they are in the
 #: noise and how far their neighbours may be, and readings of a candidate that are looked at first, at most.
 LOOKED, AROUND, FAR, NEAR, SHOWN = 6, 8, 5.0, 3.0, 500
@@ -36,9 +44,14 @@ COARSEST = 1.0
 LOCAL = 0.25
 #: Counts of three codes from which on they alone show the next one's.
 MANY = 30.0
+#: The others come close to a limit of the part: within this many of their standard deviations, or at the next value,
+#: are this share of its own readings, or of the others. At the largest of some hundred normal readings are fewer.
+CLOSE, CLOSE_OWN, CLOSE_OTHERS = 0.5, 0.5, 0.05
 #: Share of the count beside a value, over that farther off, below which a dead band is about the value, and readings
 #: that it has taken from the gaps on either side.
 BAND, GAP = 0.5, 10.0
+#: Readings that begin beyond a dead band at least, within half its width and half the noise. A tail has fewer.
+GAP_FULL = 20
 #: Neighbours whose mean is the level of a lost word among the readings. Of few the mean would follow their noise, and
 #: the words left would follow them.
 LEVEL = 1001
@@ -48,9 +61,11 @@ LN_SCALE = 5.0
 
 @dataclass(frozen=True)
 class Recurring:
-    """Readings that are one `value` too often: the `mask` [n] of those to leave out, and the evidence in nats."""
+    """Readings that are one `value` too often: their `share`, the `mask` [n] of those to leave out, and the evidence in
+    nats. Beyond a share of MOST none is left out."""
 
     value: float
+    share: float
     mask: Mask
     nats: float
 
@@ -61,56 +76,72 @@ def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
     y = values if known.all() else values[known]
     if y.size < 8 * AROUND:
         return None
-    steps = np.diff(y)
-    np.abs(steps, out=steps)
-    # Lost words are in fewer than two fifths of the steps; on a lattice coarser than the noise most steps are none.
+    unique, counts = np.unique(y, return_counts=True)
+    commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
+    del unique, counts  # as long as the record
+    rest = y[y != commonest] if most > SHOWS * y.size else y
+    if rest.size < 8 * AROUND:
+        return None
+    steps = np.abs(np.diff(rest if most > COMMON * y.size else y))
+    # On a lattice coarser than the noise most steps are none.
     some = steps[:: max(1, steps.size // STEPS)]
     sigma = max(float(np.median(some)) / 0.6745, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
+    del steps, some
     if not sigma > 0.0:
         return None
-    far = _far(y, steps, sigma, rate_hz)
-    del steps, some  # as long as the record
-    found = (*far, 1.0) if far is not None else _within(y, sigma, lattice_of(y, rate_hz))
-    if found is None:
+    far = _far(y, sigma, rate_hz)
+    lattice = lattice_of(y, rate_hz) if far is None else None
+    found: tuple[float, float, float] | None
+    if far is not None:
+        found = (*far, 1.0)
+    elif most > SHOWS * y.size and _is_off(rest, commonest, most, sigma, lattice, lattice_of(rest, rate_hz)):
+        found = (commonest, 1e6, 1.0)
+    else:
+        found = _within(y, sigma, lattice)
+    if found is None or (2 * most > y.size and found[0] != commonest):
         return None
-    value, nats, share = found
+    del rest
+    value, nats, excess = found
+    own = values == value
+    share = excess * float(np.count_nonzero(own)) / y.size
     mask = np.zeros(values.size, bool)
-    mask[known] = _lost(y, value, share, rate_hz)
-    return Recurring(value, mask, min(1e6, nats))
+    if share <= MOST:
+        mask[known] = _lost(y, value, excess, rate_hz)
+    return Recurring(value, share, mask, min(1e6, nats))
 
 
-def _far(y: Array, steps: Array, sigma: float, rate_hz: float) -> tuple[float, float] | None:
+def _far(y: Array, sigma: float, rate_hz: float) -> tuple[float, float] | None:
     """The value and its evidence, where readings [n] of it are far from the level of their neighbours, and the lattice
-    of these has no reason to come to this value so often. `steps` [n - 1]: between readings; `sigma`: their noise.
+    of these has no reason to come to this value so often. `sigma`: their noise.
 
     A value counts where its neighbours rest: in motion a part comes to its limits. The evidence is that of its count
     over the count of a cell about it (Poisson).
     """
-    jump = steps > (FAR - 1.0) * sigma
+    jump = np.abs(np.diff(y)) > (FAR - 1.0) * sigma
     if np.count_nonzero(jump) < LEAST:
         return None
     jumps = np.unique(np.concatenate([np.flatnonzero(jump), np.flatnonzero(jump) + 1]))
     unique, counts = np.unique(y[jumps], return_counts=True)
-    beside = np.delete(np.arange(-AROUND, AROUND + 1), AROUND)
     best: tuple[float, float] | None = None
     for place in np.argsort(-counts, kind="stable")[:LOOKED]:
         value = float(unique[place])
         if counts[place] < LEAST:
             break
-        some = jumps[y[jumps] == value][:SHOWN]
-        about = y[np.clip(some[:, None] + beside, 0, y.size - 1)]
-        if not np.median(np.abs(value - np.median(about, axis=1))) > FAR * sigma:
-            continue  # of the noise, as most are
         own = y == value
         size = np.count_nonzero(own)
-        if y.size < (1.0 + OTHERS) * size:
+        if y.size - size < 8 * AROUND:
             continue
-        level, rests = _about(y, own, sigma)
-        count = int((rests & (np.abs(value - level) > FAR * sigma)).sum())
+        level, _ = _about(y, own, sigma, SHOWN)
+        if not np.median(np.abs(value - level)) > FAR * sigma:
+            continue  # of the noise, as most are
+        level, rests = _about(y, own, sigma, SAMPLED)
+        count = int(float(np.mean(rests & (np.abs(value - level) > FAR * sigma))) * size)
         if count < LEAST or 2 * count < size:
             continue
         others = y[~own]
         lattice = lattice_of(others, rate_hz)
+        if _has_gaps(others, value, sigma, lattice):
+            continue
         width = max(2.0 * sigma, 4.0 * lattice.step if lattice is not None else 0.0)
         cells = 2.0 * width / lattice.step if lattice is not None else 20.0
         expected = (np.count_nonzero(np.abs(others - value) < width) + 1.0) / cells
@@ -120,14 +151,28 @@ def _far(y: Array, steps: Array, sigma: float, rate_hz: float) -> tuple[float, f
     return best
 
 
-def _about(y: Array, own: Mask, sigma: float) -> tuple[Array, Mask]:
-    """The level of the other readings about each of the own ones among readings [n], and whether these rest there. The
-    same number of others on either side."""
-    others = np.flatnonzero(~own)
-    first = np.clip(np.searchsorted(others, np.flatnonzero(own)) - AROUND, 0, others.size - 2 * AROUND)
+def _about(y: Array, own: Mask, sigma: float, most: int) -> tuple[Array, Mask]:
+    """The level of the other readings about the own ones among readings [n], and whether these rest there. The same
+    number of others on either side. Every so many of the own ones, `most` in all."""
+    others, at = np.flatnonzero(~own), np.flatnonzero(own)
+    at = at[:: -(-at.size // most)]
+    first = np.clip(np.searchsorted(others, at) - AROUND, 0, others.size - 2 * AROUND)
     around = y[others[first[:, None] + np.arange(2 * AROUND)]]
     level = np.median(around, axis=1)
     return level, np.quantile(np.abs(around - level[:, None]), 0.75, axis=1) < NEAR * sigma
+
+
+def _is_off(
+    others: Array, value: float, count: int, sigma: float, lattice: Lattice | None, own: Lattice | None
+) -> bool:
+    """Whether a value of this `count` lies beside the `own` lattice of the `others` [n], and is no limit of the part
+    and no dead band. `lattice`: of all."""
+    if own is None or own.coarseness > COARSEST or (lattice is not None and lattice.step > 0.75 * own.step):
+        return False
+    cells = round(float(np.ptp(others)) / own.step) + 1
+    if own.distinct < max(CODES, cells // 2):
+        return False
+    return not _has_gaps(others, value, sigma, own) and not _is_limit(others, value, count)
 
 
 def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, float, float] | None:
@@ -159,13 +204,16 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
     top = int(np.argmax(np.where((count >= LEAST) & (excess > EXCESS), worth, 0.0)))
     nats = float(worth[top]) - math.log(unique.size)
     own = y == value[top]
-    if nats < NATS or y.size < (1.0 + OTHERS) * np.count_nonzero(own):
+    size = int(np.count_nonzero(own))
+    if nats < NATS or y.size - size < 8 * AROUND or (size > COMMON * y.size and excess[top] < COMMON_EXCESS):
         return None
-    without = np.where(np.arange(count.size) == top, expected[top], count)
-    expected, sd = _beside_codes(without) if codes else _beside_values(value, without, BESIDE * sigma)
+    smooth = float(expected[top])
     if codes:
         n1, n2 = (np.array([_at(count, top - k), _at(count, top + k)]) for k in (1, 2))
-    else:
+        smooth = min(smooth, math.exp(float(4.0 * np.log(n1 + 0.5).sum() - np.log(n2 + 0.5).sum()) / 6.0))
+    without = np.where(np.arange(count.size) == top, smooth, count)
+    expected, sd = _beside_codes(without) if codes else _beside_values(value, without, BESIDE * sigma)
+    if not codes:
         offset = np.abs(value - value[top]) / sigma
         n1, n2 = (
             np.array([count[inside & (value < value[top])].sum(), count[inside & (value > value[top])].sum()])
@@ -180,21 +228,45 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
         gap -= lattice.step if lattice is not None else 0.0
         if gap * n2.min() > GAP * BESIDE * sigma:
             return None
-    beyond = min(np.count_nonzero(y < value[top]), np.count_nonzero(y > value[top]))
-    if (n1 + 3.0 * np.sqrt(n2) + 3.0 < BAND * n2).all() or (not n1.any() and beyond > 0.01 * y.size):
+    if (n1 + 3.0 * np.sqrt(n2) + 3.0 < BAND * n2).all():
         return None
-    if beyond == 0 and np.count_nonzero(own) < np.count_nonzero((np.abs(y - value[top]) < sigma) & ~own):
+    if _has_gaps(y[~own], float(value[top]), sigma, lattice):
         return None
-    level, rests = _about(y, own, sigma)
+    if _is_limit(y[~own], float(value[top]), size):
+        return None
+    level, rests = _about(y, own, sigma, SAMPLED)
     share = -math.expm1(-excess[top])
     noise = lattice.step / lattice.coarseness if lattice is not None else sigma
     here = _explained(float(value[top]), level, noise, lattice)
-    lost = share * level.size
+    lost = share * size
     for _ in range(20):  # of the same count where the level about each reading is known: EM
-        lost = float((lost / (lost + here * y.size)).sum())
-    if 2 * np.count_nonzero(rests) < level.size or lost < LOCAL * share * level.size:
+        lost = float((lost / (lost + here * y.size)).mean()) * size
+    if 2 * np.count_nonzero(rests) < level.size or lost < LOCAL * share * size:
         return None
     return float(value[top]), nats, share
+
+
+def _has_gaps(others: Array, value: float, sigma: float, lattice: Lattice | None) -> bool:
+    """Whether the `others` [n] leave a gap on either side of a value and begin at once beyond it: a dead band."""
+    offset = others - value
+    above, below = offset[offset > 0.0], -offset[offset < 0.0]
+    if not (above.size and below.size):
+        return False
+    gap = min(float(above.min()), float(below.min()))
+    step = lattice.step if lattice is not None else 0.0
+    edge = gap + 0.5 * min(gap - step, sigma)
+    most = max(np.count_nonzero(above < edge), np.count_nonzero(below < edge))
+    return gap > 1.5 * step and int(most) > GAP_FULL
+
+
+def _is_limit(others: Array, value: float, count: int) -> bool:
+    """Whether a value at the edge of all readings has the `count` that a limit of the part makes of their noise: the
+    `others` [n] come close to it."""
+    if float(others.min()) < value < float(others.max()):
+        return False
+    distance = np.abs(others - value)
+    close = int(np.count_nonzero(distance < max(CLOSE * float(others.std()), 1.01 * float(distance.min()))))
+    return close > min(CLOSE_OWN * count, CLOSE_OTHERS * others.size)
 
 
 def _no_stuck(y: Array) -> Mask:
@@ -255,7 +327,9 @@ def _beside_values(value: Array, count: Array, width: float) -> tuple[Array, Arr
 def _lost(y: Array, value: float, share: float, rate_hz: float) -> Mask:
     """Which readings [n] of a value are lost words, a `share` of them: those that the noise about the level of their
     neighbours explains least. Where both are possible chance decides, so that as many are left as the noise makes."""
-    own = y == value
+    own: Mask = y == value
+    if share == 1.0:
+        return own
     at, others = np.flatnonzero(own), y[~own]
     sigma = float(np.median(np.abs(np.diff(others)))) / 0.6745 / math.sqrt(2.0)
     lattice = lattice_of(others, rate_hz)

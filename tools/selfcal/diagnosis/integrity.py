@@ -132,9 +132,8 @@ def recurring(record: Record, axis: str) -> Look | None:
     readings = record.readings.get(axis)
     if readings is None or readings.recurring is None:
         return None
-    mask, nats = readings.recurring.mask, readings.recurring.nats
-    times = readings.recording.time_s[mask]
-    share = float(mask.mean())
+    mask, nats, share = readings.recurring.mask, readings.recurring.nats, readings.recurring.share
+    times = readings.recording.time_s[mask if mask.any() else readings.values == readings.recurring.value]
     estimate = {
         "fraction": interval(share, math.sqrt(share / mask.size), "1"),
         "time_s": interval(float(times[0]), 0.0, "s"),
