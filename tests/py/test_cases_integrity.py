@@ -262,6 +262,89 @@ def test_lost_words_within_the_noise_are_left_out(
     held.check()
 
 
+@pytest.mark.parametrize(
+    ("share", "q", "off", "K"),
+    [(0.37, 0.0, 0.4, 0.0), (0.42, 0.015, 1.2, 4e-3), (0.55, 0.03, 0.8, 0.0), (0.62, 0.0, 2.5, 4e-3),
+     (0.4, 0.02, 12.0, 0.0), (0.13, -0.03, 0.3, 0.0), (0.5, -0.03, 1.0, 4e-3)],
+)  # fmt: skip
+def test_lost_words_of_up_to_two_thirds_are_left_out(share: float, q: float, off: float, K: float) -> None:
+    """One value, `off` times the noise from the bias, on the lattice `q` of the others or, where it is negative, beside
+    it: N, K and the bias are those of the others."""
+    held = Held()
+    for seed in range(case_records(3, 120)):
+        random = np.random.default_rng([41, seed, round(100 * share)])
+        y, bias = noise(random, 9000, 20.0, K)
+        step = abs(q)
+        y = np.rint(y / step) * step if q else y
+        value = float(bias[0] + off * 0.04 * math.sqrt(20.0))
+        value = step * (round(value / step) + (0.4 if q < 0.0 else 0.0)) if q else value
+        y[random.uniform(size=y.size) < share] = value
+        recording = a_recording(y, 20.0)
+        assert "outliers" in held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + q * q / 12.0 / 20.0), K)
+        found = look(recording, "gx", GYRO)
+        assert found.clipped is None and found.recurring is not None
+        assert found.recurring.value == pytest.approx(value, abs=1e-9)
+        assert found.recurring.share == pytest.approx(share, abs=5.0 * math.sqrt(0.25 / y.size))
+    held.check()
+
+
+@pytest.mark.parametrize("share", [0.72, 0.88])
+def test_lost_words_of_more_than_two_thirds_are_flagged(share: float) -> None:
+    """Either the value or the others may be the noise: none is left out, and the check `outliers` fails."""
+    for seed in range(case_records(2, 60)):
+        random = np.random.default_rng([42, seed])
+        y, bias = noise(random, 9000, 20.0)
+        y[random.uniform(size=y.size) < share] = bias[0] + 0.1
+        found = identify_axis(a_recording(y, 20.0), "gx", MODEL, "library", None)
+        assert not found.judged.checks["outliers"]["passed"]
+        assert found.judged.checks["outliers"]["value"] == pytest.approx(share, abs=0.03)
+        recurring = look(a_recording(y, 20.0), "gx", GYRO).recurring
+        assert recurring is not None and not recurring.mask.any()
+        look_at = judged(a_recording(y, 20.0))
+        assert "outliers" in [finding.look.cause for finding in look_at.findings]
+
+
+#: One value that holds a large share of the readings, and is no lost word: noise, level, random numbers -> readings.
+COMMON: dict[str, Callable[[Array, float, np.random.Generator], Array]] = {
+    "coarse": lambda y, at, random: np.rint((y - at) / (q := random.uniform(1.5, 3.0)) + random.uniform(-0.1, 0.1)) * q,
+    "dead band": lambda y, at, random: np.where(np.abs(y - at) < random.uniform(0.3, 2.0), at, y),
+    "dead band of codes": lambda y, at, random: np.where(np.abs(y - at) < random.uniform(0.3, 2.0), at, y) // 0.1 * 0.1,
+    "held": lambda y, at, random: np.rint(y[np.cumsum(random.random(y.size) < 0.5)] / 0.2) * 0.2,
+    "frozen": lambda y, at, random: np.where(np.abs(np.arange(y.size) - 4000) < random.uniform(800, 2500), y[4000], y),
+    "clipped": lambda y, at, random: np.minimum(y, np.quantile(y, random.uniform(0.4, 0.85))),
+    "clipped codes": lambda y, at, random: np.rint(np.maximum(y, at - random.uniform(-0.3, 1.5)) / 0.3) * 0.3,
+}
+
+
+@pytest.mark.parametrize("kind", COMMON)
+def test_a_common_value_is_no_lost_word(kind: str) -> None:
+    records, fired = case_records(6, 200), 0
+    for seed in range(records):
+        random = np.random.default_rng([43, seed])
+        at = random.uniform(-20.0, 20.0)
+        y = at + np.cumsum(random.choice([0.0, 2e-3]) * random.normal(size=9000)) + random.normal(size=9000)
+        fired += look(a_recording(0.1 * COMMON[kind](y, at, random), 20.0), "gx", GYRO).recurring is not None
+    assert fired <= records // 200
+
+
+def test_clipping_on_a_lattice_coarser_than_the_noise_is_named() -> None:
+    """A third of the readings in the last code of three or more, and its clean twin of as coarse codes."""
+    records, named, fired = case_records(8, 200), 0, 0
+    for seed in range(records):
+        random = np.random.default_rng([44, seed])
+        q = random.uniform(1.5, 1.8)
+        y = random.uniform(0.0, q) + np.cumsum(random.choice([0.0, 1e-3]) * random.normal(size=9000))
+        y += random.normal(size=9000)
+        limit = q * round(float(np.quantile(y, 0.67)) / q)
+        codes = np.rint(y / q) * q
+        assert np.unique(clipped := np.minimum(codes, limit)).size >= 3
+        found = look(a_recording(0.1 * clipped, 20.0), "gx", GYRO).clipped
+        named += found is not None and found.limit == pytest.approx(0.1 * limit)
+        fired += look(a_recording(0.1 * np.rint(y / q * 0.6) * q / 0.6, 20.0), "gx", GYRO).clipped is not None
+    assert named >= records - records // 50
+    assert fired <= records // 200
+
+
 def test_the_codes_of_the_real_runs_are_no_lost_words() -> None:
     for number in (1, 2, 4):
         recorded = shared_recording(f"adis16405_run{number}.npz")

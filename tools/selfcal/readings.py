@@ -42,6 +42,9 @@ LN_STUCK = math.log(1e-9)
 AROUND = 32
 #: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
 CLIPPED_LEAST = -math.log(5e-4)
+#: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
+#: most.
+PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
 #: Steps of EM at most, and the change of the noise at which it has settled.
@@ -401,13 +404,21 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     """
     rows = np.flatnonzero(np.isfinite(values))
     y = values[rows]
-    if y.size < 4 * AROUND or (lattice is not None and lattice.too_coarse):
+    if y.size < 4 * AROUND:
         return None
     half = 0.5 * lattice.step if lattice is not None else 0.0
     edges = [(sign, float((sign * y).max())) for sign in (1, -1)]
     at_edges = [sign * y >= edge - max(1e-9 * max(1.0, abs(edge)), 0.5 * half) for sign, edge in edges]
     if all(at_edge.sum() < 3 for at_edge in at_edges):
         return None
+    if lattice is not None and lattice.too_coarse:
+        found = {
+            sign * edge: (worth, rows[at_edge])
+            for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice.step), strict=True)
+            if worth > PILED_LEAST and at_edge.sum() >= 3
+        }
+        masks = {edge: np.isin(np.arange(values.size), at) for edge, (_, at) in found.items()}
+        return Clipped(masks, sum(worth for worth, _ in found.values())) if found else None
     size = 2 * AROUND + 1
     level = (uniform_filter1d(y, size, mode="reflect") * size - y) / (size - 1)
     # The level's own noise, 1 / (2 AROUND), is in the scatter, and a second time in the level.
@@ -438,6 +449,35 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         limits[sign * edge] = mask
         nats += worth + math.log(2.0)
     return Clipped(limits, nats) if limits else None
+
+
+def _piled(y: Array, step: float) -> tuple[float, float]:
+    """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond as well.
+
+    It is the likelihood of codes of rounded normal noise with a limit over that without. Each piece of the readings has
+    its best level, and the record its best noise.
+    """
+    code = np.rint((y - y.min()) / step).astype(np.int64)
+    many = int(code.max()) + 1
+    if not 3 <= many <= CODES_MOST:
+        return 0.0, 0.0
+    length = max(2 * AROUND, -(-y.size // PIECES))
+    pieces = y.size // length
+    place = np.repeat(np.arange(pieces), length) * many + code[: pieces * length]
+    count = np.bincount(place, minlength=pieces * many).reshape(pieces, many).astype(np.float64)
+    level = np.arange(-2.0, many + 1.0, 0.05)
+    ends = np.arange(many + 1)[:, None] - 0.5 - level
+    best = np.full(3, -math.inf)
+    for sigma in np.geomspace(0.1, 2.0, 40):
+        below, above = ndtr(ends / sigma), ndtr(-ends / sigma)
+        # The smaller tail keeps its digits.
+        chance = np.where(ends[:-1] > 0.0, above[:-1] - above[1:], below[1:] - below[:-1])
+        for k, last in enumerate((None, many - 1, 0)):
+            here = chance.copy()
+            if last is not None:
+                here[last] = above[last] if last else below[1]
+            best[k] = max(best[k], float((count @ np.log(here + 1e-12)).max(axis=1).sum()))
+    return float(best[1] - best[0]), float(best[2] - best[0])
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
