@@ -171,25 +171,33 @@ void selfcal_bank_start_node(selfcal_t *self, uint16_t index) {
 /* Between what ln of an axis's sigma_v lies, as its first batch shows it: with D_i the differences of neighbours,
  * E D_i^2 / 2 = sigma_v^2 + sigma_w^2 / 2 and -E D_i D_(i+1) = sigma_v^2. The first is the upper end. The second is not
  * raised by drift but scatters more: where drift is evident (the batch spreads twice as wide as its differences,
- * sigma_w above some 0.8 sigma_v) it is the lower end, but not below a hundredth of the first. Both within the prior's
- * limits. */
+ * sigma_w above some 0.8 sigma_v) it is the lower end, but not below a hundredth of the first. Few neighbours, among
+ * gaps, scatter too much: then the steps across the gaps are the upper end, and a hundredth of it the lower. Both within
+ * the prior's limits. */
 typedef struct {
     selfcal_real_t lo, hi;
 } ln_range_t;
 
+/* Differences of neighbours from which on they show the noise: ln sigma_v to 0.25, half of the nodes' margin. */
+#define NEIGHBOURS_MIN 8U
+
 static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     const selfcal_batch_t *batch = waiting(self);
     const selfcal_real_t *y = batch->y[axis];
-    selfcal_real_t square = R(0.0), product = R(0.0), mean = R(0.0), spread = R(0.0);
+    selfcal_real_t square = R(0.0), product = R(0.0), mean = R(0.0), spread = R(0.0), across = R(0.0);
     uint32_t squares = 0, products = 0;
     for (uint32_t i = 0; i < batch->count; i++) {
         const selfcal_real_t off = y[i] - mean; /* Welford's recursion */
         mean += off / (selfcal_real_t)(i + 1U);
         spread = r_fma(off, y[i] - mean, spread);
-        if (i == 0U || batch->gap[i] > 0U) {
+        if (i == 0U) {
             continue;
         }
         const selfcal_real_t step = y[i] - y[i - 1U];
+        across += R(0.5) * step * step;
+        if (batch->gap[i] > 0U) {
+            continue;
+        }
         square += R(0.5) * step * step;
         squares++;
         if (i > 1U && batch->gap[i - 1U] == 0U) {
@@ -202,10 +210,16 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     const selfcal_real_t least = (selfcal_real_t)prior->ln_min - half_ln_dt,
         most = (selfcal_real_t)prior->ln_max - half_ln_dt;
     ln_range_t range = {least, least};
+    const bool gappy = squares < NEIGHBOURS_MIN && squares + 1U < batch->count;
+    if (gappy) {
+        square = across;
+        squares = batch->count - 1U;
+    }
     if (square > R(0.0)) {
         square /= (selfcal_real_t)squares;
         spread /= (selfcal_real_t)(batch->count - 1U);
         product = products > 0U && spread > R(2.0) * square ? product / (selfcal_real_t)products : square;
+        product = gappy ? R(0.0) : product;
         range.hi = r_fmin(r_fmax(R(0.5) * r_log(square), least), most);
         range.lo = r_fmin(r_fmax(R(0.5) * r_log(r_fmax(product, R(0.01) * square)), least), range.hi);
     } else if (squares == 0U) {

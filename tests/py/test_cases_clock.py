@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from selfcal.errors import UserError
 from selfcal.recording import load
-from selfcal.sampling import Ambiguous, sampling
+from selfcal.sampling import Ambiguous, rate_changes, sampling
 from selfcal.timebase import clock_of
 
 from conftest import case_records
@@ -120,3 +120,63 @@ def test_a_stated_rate_is_taken_however_many_samples_are_lost(jitter: float, los
         for wrong in (2.0, 0.5, 1.333):
             with pytest.raises(UserError, match="does not agree with --rate"):
                 clock_of("log.csv", time, 1e-6, wrong * RATE_HZ, fail)
+
+
+def in_bursts(random: Random, rows: int, lost: float, run: float) -> NDArray[np.bool_]:
+    """Which of `rows` samples arrive, bool[rows]: runs of `run` on average, and losses between them."""
+    lengths = np.column_stack([random.geometric(1.0 / run, rows), random.geometric((1.0 - lost) / (run * lost), rows)])
+    return np.repeat(np.tile([True, False], rows), lengths.ravel())[:rows]
+
+
+@pytest.mark.parametrize("lost", [0.35, 0.6, 0.88])
+@pytest.mark.parametrize("run", [0.0, 8.0, 25.0])
+def test_an_exact_grid_is_known_whatever_it_loses(lost: float, run: float) -> None:
+    """Samples lost one by one (`run` 0) or in bursts. The stamps are exact multiples of the interval, to 1 us."""
+    for seed in range(case_records(2, 30)):
+        random = np.random.default_rng(seed)
+        kept = in_bursts(random, 24000, lost, run) if run else random.random(24000) >= lost
+        place = np.flatnonzero(kept)
+        rate, missing = found(np.round(place / 32.0, 6))
+        assert rate == pytest.approx(32.0, rel=1e-7)
+        assert missing == int(np.ptp(place)) + 1 - place.size
+
+
+@pytest.mark.parametrize("tick_s", [0.001, 0.01, 1.0 / 64.0])
+def test_ticks_of_a_clock_make_no_grid_of_random_times(tick_s: float) -> None:
+    """Steps of 0.3 to 1.7 intervals, of 6.2 ticks, written in whole ticks: their mean rate."""
+    for seed in range(case_records(2, 30)):
+        steps = np.random.default_rng(seed).uniform(0.3, 1.7, ROWS) * 6.2 * tick_s
+        rate, missing = found(np.floor(np.cumsum(steps) / tick_s) * tick_s)
+        assert missing == 0
+        # The steps spread by 0.4.
+        assert rate == pytest.approx(1.0 / (6.2 * tick_s), rel=4.0 * 0.4 / np.sqrt(ROWS))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.08])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(150, 12.0), (3, 50.0), (200, 12.0)],
+        [(60, 20.0), (9, 8.0), (200, 20.0), (12, 8.0), (150, 20.0)],
+        [(150, 3.0), (150, 4.0), (120, 6.0), (150, 5.0)],
+    ],
+    ids=["burst", "slow stretches", "steps"],
+)
+def test_each_change_of_rate_is_found(parts: list[tuple[float, float]], jitter: float) -> None:
+    for seed in range(case_records(2, 30)):
+        random = np.random.default_rng(seed)
+        steps = np.concatenate([np.full(round(s * hz), 1.0 / hz) for s, hz in parts])
+        time = np.concatenate([[0.0], np.cumsum(steps)])[:-1] + jitter * steps * random.uniform(-0.5, 0.5, steps.size)
+        changes = rate_changes(time)
+        # A change lies within one interval of its first sample, where the jitter hides it two.
+        assert [one.row for one in changes] == pytest.approx(np.cumsum([s * hz for s, hz in parts])[:-1], abs=2)
+        assert [1.0 / one.after_s for one in changes] == pytest.approx([hz for _, hz in parts[1:]], rel=0.01)
+
+
+@pytest.mark.parametrize("stalled", [45, 80])
+def test_a_burst_after_a_stall_is_no_change_of_rate(stalled: int) -> None:
+    """The samples of a stall come at once after it, 1 ms apart."""
+    time = np.arange(6000) / 15.0
+    late = slice(3000, 3000 + stalled)
+    time[late] = time[late.stop] - 0.001 * np.arange(stalled, 0, -1)
+    assert rate_changes(time) == []

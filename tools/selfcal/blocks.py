@@ -55,7 +55,10 @@ def usable_blocks(
     kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
     if present.size < needed:
         found = f"{present.size} averages of {tables.dt_s:g} s"
-        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept})")
+        each = int(np.isfinite(samples).sum())
+        alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone" if each >= needed else ""
+        alone = alone if tables.block > 1 else ""
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept}){alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
         raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")

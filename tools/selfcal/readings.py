@@ -33,7 +33,7 @@ CLOCK_LEAST = 1e-3
 #: Pieces on either side of a change, and standard deviations of their slopes that it takes.
 SLOPES, SLOPES_LEAST = 10, 8.0
 #: Longest common interval of two rates, s, and how far off it may be.
-COMMON_S, COMMON_OFF = 0.5, 3e-3
+COMMON_S, COMMON_OFF = 1.0, 3e-3
 #: Longest gap that motion is looked for across, s.
 GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.

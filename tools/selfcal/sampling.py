@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
+from scipy.ndimage import median_filter
 
 #: Rows looked at on either side of a long time step to tell missing samples from a late one.
 _NEIGHBOURS = 10
@@ -54,10 +55,14 @@ _MEAN, _GAP = 1.2, 20.0
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
 #: Rows over which a stated grid's phase is followed.
 _PIECE_OF_GRID = 100
-#: Least share of the samples of an even grid that is left: of fewer, random stamps on a lattice look alike.
-_KEPT = 0.4
-#: Rows that show it, rows looked at, and the power of a line over the mean beyond the largest of as many by chance.
-_ROWS_LEAST, _ROWS, _LINE = 500, 1 << 17, 8.0
+#: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
+#: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
+_ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
+#: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
+_ONES, _ONES_SHARE = 20, 0.7
+#: A regular part: rows at least, the share of its steps that are near its interval, how near, how constant the medians
+#: of its steps and how far from the next part's (ln), and parts at most.
+_SHORT, _SHORT_SHARE, _SHORT_NEAR, _SHORT_APART, _SHORT_MOST = 2 * _STEPS, 0.9, 0.3, 0.1, 100
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
@@ -88,6 +93,8 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         except Ambiguous:
             if rate is None:
                 raise  # a stated rate decides, and is checked by who knows it
+    elif rate is None and lattice > 0.0 and _lossy(np.rint(steps / lattice)):
+        return _on_every_step(time, lattice)
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
     first = _usual(steps) if rate is None else 1.0 / rate
@@ -144,8 +151,47 @@ class Change:
 
 
 def rate_changes(time: NDArray[np.float64]) -> list[Change]:
-    """Every change of rate in stamps float64[n], s, in order of time. A rate that lasts less than two pieces of
-    n / _PIECES rows, or of 3 * _STEPS, is none."""
+    """Every change of rate in stamps float64[n], s, in order of time.
+
+    Of regular stamps a rate that lasts _SHORT rows or more is seen if it differs by a tenth. Of others it must last two
+    pieces of n / _PIECES rows, or of 3 * _STEPS."""
+    return _regular_parts(time) or _parts(time)
+
+
+def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
+    """The changes of rate of stamps whose steps are nearly all those of their part; none for other stamps."""
+    steps = np.diff(time)
+    if steps.size < 2 * _SHORT:
+        return []
+    level = median_filter(steps, 2 * _STEPS + 1, mode="nearest")
+    if not level.min() > 0.0:
+        return []
+    ln = np.log(level)
+    rows = np.flatnonzero(np.abs(np.diff(ln)) > _SHORT_APART) + 1
+    if not 0 < rows.size < _SHORT_MOST or np.diff(rows, prepend=0, append=steps.size).min() <= _SHORT:
+        return []
+    near = np.abs(steps / level - 1.0) < _SHORT_NEAR
+    spans = list(pairwise([0, *rows.tolist(), steps.size]))
+    # Medians within _STEPS rows of a change are the extremes of one part's steps.
+    inner = [ln[a + (_STEPS if a else 0) : b - (_STEPS if b < steps.size else 0)] for a, b in spans]
+    if any(near[a:b].mean() < _SHORT_SHARE for a, b in spans) or any(np.ptp(one) > _SHORT_APART for one in inner):
+        return []
+    # A burst after a stall makes up for it: samples of one rate, stamped late.
+    edges = rows[:, None] + np.arange(-2, 3)
+    slower = np.maximum(level[rows - 1], level[rows])
+    if (steps[edges] > (1.0 + 2.0 * _SHORT_NEAR) * slower[:, None]).any():
+        return []
+    exact = [float(steps[a:b][near[a:b]].mean()) for a, b in spans]
+    scatter = max(1e-3, float(np.std(np.log(steps[near] / level[near]))))
+    found = []
+    for ((a, b), (c, d)), (before, after) in zip(pairwise(spans), pairwise(exact), strict=True):
+        nats = 0.5 * min(b - a, d - c) * (math.log(after / before) / scatter) ** 2
+        found.append(Change(b, before, after, min(1e6, nats)))
+    return found
+
+
+def _parts(time: NDArray[np.float64]) -> list[Change]:
+    """The changes between parts of many rows, whose steps may be any on average."""
     n = time.size
     size = max(3 * _STEPS, n // _PIECES)
     if n < 6 * size:
@@ -354,17 +400,32 @@ def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) 
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:
-    """Whether whole numbers of lattice steps are those of an even grid of one step that loses samples at random.
+    """Whether whole numbers of lattice steps are those of an even grid of one step that loses samples.
 
-    A stamp is then on each lattice step with one probability, whatever the others: which steps have one is white noise.
-    Another rate on the lattice is a line in its spectrum, however many samples are lost."""
-    head = np.cumsum(steps[:_ROWS].astype(np.int64))
-    if steps.size < _ROWS_LEAST or steps.min() < 1.0 or not _KEPT < head.size / head[-1] < 1.0:
+    Random times repeat a stamp half as often as they take neighbouring ones, or keep a distance; a grid does neither.
+    Another rate on the lattice is a line in the spectrum of the steps that have a stamp, however many samples are lost.
+    Losses, one by one or in bursts, make no line."""
+    if steps.min() < 1.0:
+        return False
+    head = np.cumsum(steps)
+    head = head[: int(np.searchsorted(head, _PLACES))].astype(np.int64)
+    if head.size < _ROWS_LEAST or head[-1] <= head.size:
+        return False
+    ones = int(np.count_nonzero(steps[: head.size] == 1.0))
+    if ones < max(_ONES, _ONES_SHARE * head.size**2 / int(head[-1])):
         return False
     taken = np.zeros(int(head[-1]) + 1)
     taken[head] = 1.0
     power = np.abs(rfft(taken - taken.mean())[1:]) ** 2
-    return float(power.max()) < (math.log(power.size) + _LINE) * float(power.mean())
+    most = math.log(power.size) + _LINE
+    begin = _SLOWEST
+    while begin < power.size:
+        end = begin + max(_SLOWEST, int(_BAND * begin))
+        band = power[begin : end if end + _SLOWEST < power.size else power.size]
+        if float(band.max()) > most * float(np.median(band)) / math.log(2.0):
+            return False
+        begin += band.size
+    return True
 
 
 def _on_every_step(time: NDArray[np.float64], lattice: float) -> Found:
