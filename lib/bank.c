@@ -172,8 +172,8 @@ void selfcal_bank_start_node(selfcal_t *self, uint16_t index) {
  * E D_i^2 / 2 = sigma_v^2 + sigma_w^2 / 2 and -E D_i D_(i+1) = sigma_v^2. The first is the upper end. The second is not
  * raised by drift but scatters more: where drift is evident (the batch spreads twice as wide as its differences,
  * sigma_w above some 0.8 sigma_v) it is the lower end, but not below a hundredth of the first. Few neighbours, among
- * gaps, scatter too much: then the steps across the gaps are the upper end, and a hundredth of it the lower. Both within
- * the prior's limits. */
+ * gaps, scatter too much: then the steps across the gaps are the upper end, and a hundredth of it the lower. Both
+ * within the prior's limits. */
 typedef struct {
     selfcal_real_t lo, hi;
 } ln_range_t;

@@ -16,6 +16,8 @@ from selfcal.tables import Tables
 
 #: Bank samples a report needs (SELFCAL_REPORT_MIN).
 REPORT_MIN = 3
+#: Averages that are too few where the rest of the readings, all but this share, are in averages of which most is lost.
+FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
 #: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
 MOST_DENSE = 10_000_000
 
@@ -53,12 +55,15 @@ def usable_blocks(
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = REPORT_MIN + len(tables.regressors)
     kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
+    found = f"{present.size} averages of {tables.dt_s:g} s"
+    whole = float((tables.block / blocks.r[np.isfinite(blocks.mean)]).sum())
+    each = int(np.isfinite(samples).sum())
+    alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone"
     if present.size < needed:
-        found = f"{present.size} averages of {tables.dt_s:g} s"
-        each = int(np.isfinite(samples).sum())
-        alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone" if each >= needed else ""
-        alone = alone if tables.block > 1 else ""
-        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept}){alone}")
+        more = alone if tables.block > 1 and each >= needed else ""
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept}){more}")
+    if present.size < FEWEST_WHOLE and whole < WHOLE_SHARE * each:
+        raise UserError(f"too few whole averages: {found} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
         raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 
 #: Rows looked at on either side of a long time step to tell missing samples from a late one.
 _NEIGHBOURS = 10
@@ -58,6 +58,8 @@ _PIECE_OF_GRID = 100
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
+#: Roundings of stamps, s, and how many of them an interval has at least that shows beside them.
+_ROUNDINGS, _ROUNDED = (1e-9, 1e-6, 1e-3), 20.0
 #: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
 _ONES, _ONES_SHARE = 20, 0.7
 #: A regular part: rows at least, the share of its steps that are near its interval, how near, how constant the medians
@@ -93,8 +95,10 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         except Ambiguous:
             if rate is None:
                 raise  # a stated rate decides, and is checked by who knows it
-    elif rate is None and lattice > 0.0 and _lossy(np.rint(steps / lattice)):
-        return _on_every_step(time, lattice)
+    elif rate is None:
+        grid = _lossy_grid(steps, lattice)
+        if grid > 0.0:
+            return _on_every_step(time, grid)
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
     first = _usual(steps) if rate is None else 1.0 / rate
@@ -167,7 +171,8 @@ def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
     if not level.min() > 0.0:
         return []
     ln = np.log(level)
-    rows = np.flatnonzero(np.abs(np.diff(ln)) > _SHORT_APART) + 1
+    jump = np.abs(np.diff(ln))
+    rows = np.flatnonzero((jump > _SHORT_APART) & (jump == maximum_filter1d(jump, 5))) + 1
     if not 0 < rows.size < _SHORT_MOST or np.diff(rows, prepend=0, append=steps.size).min() <= _SHORT:
         return []
     near = np.abs(steps / level - 1.0) < _SHORT_NEAR
@@ -397,6 +402,22 @@ def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) 
     if steps.min() < 1 or own > gaps + 0.5 * math.sqrt(gaps) + _AS_GOOD:
         return None
     return _on_every_step(time, lattice)
+
+
+def _lossy_grid(steps: NDArray[np.float64], lattice: float) -> float:
+    """Interval, s, of an even grid that loses samples, of which each step is a multiple; 0 if there is none.
+
+    It is the `lattice`, or one far coarser than the rounding of the stamps."""
+    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
+        return lattice
+    for rounding in _ROUNDINGS:
+        grid = _lattice(steps[:_PLACES], 2.5 * rounding)
+        if grid > _ROUNDED * rounding and _lossy(np.rint(steps / grid)):
+            # Two roundings make a step; the grid is known to one of them over many intervals.
+            off = np.abs(steps - np.rint(steps / grid) * grid)
+            if float(off.max()) < 2.0 * rounding:
+                return grid
+    return 0.0
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:
