@@ -336,8 +336,8 @@ def test_clipping_on_a_lattice_coarser_than_the_noise_is_named() -> None:
         y = random.uniform(0.0, q) + np.cumsum(random.choice([0.0, 1e-3]) * random.normal(size=9000))
         y += random.normal(size=9000)
         limit = q * round(float(np.quantile(y, 0.67)) / q)
-        codes = np.rint(y / q) * q
-        assert np.unique(clipped := np.minimum(codes, limit)).size >= 3
+        clipped = np.minimum(np.rint(y / q) * q, limit)
+        assert np.unique(clipped).size >= 3
         found = look(a_recording(0.1 * clipped, 20.0), "gx", GYRO).clipped
         named += found is not None and found.limit == pytest.approx(0.1 * limit)
         fired += look(a_recording(0.1 * np.rint(y / q * 0.6) * q / 0.6, 20.0), "gx", GYRO).clipped is not None
