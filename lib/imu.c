@@ -167,7 +167,7 @@ bool selfcal_imu_room(const selfcal_imu_t *imu) {
 static selfcal_status_t begin_report(selfcal_imu_t *imu) {
     selfcal_status_t status = SELFCAL_OK;
     for (uint8_t axis = 0; !imu->computing && imu->due != 0U; axis++) {
-        if ((imu->due >> axis & 1U) != 0U) {
+        if (((uint32_t)imu->due >> axis & 1U) != 0U) {
             imu->due &= (uint16_t)~(1U << axis);
             imu->whole = false;
             status = selfcal_report_begin(&imu->work, &imu->bank, axis, &imu->report);

@@ -61,7 +61,7 @@ int main() {
         y.push_back(static_cast<double>(sample[0]));
     }
     const Record one_axis{y.data(), nullptr, y.size(), static_cast<double>(model.dt_s), 0.0, 10.0};
-    const Law gauss_markov{{{false}}};
+    const Law gauss_markov{{Term{Kind::markov}}};
     constexpr std::size_t filters = 8;
     volatile double ln_p = 0.0; // kept, so that nothing is left out
     for (int round = 0; round < rounds; ++round) {

@@ -612,3 +612,13 @@ def test_what_cannot_be_judged_is_told_in_one_line(tmp_path: Path) -> None:
     axes = diagnose(huge)["axes"]
     assert "is the unit right?" in axes["gx"]["error"]
     assert "error" not in axes["gy"]
+
+
+def test_a_copied_column_is_named(tmp_path: Path) -> None:
+    """Columns that are one but for a factor and an offset, which no diagnosis can part; the first is judged."""
+    random = np.random.default_rng(77)
+    own = 0.05 * random.standard_normal(1500)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", own), "gz": ("deg/s", 0.4 - 1.5 * own)}, 2.0)
+    axes = diagnose(tmp_path / "log.npz", full_rate=True)["axes"]
+    assert axes["gx"]["verdict"] == "adequate"
+    assert "its readings are those of gx" in axes["gz"]["error"]

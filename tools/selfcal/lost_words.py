@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from selfcal.lattice import Lattice, lattice_of
@@ -336,6 +335,8 @@ def _lost(y: Array, value: float, share: float, rate_hz: float) -> Mask:
     if lattice is not None:
         sigma = max(sigma, lattice.step / lattice.coarseness)
     level = uniform_filter1d(others, LEVEL, mode="nearest")
+    from scipy.optimize import brentq  # a quarter of a second to import: for who has lost words alone
+
     level = level[np.clip(np.searchsorted(np.flatnonzero(~own), at), 0, others.size - 1)]
     explained = _explained(value, level, sigma, lattice)
     lost = share * at.size / y.size

@@ -25,6 +25,8 @@ from selfcal.timebase import Clock
 LEAST, MOST = 200, 10_000_000
 #: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
 BEYOND = 100.0
+#: Two axes whose steps correlate this well are one, but for a factor, an offset and the rounding of numbers.
+SAME = 1.0 - 1e-7
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
 
@@ -97,6 +99,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
+    known = [name for k, name in enumerate(known) if _original(recording, name, known[:k]) is None]
     recording, changes = evened(recording)
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
     clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
@@ -275,9 +278,27 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
+    original = _original(recording, name, [one for one in model.axes if one in recording.columns and one != name])
+    if original is not None:
+        return f"its readings are those of {original}, but for a factor and an offset: which column is {name}?"
     if _varies(values):
         return "too few of its readings are none that stick or are clipped"
     return "every reading is the same"
+
+
+def _original(recording: Recording, name: str, others: Sequence[str]) -> str | None:
+    """The axis of `others` that this one is a copy of: no noise of its own."""
+    own = np.diff(recording.columns[name].values)
+    for other in others:
+        theirs = np.diff(recording.columns[other].values)
+        if own.size != theirs.size:
+            continue
+        both = np.isfinite(own) & np.isfinite(theirs)
+        a, b = own[both], theirs[both]
+        size = float(np.dot(a, a)) * float(np.dot(b, b))
+        if both.sum() >= LEAST and size > 0.0 and abs(float(np.dot(a, b))) >= SAME * math.sqrt(size):
+            return other
+    return None
 
 
 def _varies(values: Array) -> bool:

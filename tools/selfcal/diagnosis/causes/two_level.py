@@ -125,7 +125,7 @@ def looks(state: State, record: Record) -> list[Look]:
     worth = net(gain - none, 3, LN_LOOKS)
     if worth < 1.0:
         return []
-    levels = (upper - 0.5)[np.minimum(np.arange(state.y.size) // block, upper.size - 1)]
+    levels = np.where(upper, 0.5, -0.5)[np.minimum(np.arange(state.y.size) // block, upper.size - 1)]
     dt = state.dt * block
     measure = partial(_amplitude, state, levels)
     estimate = {
