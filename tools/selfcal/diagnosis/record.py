@@ -99,7 +99,6 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
-    known = [name for k, name in enumerate(known) if _original(recording, name, known[:k]) is None]
     recording, changes = evened(recording)
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
     clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
@@ -176,6 +175,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
         if _beyond(values[np.isfinite(values)], group) or clock.rate_hz * dt < SLOWEST:
+            continue
+        if _original(recording, name, tuple(states)) is not None:
             continue
         whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
         rows = own_rows(recording, name) if whole and held is None else None
