@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
+from selfcal.sampling import followed_phase
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
@@ -120,9 +122,9 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     frequency = top / grid.size
     block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))
     even = (at - at[0]).astype(np.float64)
-    phase, size_of_line = _phase(x, even, frequency, block)
+    phase, size_of_line = followed_phase(x, even, frequency, block)
     if off is not None:
-        stamped = _phase(x, even + off, frequency, block)
+        stamped = followed_phase(x, even + off, frequency, block)
         phase = stamped[0] if stamped[1] > size_of_line else phase
     # The share that repeats at each phase: where it is no more than chance the row is a new reading.
     bins = max(8, min(BINS, n // IN_BIN))
@@ -165,21 +167,3 @@ def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
     ratio = n / rows.size
     unasked = np.diff(at[rows] - rows, prepend=at[rows[0]] - rows[0])
     return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), even=False)
-
-
-def _phase(x: Array, time: Array, frequency: float, block: int) -> tuple[Array, float]:
-    """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
-    the size of the line. It is whole where x is largest."""
-    edges = np.arange(0, max(1, x.size // block)) * block
-    middle = np.add.reduceat(time, edges) / np.diff(edges, append=x.size)
-    phase = frequency * time
-    for _ in range(3):
-        line = np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)
-        turns = np.unwrap(np.angle(line)) / (2.0 * math.pi)
-        if edges.size < 2:
-            phase = phase + turns[0]
-            continue
-        slope = np.diff(turns) / np.diff(middle)
-        phase = phase + np.interp(time, middle, turns)
-        phase += slope[0] * np.minimum(time - middle[0], 0.0) + slope[-1] * np.maximum(time - middle[-1], 0.0)
-    return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())

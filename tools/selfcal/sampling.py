@@ -335,16 +335,30 @@ def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> F
 
 def _on_grid(time: NDArray[np.float64], dt: float) -> Found:
     """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record."""
-    edges = np.arange(0, max(1, time.size // _PIECE_OF_GRID)) * _PIECE_OF_GRID
-    turns = time / dt
-    for _ in range(3):
-        mean = np.add.reduceat(np.exp(2j * math.pi * turns), edges)
-        phase = np.unwrap(np.angle(mean)) / (2.0 * math.pi)
-        middle = np.add.reduceat(time, edges) / np.diff(edges, append=time.size)
-        turns = turns - (np.interp(time, middle, phase) if edges.size > 1 else phase[0])
+    turns, _ = followed_phase(np.ones(time.size), time, 1.0 / dt, _PIECE_OF_GRID)
     place = np.maximum.accumulate(np.rint(turns).astype(np.int64) - np.arange(time.size))
     missing = np.diff(place, prepend=place[0])
     return float(time[-1]) / (time.size - 1 + int(missing.sum())), missing
+
+
+def followed_phase(
+    x: NDArray[np.float64], time: NDArray[np.float64], frequency: float, block: int
+) -> tuple[NDArray[np.float64], float]:
+    """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
+    the size of the line. It is whole where x is largest."""
+    edges = np.arange(0, max(1, x.size // block)) * block
+    middle = np.add.reduceat(time, edges) / np.diff(edges, append=x.size)
+    phase = frequency * time
+    for _ in range(3):
+        line = np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)
+        turns = np.unwrap(np.angle(line)) / (2.0 * math.pi)
+        if edges.size < 2:
+            phase = phase + turns[0]
+            continue
+        slope = np.diff(turns) / np.diff(middle)
+        phase = phase + np.interp(time, middle, turns)
+        phase += slope[0] * np.minimum(time - middle[0], 0.0) + slope[-1] * np.maximum(time - middle[-1], 0.0)
+    return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())
 
 
 def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:
