@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
@@ -124,6 +125,19 @@ def push(bank: Bank, y: Floats, z: Floats | None = None) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------- records
+
+
+def assert_prediction_is_that_of_a_gap(tables: Tables, y: Floats, z: Floats | None, horizons: Sequence[int]) -> None:
+    """selfcal_predict() so many bank samples ahead against the filters through a gap: 1e-3 of the sd, on both."""
+    before = Bank(tables)
+    push(before, y, z)
+    for horizon, (mean, sd) in zip(horizons, before.raw.predict(0, [float(h) for h in horizons]), strict=True):
+        bank = Bank(tables)
+        push(bank, y, z)
+        bank.raw.skip(horizon)
+        after = bank.report(0)
+        assert mean == pytest.approx(after.bias_mean, abs=1e-3 * after.bias_sd)
+        assert sd == pytest.approx(after.bias_sd, rel=1e-3)
 
 
 def columns_of(n: int, seed: int) -> Floats:

@@ -36,6 +36,7 @@ from agreement import (
     Nodes,
     a_bank,
     a_record,
+    assert_prediction_is_that_of_a_gap,
     columns_of,
     compare,
     faded,
@@ -178,16 +179,7 @@ def test_prediction_is_that_of_a_gap(law: str, columns: int) -> None:
     made = tables("host", columns, only=law)
     y, _ = a_record(law, 300, 5)
     z = columns_of(300, 5)[:, :columns] if columns else None
-    before = Bank(made)
-    push(before, y, z)
-    horizons = [1, 10, 100, 3000]
-    for horizon, (mean, sd) in zip(horizons, before.raw.predict(0, [float(h) for h in horizons]), strict=True):
-        bank = Bank(made)
-        push(bank, y, z)
-        bank.raw.skip(horizon)
-        after = bank.report(0)
-        assert mean == pytest.approx(after.bias_mean, abs=1e-3 * after.bias_sd)
-        assert sd == pytest.approx(after.bias_sd, rel=1e-3)
+    assert_prediction_is_that_of_a_gap(made, y, z, [1, 10, 100, 3000])
 
 
 @pytest.mark.parametrize("build", ["float", "double", "fixed"])
