@@ -326,6 +326,8 @@ def _beside_values(value: Array, count: Array, width: float) -> tuple[Array, Arr
 def _lost(y: Array, value: float, share: float, rate_hz: float) -> Mask:
     """Which readings [n] of a value are lost words, a `share` of them: those that the noise about the level of their
     neighbours explains least. Where both are possible chance decides, so that as many are left as the noise makes."""
+    from scipy.optimize import brentq  # a quarter of a second to import: for who has lost words alone
+
     own: Mask = y == value
     if share == 1.0:
         return own
@@ -335,8 +337,6 @@ def _lost(y: Array, value: float, share: float, rate_hz: float) -> Mask:
     if lattice is not None:
         sigma = max(sigma, lattice.step / lattice.coarseness)
     level = uniform_filter1d(others, LEVEL, mode="nearest")
-    from scipy.optimize import brentq  # a quarter of a second to import: for who has lost words alone
-
     level = level[np.clip(np.searchsorted(np.flatnonzero(~own), at), 0, others.size - 1)]
     explained = _explained(value, level, sigma, lattice)
     lost = share * at.size / y.size
