@@ -27,7 +27,7 @@
  *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once
  *   |B| or C has reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is
  *   never: C takes 2^35 samples, and the count is 32 bits. How long a record keeps its accuracy is another matter:
- *   GUARD BITS, selfcal.h at SELFCAL_FIXED.
+ *   GUARD BITS, selfcal_tables.h at SELFCAL_FIXED.
  *
  * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for
  * all. >> of a negative number must be arithmetic, as it is with every compiler of these parts. */

@@ -1,5 +1,5 @@
 /* The structs that a caller places, with their sizes. selfcal.h includes this file. Members belong to the library, save
- * those that selfcal.h says may be read. */
+ * those that selfcal.h and selfcal_parts.h name. */
 #ifndef SELFCAL_LAYOUT_H
 #define SELFCAL_LAYOUT_H
 

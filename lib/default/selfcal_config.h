@@ -1,5 +1,5 @@
 /* Made by `selfcal codegen` from the model 'default' for cortex-m4f. Do not edit.
- * The compiler's command line may set any of these. lib/selfcal.h says what each is. */
+ * The compiler's command line may set any of these. lib/selfcal_tables.h explains each. */
 #ifndef SELFCAL_CONFIG_H
 #define SELFCAL_CONFIG_H
 

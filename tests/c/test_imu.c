@@ -1,4 +1,4 @@
-/* The pipe: bit for bit what its parts do, called by hand after the rules that selfcal.h states at each of them. */
+/* The pipe: bit for bit what its parts do, called by hand after the rules that selfcal_parts.h states at each. */
 #include "noise.h"
 #include "selfcal_frames.h"
 #include "selfcal_model.h"

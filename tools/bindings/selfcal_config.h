@@ -1,5 +1,5 @@
-/* Sizes of the Python package's builds, which take any model: see lib/selfcal.h. `selfcal codegen` writes such a file
- * for a model. */
+/* Sizes of the Python package's builds, which take any model: see lib/selfcal_tables.h. `selfcal codegen` writes such
+ * a file for a model. */
 #ifndef SELFCAL_CONFIG_H
 #define SELFCAL_CONFIG_H
 

@@ -1,5 +1,6 @@
-"""Laws as data: a law is the terms of its drift and the kind of its white noise (`selfcal_law_t` in lib/selfcal.h).
+"""Laws as data: a law is the terms of its drift and the kind of its white noise.
 
+In C it is `selfcal_law_t` (lib/selfcal_tables.h).
 `NAMED` holds the laws that a model file may give by name alone. A model file states any other law as a list of terms.
 """
 
@@ -111,7 +112,7 @@ class Law:
 
     @staticmethod
     def bandwidth(term: Term) -> float:
-        """As lib/selfcal.h has it: 0 of a walk."""
+        """As lib/selfcal_tables.h has it: 0 of a walk."""
         return 0.0 if term.kind == "walk" else term.bandwidth
 
     def node(self, parameters: Mapping[str, float]) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from selfcal.warm import load as load_start
 from selfcal.warm import warmed
 from selfcal.wire import carries
 
-#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal.h, SIGMA_BITS in bank_kernel_fixed.c.
+#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal_parts.h, SIGMA_BITS in bank_kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
 
 #: Nodes of a grid at least, of a model that has none.
@@ -155,7 +155,7 @@ def _config(model: Model, tables: Tables, target: str) -> str:
     defined += ["FIXED"] if core_of(target) in WITHOUT_FPU else []
     macros = "".join(f"#ifndef SELFCAL_{one.split()[0]}\n#define SELFCAL_{one}\n#endif\n" for one in defined)
     return f"""/* Made by `selfcal codegen` from the model '{remark(model.name)}' for {target}. Do not edit.
- * The compiler's command line may set any of these. lib/selfcal.h says what each is. */
+ * The compiler's command line may set any of these. lib/selfcal_tables.h explains each. */
 #ifndef SELFCAL_CONFIG_H
 #define SELFCAL_CONFIG_H
 
