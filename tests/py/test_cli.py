@@ -11,12 +11,13 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
 import selfcal
 from selfcal import cli
-from selfcal.loaders import READ
+from selfcal.loaders import READ, Reading
 
 from conftest import CALLED, COMMAND, ROOT, run
 
@@ -221,6 +222,8 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
     named |= {"column": "columns", "unit": "units", "from": "start", "no_suspicion": "suspicion"}
     function = getattr(import_module(f"selfcal.verbs.{verb}"), verb)
     keywords = set(inspect.signature(function).parameters)
+    if "reading" in keywords:
+        keywords |= Reading.__annotations__.keys()
     command = typer.main.get_command(cli.app)
     assert isinstance(command, typer.core.TyperGroup)
     options = {
@@ -231,6 +234,19 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
     ensemble = {"records", "results", "samples", "scheduler", "seed", "truth"} if verb == "rivals" else set()
     known = {named.get(option, option) for option in options - ensemble - {"help"}}
     assert known <= keywords, known - keywords
+
+
+def test_compare_reads_foreign_headers(tmp_path: Path) -> None:
+    """Truth: N of the two logs, 0.04 and 0.05 deg/s/sqrt(Hz), 2000 samples at 1 Hz: 10 sd apart."""
+    draw = np.random.default_rng(88)
+    for name, sigma in (("a.csv", 0.04), ("b.csv", 0.05)):
+        np.savetxt(tmp_path / name, sigma * draw.standard_normal(2000), header="turn", comments="")
+    reading = ("--column", "gx=turn", "--unit", "gx=deg/s", "--rate", "1")
+    done = run("compare", "a.csv", "b.csv", *reading, "--fail-on", "changed", "--json", "c.json", cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    [change] = [one for one in json.loads((tmp_path / "c.json").read_text())["axes"]["gx"] if one["quantity"] == "N"]
+    assert abs(change["before"] / 0.04 - 1.0) < 0.1
+    assert abs(change["after"] / 0.05 - 1.0) < 0.1
 
 
 def test_interrupt_is_clean() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -15,7 +16,7 @@ from typer.exceptions import TyperException
 
 from selfcal.ending import Held, install, last_signal, leave
 from selfcal.errors import UserError, called, note, printable
-from selfcal.loaders import READ, WRITTEN
+from selfcal.loaders import READ, WRITTEN, Reading
 
 app = typer.Typer(
     help="An inertial sensor at rest identifies its own error model.",
@@ -130,6 +131,17 @@ Source = Annotated[
     typer.Option("--source", metavar="NAME", help="Sensor to read of a log that has several (repeat for more)"),
 ]
 Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE.dbc", help="Signals of a log of CAN frames")]
+#: What `Reading` is made of on the command line, with its default.
+_READING: Mapping[str, tuple[Any, Any]] = {
+    "rate": (Rate, None),
+    "column": (Column, None),
+    "unit": (Unit, None),
+    "scale": (Scale, None),
+    "no_time": (NoTime, False),
+    "skip_bad": (SkipBad, False),
+    "source": (Source, None),
+    "dbc": (Dbc, None),
+}
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
@@ -137,6 +149,39 @@ Scheduler = Annotated[
 Results = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder that keeps finished records, so that a later run goes on")
 ]
+
+
+def _reading_logs(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `recording.Reading`; they reach it together, as its argument `reading`."""
+
+    def run(**given: Any) -> None:
+        from selfcal.recording import parse_pairs, parse_scales
+
+        option = {name: given.pop(name) for name in _READING}
+        command(
+            **given,
+            reading={
+                "rate": option["rate"],
+                "columns": parse_pairs("--column", option["column"] or ()),
+                "units": parse_pairs("--unit", option["unit"] or ()),
+                "scale": parse_scales(option["scale"] or ()),
+                "no_time": option["no_time"],
+                "skip_bad": option["skip_bad"],
+                "source": option["source"] or (),
+                "dbc": option["dbc"],
+            },
+        )
+
+    own = [one for one in signature(command, eval_str=True).parameters.values() if one.name != "reading"]
+    added = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in _READING.items()
+    ]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    run.__annotations__ = {one.name: one.annotation for one in (*own, *added)}
+    shown = Signature([one.replace(kind=Parameter.KEYWORD_ONLY) for one in own] + added)
+    run.__signature__ = shown  # type: ignore[attr-defined]
+    return run
 
 
 def _judge(result: Mapping[str, Any], fail_on: str | None) -> None:
@@ -153,7 +198,9 @@ def _judge(result: Mapping[str, Any], fail_on: str | None) -> None:
 
 
 @app.command()
+@_reading_logs
 def identify(
+    reading: Reading,
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
@@ -187,17 +234,8 @@ def identify(
     end: End = None,
     since_power_on: SincePowerOn = 0.0,
     gate: Gate = False,
-    rate: Rate = None,
-    column: Column = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    no_time: NoTime = False,
-    skip_bad: SkipBad = False,
-    source: Source = None,
-    dbc: Dbc = None,
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
-    from selfcal.recording import parse_pairs, parse_scales
     from selfcal.table import show
     from selfcal.verbs import identify as verb
 
@@ -218,21 +256,16 @@ def identify(
         end_s=end,
         since_power_on_s=since_power_on,
         gate=gate,
-        rate=rate,
-        columns=parse_pairs("--column", column or ()),
-        units=parse_pairs("--unit", unit or ()),
-        scale=parse_scales(scale or ()),
-        no_time=no_time,
-        skip_bad=skip_bad,
-        source=source or (),
-        dbc=dbc,
+        **reading,
     )
     show(result, to_stderr=str(json) == "-", datasheet=table_units is Units.datasheet)
     _judge(result, fail_on)
 
 
 @app.command()
+@_reading_logs
 def diagnose(
+    reading: Reading,
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
@@ -258,17 +291,8 @@ def diagnose(
     end: End = None,
     since_power_on: SincePowerOn = 0.0,
     gate: Gate = False,
-    rate: Rate = None,
-    column: Column = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    no_time: NoTime = False,
-    skip_bad: SkipBad = False,
-    source: Source = None,
-    dbc: Dbc = None,
 ) -> None:
     """What the model gets wrong in a recording at rest, why, and what mending it gains."""
-    from selfcal.recording import parse_pairs, parse_scales
     from selfcal.verbs import diagnose as verb
 
     result = verb.diagnose(
@@ -286,21 +310,16 @@ def diagnose(
         end_s=end,
         since_power_on_s=since_power_on,
         gate=gate,
-        rate=rate,
-        columns=parse_pairs("--column", column or ()),
-        units=parse_pairs("--unit", unit or ()),
-        scale=parse_scales(scale or ()),
-        no_time=no_time,
-        skip_bad=skip_bad,
-        source=source or (),
-        dbc=dbc,
+        **reading,
     )
     verb.show(result, to_stderr=str(json) == "-")
     _judge(result, fail_on)
 
 
 @app.command()
+@_reading_logs
 def compare(
+    reading: Reading,
     logs: Annotated[
         list[Path], typer.Argument(metavar="LOG LOG...", help=f"Recordings of one part: {READ}", show_default=False)
     ],
@@ -318,8 +337,6 @@ def compare(
     start: Start = None,
     end: End = None,
     gate: Gate = False,
-    source: Source = None,
-    dbc: Dbc = None,
     json: Json = None,
 ) -> None:
     """What changed between recordings of one part, beyond what each leaves open."""
@@ -334,50 +351,37 @@ def compare(
         start_s=start,
         end_s=end,
         gate=gate,
-        source=source or (),
-        dbc=dbc,
         json=json,
+        **reading,
     )
     verb.show(result, to_stderr=str(json) == "-")
     _judge(result, fail_on)
 
 
 @app.command()
+@_reading_logs
 def convert(
+    reading: Reading,
     log: Log,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help=f"Recording to write: {WRITTEN}", show_default=False)
     ],
-    rate: Rate = None,
-    column: Column = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    no_time: NoTime = False,
-    skip_bad: SkipBad = False,
-    source: Source = None,
-    dbc: Dbc = None,
 ) -> None:
     """Write a log of any form as a recording that every other program reads."""
-    from selfcal.recording import parse_pairs, parse_scales
     from selfcal.verbs import convert as verb
 
     result = verb.convert(
         log,
         output,
-        rate=rate,
-        columns=parse_pairs("--column", column or ()),
-        units=parse_pairs("--unit", unit or ()),
-        scale=parse_scales(scale or ()),
-        no_time=no_time,
-        skip_bad=skip_bad,
-        source=source or (),
-        dbc=dbc,
+        **reading,
     )
     verb.show(result, output)
 
 
 @app.command()
+@_reading_logs
 def rivals(
+    reading: Reading,
     log: Annotated[
         Path | None,
         typer.Argument(metavar="[LOG]", help=f"Recording: {READ}; or give --records", show_default=False),
@@ -403,17 +407,8 @@ def rivals(
     scheduler: Scheduler = None,
     results: Results = None,
     json: Json = None,
-    rate: Rate = None,
-    column: Column = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    no_time: NoTime = False,
-    skip_bad: SkipBad = False,
-    source: Source = None,
-    dbc: Dbc = None,
 ) -> None:
     """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
-    from selfcal.recording import parse_pairs, parse_scales
     from selfcal.verbs import rivals as verb
 
     if (log is None) == (records is None):
@@ -441,14 +436,7 @@ def rivals(
         decimate=decimate,
         only=only or (),
         json=json,
-        rate=rate,
-        columns=parse_pairs("--column", column or ()),
-        units=parse_pairs("--unit", unit or ()),
-        scale=parse_scales(scale or ()),
-        no_time=no_time,
-        skip_bad=skip_bad,
-        source=source or (),
-        dbc=dbc,
+        **reading,
     )
     verb.show(result, to_stderr=str(json) == "-")
 
@@ -472,7 +460,9 @@ def simulate(
 
 
 @app.command()
+@_reading_logs
 def replay(
+    reading: Reading,
     log: Log,
     axis: Axis = None,
     model: ModelFile = None,
@@ -491,17 +481,8 @@ def replay(
     since_power_on: SincePowerOn = 0.0,
     json: Json = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
-    rate: Rate = None,
-    column: Column = None,
-    unit: Unit = None,
-    scale: Scale = None,
-    no_time: NoTime = False,
-    skip_bad: SkipBad = False,
-    source: Source = None,
-    dbc: Dbc = None,
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
-    from selfcal.recording import parse_pairs, parse_scales
     from selfcal.table import show
     from selfcal.verbs import replay as verb
 
@@ -520,14 +501,7 @@ def replay(
         since_power_on_s=since_power_on,
         json=json,
         plot=plot,
-        rate=rate,
-        columns=parse_pairs("--column", column or ()),
-        units=parse_pairs("--unit", unit or ()),
-        scale=parse_scales(scale or ()),
-        no_time=no_time,
-        skip_bad=skip_bad,
-        source=source or (),
-        dbc=dbc,
+        **reading,
     )
     show(result, to_stderr=str(json) == "-")
 

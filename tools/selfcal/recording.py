@@ -60,7 +60,6 @@ _LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
 _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
 _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
 
-_NOTHING: Mapping[str, str] = MappingProxyType({})
 
 #: Size of one LSB, with its unit unless the column's usual one is meant.
 Scale = tuple[float, str | None]
@@ -303,8 +302,8 @@ class _Field:
 def load(
     path: Path | str | Sequence[Path | str],
     rate: float | None = None,
-    columns: Mapping[str, str] = _NOTHING,
-    units: Mapping[str, str] = _NOTHING,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
     scale: Mapping[str, Scale] | float | None = None,
     sensors: Collection[str] = SENSORS,
     *,
@@ -327,6 +326,7 @@ def load(
     for 10^6 CSV rows of 7 columns.
     """
     paths = list_of(path)
+    columns, units = columns or {}, units or {}
     by_name: Mapping[str, Scale] = {"": (float(scale), None)} if isinstance(scale, int | float) else scale or {}
     if rate is not None and not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")

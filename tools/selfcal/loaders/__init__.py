@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
 from selfcal.errors import UserError
+
+if TYPE_CHECKING:
+    from selfcal.recording import Scale
 
 #: Text, each with .gz too.
 TEXT = (".csv", ".tsv", ".txt", ".log")
@@ -58,6 +63,19 @@ READ = (
     f"{', '.join((*TEXT, ZIP, *(suffix for one in FORMATS for suffix in one.suffixes)))}; .gz of text; a ROS 2 folder"
 )
 WRITTEN = ".csv, .csv.gz or .npz"
+
+class Reading(TypedDict, total=False):
+    """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
+
+    rate: float | None
+    columns: Mapping[str, str] | None
+    units: Mapping[str, str] | None
+    scale: Mapping[str, Scale] | float | None
+    no_time: bool
+    skip_bad: bool
+    source: Sequence[str]
+    dbc: Path | str | None
+
 
 #: Bytes from a file's begin that tell its format.
 _HEAD = 520

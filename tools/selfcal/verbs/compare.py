@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from rich import box
 from rich.console import Console
@@ -17,6 +17,7 @@ from selfcal.document import check_writable, write_json
 from selfcal.ending import Held
 from selfcal.errors import UserError, called, printable
 from selfcal.fail_on import CHANGED, check
+from selfcal.loaders import Reading
 from selfcal.result import HALF_90
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -38,16 +39,15 @@ def compare(
     start_s: float | None = None,
     end_s: float | None = None,
     gate: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
     json: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; and the `verdicts` by recording and axis. An axis that two successive recordings do
     not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
-    `decimate`, `start_s`, `end_s`, `gate`, `source`, `dbc`: as `diagnose` has them, of each recording. `fail_on`: see
+    `decimate`, `start_s`, `end_s`, `gate`, `reading`: as `diagnose` has them, of each recording. `fail_on`: see
     fail_on.py; it is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
@@ -58,7 +58,7 @@ def compare(
     seen = []
     verdicts: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
-    part |= {"source": source, "dbc": dbc}
+    part |= reading
     for log in logs:
         identified = identify(log, suspicion=False, **part)["axes"]
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.errors import UserError
+from selfcal.loaders import Reading
 from selfcal.output import check_place
-from selfcal.recording import Recording, Scale, list_of, load, save
+from selfcal.recording import Recording, list_of, load, save
 
 #: Stamps closer than this, as a share of the fastest axes' interval, are one row.
 _ONE_ROW = 0.01
@@ -19,15 +21,7 @@ _ONE_ROW = 0.01
 def convert(
     log: Path | str | Sequence[Path | str],
     output: Path | str,
-    *,
-    rate: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    scale: Mapping[str, Scale] | float | None = None,
-    no_time: bool = False,
-    skip_bad: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> Recording:
     """Write a recording as .csv, .csv.gz or .npz, and return it. The options are `load`'s.
 
@@ -37,9 +31,7 @@ def convert(
     if Path(output).resolve() in {path.resolve() for path in list_of(log)}:
         raise UserError(f"{output}: is the log itself: give another file with -o")
     check_place(output)
-    recording = load(
-        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-    )
+    recording = load(log, **reading)
     times = {id(one.clock): _stamps(recording, name) for name, one in recording.columns.items()}
     rows = _rows(list(times.values()), _ONE_ROW / recording.rate_hz)
     table = {}

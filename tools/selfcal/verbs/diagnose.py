@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, Unpack
 
 from rich.console import Console
 
@@ -23,10 +23,11 @@ from selfcal.document import check_writable, of_errors, parameters_entry, record
 from selfcal.ending import Held, Stopped, abandon, held
 from selfcal.errors import UserError, note, printable
 from selfcal.fail_on import check
+from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.output import write_text
 from selfcal.progress import Doing
-from selfcal.recording import Recording, Scale, list_of, load
+from selfcal.recording import Recording, list_of, load
 from selfcal.table import since
 from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
 
@@ -54,14 +55,7 @@ def diagnose(
     end_s: float | None = None,
     since_power_on_s: float = 0.0,
     gate: bool = False,
-    rate: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    scale: Mapping[str, Scale] | None = None,
-    no_time: bool = False,
-    skip_bad: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
@@ -87,17 +81,13 @@ def diagnose(
     if write_model is not None:
         check_not_by_hand(write_model)
     loaded = Model.load(model)
-    recording = load(
-        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-    )
+    recording = load(log, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     second = None
     if on is not None:
-        second = load(
-            on, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-        )
+        second = load(on, **reading)
     first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ from selfcal.errors import OutsidePriors, UserError
 from selfcal.export import FORMS, write_export
 from selfcal.fail_on import check
 from selfcal.gate import gated
+from selfcal.loaders import Reading
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
 from selfcal.readings import look
-from selfcal.recording import Recording, Scale, as_float, list_of, load
+from selfcal.recording import Recording, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
@@ -59,14 +60,7 @@ def identify(
     end_s: float | None = None,
     since_power_on_s: float = 0.0,
     gate: bool = False,
-    rate: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    scale: Mapping[str, Scale] | None = None,
-    no_time: bool = False,
-    skip_bad: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
@@ -97,9 +91,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    recording = load(
-        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-    )
+    recording = load(log, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     found: dict[str, Identified | UserError] = {}

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -30,10 +30,11 @@ from selfcal.ending import held
 from selfcal.errors import OutsidePriors, UserError, called, note
 from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
+from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
 from selfcal.readings import look
-from selfcal.recording import SIDE_CHANNELS, Recording, Scale, as_float, list_of, load
+from selfcal.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
 from selfcal.regressors import (
     Choice,
     Inclusion,
@@ -106,14 +107,7 @@ def replay(
     since_power_on_s: float = 0.0,
     json: Path | str | None = None,
     plot: Path | str | None = None,
-    rate: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    scale: Mapping[str, Scale] | None = None,
-    no_time: bool = False,
-    skip_bad: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
@@ -147,9 +141,7 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(
-        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-    )
+    recording = load(log, **reading)
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))

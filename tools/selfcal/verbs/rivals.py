@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,12 @@ from selfcal import units
 from selfcal.document import check_writable, recording_entry, write_json
 from selfcal.errors import UserError, first_line, note, printable
 from selfcal.laws import NAMED, PLAIN
+from selfcal.loaders import Reading
 from selfcal.methods import RIVALS, Rival
 from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
 from selfcal.model import DEFAULT, Model
-from selfcal.recording import Recording, Scale, as_float, load
+from selfcal.recording import Recording, as_float, load
 from selfcal.spread import record_seeds, spread, workers
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
@@ -60,14 +61,7 @@ def rivals(
     decimate: float | None = None,
     only: Sequence[str] = (),
     json: Path | str | None = None,
-    rate: float | None = None,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    scale: Mapping[str, Scale] | None = None,
-    no_time: bool = False,
-    skip_bad: bool = False,
-    source: Sequence[str] = (),
-    dbc: Path | str | None = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Run the library and every other method of `selfcal.methods` on the same block means of each axis.
 
@@ -80,9 +74,7 @@ def rivals(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded = Model.load(model)
-    recording = load(
-        log, rate, columns or {}, units or {}, scale, no_time=no_time, skip_bad=skip_bad, source=source, dbc=dbc
-    )
+    recording = load(log, **reading)
     names = chosen_axes(recording, loaded, axes)
     found: dict[str, Any] = {}
     console = Console(stderr=True)
