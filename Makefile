@@ -26,6 +26,7 @@
 #   make setup-all              every reader of other programs' logs too (400 MB); `make test` runs it
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make setup-packages         what packs lib/ for the registries of PlatformIO and ESP-IDF (70 MB)
+#   make docs                   these pages, the header and the Python functions as a site, build/docs/site/index.html
 #   make lock [UPGRADE=1 | UPGRADE=name]
 #                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
@@ -114,7 +115,7 @@ lock:
 	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --output-file requirements-all.txt pyproject.toml
 
 # Packages that few need, each group by itself: `make setup-rivals` and so on.
-OPTIONAL := rivals cluster packages
+OPTIONAL := rivals cluster packages docs
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
 	$(PIP_INSTALL) --requirement tools/requirements-$*.txt
@@ -131,6 +132,13 @@ $(VENV)/all.stamp: tools/requirements-all.txt $(VENV)/requirements.stamp
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
                           $(wildcard tools/selfcal/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
+
+# The pages as they lie in the repository, so that each link between them holds. A broken one fails.
+.PHONY: docs
+docs: setup-docs
+	rm -rf $(BUILD)/docs && mkdir -p $(BUILD)/docs/src
+	git ls-files -z | xargs -0 cp --parents -t $(BUILD)/docs/src
+	cd tools/docs && NO_MKDOCS_2_WARNING=1 $(abspath $(BIN))/python -m mkdocs build
 
 # ---------------------------------------------------------------------------------------------------------------- run
 
