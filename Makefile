@@ -18,8 +18,9 @@
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed]
 #                               random calls of the library under sanitizers, 10^7 executions
-#   make firmware [TARGET=...] [CFLAGS=...] [NODE=n] [ACCEPT=1]
-#                               build/TARGET/selfcal.elf, .bin, .hex of each board; sizes; fails above a budget
+#   make firmware [TARGET=...] [SENSOR=icm42688] [CFLAGS=...] [NODE=n] [ACCEPT=1]
+#                               build/TARGET/selfcal.elf, .bin, .hex of each board; sizes; fails above a budget.
+#                               With another sensor than the ADIS16405: build/TARGET-SENSOR
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 #   make setup                  the set-up alone
@@ -154,10 +155,10 @@ posix: $(MODEL)/selfcal_model.c
 
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
 WARNINGS_DOUBLE := $(filter-out -Wdouble-promotion,$(WARNINGS))
-INCLUDES := -Ilib -Iport -Iport/app -Iport/replay -I$(MODEL)
+INCLUDES := -Ilib -Iport -Iport/app -Iport/sensors -Iport/replay -I$(MODEL) -DSENSOR=adis16405
 # What the tests look at beyond the default model.
 TEST_SIZES := -DSELFCAL_HYPOTHESES_MAX=4 -DSELFCAL_REGRESSORS_MAX=6
-TESTED := $(wildcard lib/*.c port/app/*.c) $(MODEL)/selfcal_model.c
+TESTED := $(wildcard lib/*.c port/app/*.c) port/sensors/sensor.c $(MODEL)/selfcal_model.c
 TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
@@ -233,16 +234,16 @@ $(BUILD)/c/fixed/%: C := $(SANITIZED) -DSELFCAL_FIXED
 # From a folder four levels below to this one, whose path may have spaces.
 BACK := ../../../..
 define C_TESTS
-$(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h) $(UNITY)
+$(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h port/sensors/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
 	cd $$(@D)/objects && $(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES:-I%=-I$(BACK)/%) \
 	    -c $(TESTED:%=$(BACK)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
-$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
+$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a $(wildcard tests/c/*.h)
 	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
 	    $$(filter-out %.h,$$^) -lm -o $$@
-$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a tests/c/noise.h tests/c/laws.h
+$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a $(wildcard tests/c/*.h)
 	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
 	    $$(filter-out %.h,$$^) -lm -o $$@
 endef
@@ -282,20 +283,25 @@ $(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch]) | $(MODEL
 
 .PHONY: firmware firmware-images flash
 WANTED := $(filter $(or $(TARGET),$(BOARDS)),$(BOARDS))
-NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no CFLAGS
+NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no SENSOR, no CFLAGS
+# The default sensor is the default model's; another one has a model file of its name.
+OTHER_SENSOR := $(filter-out adis16405,$(SENSOR))
+IMAGES = $(BUILD)/$(1)$(OTHER_SENSOR:%=-%)
+SENSOR_MODEL := tools/selfcal/models/$(or $(OTHER_SENSOR),default).yaml
 
 firmware: setup firmware-images $(if $(ACCEPT),bench-images)
-	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py $(WANTED)
-	@$(if $(ACCEPT),$(if $(TARGET)$(CFLAGS),$(error $(NOT_ALL))))
+	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py \
+	    --sensor $(SENSOR) $(WANTED)
+	@$(if $(ACCEPT),$(if $(TARGET)$(OTHER_SENSOR)$(CFLAGS),$(error $(NOT_ALL))))
 	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
 
 define FIRMWARE_IMAGE
 .PHONY: image-$(1)
-image-$(1): $(BUILD)/$(1)/model/selfcal_model.c
-	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) \
-	    TARGET=$(1) MODEL_DIR=$(BUILD)/$(1)/model OUT=$(BUILD)/$(1)
-$(BUILD)/$(1)/model/selfcal_model.c: $(MODEL)/selfcal_model.c
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(CORE_$(1))
+image-$(1): $(IMAGES)/model/selfcal_model.c
+	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) SENSOR=$(SENSOR) \
+	    TARGET=$(1) MODEL_DIR=$(IMAGES)/model OUT=$(IMAGES)
+$(IMAGES)/model/selfcal_model.c: $(MODEL)/selfcal_model.c $(SENSOR_MODEL)
+	$(BIN)/selfcal codegen $(SENSOR_MODEL) -o $$(@D) --target $(CORE_$(1))
 endef
 $(foreach target,$(BOARDS),$(eval $(call FIRMWARE_IMAGE,$(target))))
 firmware-images: $(WANTED:%=image-%)
@@ -441,7 +447,7 @@ check-ruff: $(PACKAGE)
 
 check-mypy: $(PACKAGE)
 	@cd tools && ../$(BIN)/mypy --no-error-summary
-	@$(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
+	@MYPYPATH=host_sim $(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py
 	@cd tools && ../$(BIN)/mypy --no-error-summary \
 	    $(addprefix ../tests/hidden/,generator.py judge.py rivals.py false_alarms.py \

@@ -21,4 +21,4 @@ arm_objects = $(call arm_each,arm-none-eabi-gcc -O2 $(ARM_COMPILE) $(1),$(filter
 	    $(filter-out $(ARM_FAST),$(2)),$(3))
 
 # What a replayed recording needs of the application: the board's sensor, with rates of its own, is left out.
-APP_WITHOUT_SENSOR := $(filter-out port/app/module.c port/app/sensor.c,$(wildcard port/app/*.c))
+APP_WITHOUT_SENSOR := $(filter-out port/app/module.c port/app/readings.c,$(wildcard port/app/*.c))

@@ -5,7 +5,7 @@
 include port/arm.mk
 
 NOT_THE_LIBRARYS := -DAPP_% -DSELFCAL_MODEL_% -DSELFCAL_NODE=% \
-                     -DBOARD_% -DADIS16405_% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c
+                     -DBOARD_% -DSENSOR% -DQEMU_% -DSAME_% -DBENCH_% -W% %.c
 LIBRARY_FLAGS := $(strip $(ARM_$(CORE)) -fstack-usage -g $(filter-out $(NOT_THE_LIBRARYS),$(PROGRAM_FLAGS)))
 LIBRARY_SOURCES := $(wildcard lib/*.c lib/*.h) port/arm.mk
 # Named by the content of all that it is made of: no time stamp takes old objects for new ones.

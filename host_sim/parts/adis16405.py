@@ -99,6 +99,7 @@ class Adis16405:
         self._stop()
         self.registers = {0x34: 0x0006, 0x36: 0x0001, 0x38: 0x0402, 0x3C: 0, 0x40: 0, 0x48: 0, 0x56: self.product}
         self.registers |= self.factory
+        self.half: int | None = None  # the first byte of a frame
         self.out = dict.fromkeys(OUTPUTS, 0)
         self.new = dict.fromkeys(OUTPUTS, False)
         self.answer = 0
@@ -158,6 +159,7 @@ class Adis16405:
             self.machine.violations.append(f"ADIS16405: less than {stall_us:g} us between frames")
         self.selected = low
         self.burst_at = None
+        self.half = None
 
     @property
     def slow(self) -> bool:
@@ -169,32 +171,39 @@ class Adis16405:
         """Whether it answers."""
         return self.connected and not self.dead and self.machine.time_us >= self.booted_at
 
-    def frame(self, out: int, mode: int, sck_hz: float, end_us: float) -> int:
+    def exchange(self, byte: int, mode: int, sck_hz: float, end_us: float) -> int:
+        """A byte each way, the last bit at `end_us`; two make a frame."""
+        if self.half is None:
+            self.half, self.low = byte, self._shifting_out()
+            return self.low >> 8
+        self._frame(self.half << 8 | byte, mode, sck_hz, end_us)
+        self.half = None
+        return self.low & 0xFF
+
+    def _frame(self, out: int, mode: int, sck_hz: float, end_us: float) -> None:
         """16 bits each way, the last at `end_us`; `mode` is the SPI mode of the master."""
         self.frames += 1
         self.frame_end = end_us
         if not self.listening or not self.selected:
-            return 0xFFFF if self.floating_high else 0x0000
+            return
         if mode != 3:
             self.machine.violations.append(f"ADIS16405: SPI mode {mode}")
-            return self.machine.random.getrandbits(16)
+            return
         if sck_hz > (3e5 if self.slow else 2e6):
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz")
-        if self.burst_at is not None:
-            return self._burst_word(sck_hz)
-        answer = self.answer
         address = out >> 8 & 0x7F
-        if out >> 15:
+        if self.burst_at is not None:
+            self._burst_word(sck_hz)
+        elif out >> 15:
             self._write(address, out & 0xFF)
         elif out == 0x3E00:
             self.burst_at = 0
             self.bursts += 1
         else:
             self.answer = self._read(address & ~1)
-        return answer
 
-    def shifting_out(self) -> int:
-        """What it will answer the next frame with: for a master that takes a frame in two halves."""
+    def _shifting_out(self) -> int:
+        """What it will answer the next frame with."""
         if not self.listening or not self.selected:
             return 0xFFFF if self.floating_high else 0x0000
         if self.burst_at is None or self.burst_at >= len(OUTPUTS):
@@ -205,7 +214,7 @@ class Adis16405:
         """An output register as it is read."""
         return self.out[address] | self.new[address] << 15 | (self.registers[0x3C] != 0) << 14
 
-    def _burst_word(self, sck_hz: float) -> int:
+    def _burst_word(self, sck_hz: float) -> None:
         if sck_hz > 1e6:
             self.machine.violations.append(f"ADIS16405: SCK {sck_hz:g} Hz in a burst")
         position = self.burst_at or 0
@@ -216,8 +225,8 @@ class Adis16405:
             self._read_once = self.taken[-1][0]
         if position >= len(OUTPUTS):
             self.machine.violations.append("ADIS16405: a burst of more than 12 words")
-            return 0
-        return self._read(OUTPUTS[position])
+        else:
+            self._read(OUTPUTS[position])
 
     def _read(self, address: int) -> int:
         if address in self.out:

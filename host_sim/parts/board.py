@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import can
 from unicorn import arm_const as arm
@@ -35,18 +36,43 @@ def resting(seed: int) -> Callable[[int], Sample]:
     return sample
 
 
+class Sensor(Protocol):
+    """A sensor at its pins. A part has other members of its own, which break it."""
+
+    on_ready: Callable[[bool], None]
+
+    def select(self, low: bool) -> None:
+        """Chip select."""
+
+    def exchange(self, byte: int, mode: int, sck_hz: float, end_us: float, /) -> int:
+        """A byte each way, the last bit at `end_us`; `mode` is the SPI mode of the master."""
+
+    def reset_line(self, level: bool) -> None:
+        """Low holds it in reset."""
+
+    def power_on(self) -> None:
+        """The supply comes."""
+
+
 class Bench:
     """What every board has. `frames`: the telemetry heard, with the time in us. `SLOTS`: where the flash keeps the
-    saved state, two slots `STRIDE` apart."""
+    saved state, two slots `STRIDE` apart. `sensor` makes the sensor; an ADIS16405 that measures `source` by default."""
 
     SLOTS = STRIDE = 0
 
-    def __init__(self, elf: Path, seed: int, core: Core, source: Callable[[int], Sample] | None) -> None:
+    def __init__(
+        self,
+        elf: Path,
+        seed: int,
+        core: Core,
+        source: Callable[[int], Sample] | None,
+        sensor: Callable[[Machine], Sensor] | None,
+    ) -> None:
         self.elf = elf
         self.machine = Machine(elf, seed, core)
         self.frames: list[tuple[float, Frame]] = []
         self.text = bytearray()
-        self._source = source or resting(seed)
+        self._make_sensor = sensor or (lambda machine: Adis16405(machine, source or resting(seed)))
 
     def run(self, seconds: float) -> None:
         """Let time go by."""
@@ -74,8 +100,9 @@ class Board(Bench):
         channel: str | None = None,
         retained: bytes | None = None,
         clock_broken: str = "",
+        sensor: Callable[[Machine], Sensor] | None = None,
     ) -> None:
-        super().__init__(elf, seed, STM32F405, source)
+        super().__init__(elf, seed, STM32F405, source, sensor)
         machine = self.machine
         self.rcc = Rcc(machine)
         self.rcc.crystal = clock_broken != "crystal"
@@ -93,11 +120,11 @@ class Board(Bench):
         self.can = Bxcan(machine, self.rcc, lambda: self.port_b.function(8) == 9 and self.port_b.function(9) == 9)
         self.usart = Usart(machine, self.rcc)
         self.flash = Flash(machine)
-        self.sensor = Adis16405(machine, self._source)
+        self.sensor = self._make_sensor(machine)
         machine.on_reset = self.rcc.note_reset
 
         self.sensor.on_ready = lambda level: self.exti.edge(1, 0, level)
-        self.spi.device = self._spi_frame
+        self.spi.device = self._spi_byte
         self.port_a.on_output = self._port_a
         self.port_b.on_output = self._port_b
         self.usart.on_byte = self.text.append
@@ -107,10 +134,10 @@ class Board(Bench):
             machine.uc.mem_write(self.SLOTS, retained)
         machine.start()
 
-    def _spi_frame(self, word: int, mode: int, sck_hz: float, end_us: float) -> int:
+    def _spi_byte(self, byte: int, mode: int, sck_hz: float, end_us: float) -> int:
         if any(self.port_a.function(pin) != 5 for pin in (5, 6, 7)):
             self.machine.violations.append("SPI1's pins are not its own")
-        return self.sensor.frame(word, mode, sck_hz, end_us)
+        return self.sensor.exchange(byte, mode, sck_hz, end_us)
 
     def _port_a(self, pin: int, level: bool) -> None:
         if pin == 4:
@@ -165,8 +192,9 @@ class NrfBoard(Bench):
         seed: int = 0,
         retained: bytes | None = None,
         crystal: bool = True,
+        sensor: Callable[[Machine], Sensor] | None = None,
     ) -> None:
-        super().__init__(elf, seed, NRF51822, source)
+        super().__init__(elf, seed, NRF51822, source, sensor)
         machine = self.machine
         self.system = SystemControl(machine)
         self.power = PowerClock(machine)
@@ -179,11 +207,10 @@ class NrfBoard(Bench):
         self.spi = Spi0(machine)
         self.usart = Uart0(machine)
         self.flash = Nvmc(machine)
-        self.sensor = Adis16405(machine, self._source)
+        self.sensor = self._make_sensor(machine)
         machine.on_reset = self.power.note_reset
         self.sensor.on_ready = lambda level: self.gpiote.edge(self.READY, level)
-        self.spi.device = self.sensor.frame
-        self.spi.answer = self.sensor.shifting_out
+        self.spi.device = self.sensor.exchange
         self.pins.on_output = self._output
         self.usart.on_byte = self._byte
         self._line = bytearray()
@@ -194,7 +221,6 @@ class NrfBoard(Bench):
     def _output(self, pin: int, level: bool) -> None:
         if pin == self.CS:
             self.sensor.select(not level)
-            self.spi.begin_frames()
         elif pin == self.RESET:
             self.sensor.reset_line(level)
 

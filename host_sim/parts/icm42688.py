@@ -39,9 +39,12 @@ Sample = tuple[float, float, float, float, float, float]
 class Clock(Protocol):
     """What the part takes of a machine."""
 
-    time_us: float
     random: random.Random
     violations: list[str]
+
+    @property
+    def time_us(self) -> float:
+        """Since start."""
 
 
 class Icm42688:
@@ -50,6 +53,7 @@ class Icm42688:
     def __init__(self, machine: Clock, source: Callable[[int], Sample]) -> None:
         self.machine = machine
         self.source = source
+        self.on_ready: Callable[[bool], None] = lambda level: None  # INT1, which no driver here uses
         self.clock_error = 0.0  # of its own sample clock, relative
         self.tick_us = 32.0 / 30.0  # of its timestamps
         self.temperature = 25.0
@@ -78,6 +82,9 @@ class Icm42688:
     def power_on(self) -> None:
         """Registers as delivered."""
         self._boot()
+
+    def reset_line(self, level: bool) -> None:
+        """It has none."""
 
     def plug(self, connected: bool) -> None:
         """Unplugging takes the supply too."""
@@ -226,7 +233,7 @@ class Icm42688:
         if not low and not self.registers[0, FIFO_CONFIG1] >> 6 & 1:
             self.read_of_packet = 0
 
-    def exchange(self, out: int, mode: int = 0, sck_hz: float = 1e6) -> int:
+    def exchange(self, out: int, mode: int = 0, sck_hz: float = 1e6, end_us: float = 0.0) -> int:
         """A byte each way; `mode` is the SPI mode of the master."""
         if not self.listening or not self.selected:
             return 0xFF if self.floating_high else 0x00
@@ -245,10 +252,6 @@ class Icm42688:
             self._write(address, out)
             return 0x00
         return self._noisy(self._read(address))
-
-    def frame(self, out: int, mode: int, sck_hz: float, end_us: float) -> int:
-        """Two bytes, for a master of 16 bits; the last bit at `end_us`."""
-        return self.exchange(out >> 8, mode, sck_hz) << 8 | self.exchange(out & 0xFF, mode, sck_hz)
 
     def _noisy(self, byte: int) -> int:
         if self.flip > 0.0 and self.machine.random.random() < self.flip:

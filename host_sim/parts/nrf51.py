@@ -301,8 +301,8 @@ class Rng(Peripheral):
 class Spi0(Peripheral):
     """SPI master: RXD and TXD double buffered. READY comes when a byte is in RXD; the next waits until that is read.
 
-    `device(word, mode, sck_hz, end_us)` answers a frame of 16 bits that ends then, `answer()` what it will shift out;
-    `flip` is the chance that a bit is turned over on either wire.
+    `device(byte, mode, sck_hz, end_us)` answers a byte that ends then; `flip` is the chance that a bit is turned over
+    on either wire.
     """
 
     base, irq, size = 0x40003000, 3, 0x1000
@@ -311,8 +311,7 @@ class Spi0(Peripheral):
 
     def __init__(self, machine: Machine) -> None:
         super().__init__(machine)
-        self.device: Callable[[int, int, float, float], int] = lambda word, mode, hz, end: 0xFFFF
-        self.answer: Callable[[], int] = lambda: 0xFFFF
+        self.device: Callable[[int, int, float, float], int] = lambda byte, mode, hz, end: 0xFF
         self.flip = 0.0
         self.flipped = 0
         self.hang = 0  # bytes that never end, to come
@@ -321,16 +320,11 @@ class Spi0(Peripheral):
         """Off."""
         super().reset()
         self._drop()
-        self.half: int | None = None
 
     def _drop(self) -> None:
         self.waiting: int | None = None
         self.received: list[int] = []
         self.shift: Event | None = None
-
-    def begin_frames(self) -> None:
-        """Chip select fell: the next byte is the first of a frame."""
-        self.half = None
 
     def changed(self, offset: int, value: int) -> None:
         """ENABLE: off forgets what is under way."""
@@ -381,16 +375,11 @@ class Spi0(Peripheral):
 
         def shifted() -> None:
             self.shift = None
-            if self.half is None:
-                self.half, self.low = byte, self.answer()
-                got = self.low >> 8
-            else:
-                config = self.registers[0x554]
-                if config & 1:
-                    self.machine.violations.append("SPI0: least significant bit first")
-                mode = (config >> 2 & 1) << 1 | config >> 1 & 1
-                self.device(self.half << 8 | byte, mode, hz, self.machine.time_us)
-                self.half, got = None, self.low & 0xFF
+            config = self.registers[0x554]
+            if config & 1:
+                self.machine.violations.append("SPI0: least significant bit first")
+            mode = (config >> 2 & 1) << 1 | config >> 1 & 1
+            got = self.device(byte, mode, hz, self.machine.time_us)
             self.received.append(self._noisy(got))
             if len(self.received) == 1:
                 self.happen(0x108)

@@ -1,8 +1,7 @@
-"""SPI1 as a 16-bit master and the DMA2 streams that serve it."""
+"""SPI1 as a master of bytes and the DMA2 streams that serve it."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 
 from .machine import EXC_IRQ0, Event, Machine, Part
@@ -10,7 +9,7 @@ from .system import Rcc
 
 
 class Spi(Part):
-    """RM0090 28.5. `device(word, mode, sck_hz, end_us)` answers a frame that ends then; `flip` is the chance that a bit
+    """RM0090 28.5. `device(byte, mode, sck_hz, end_us)` answers a byte that ends then; `flip` is the chance that a bit
     of one is turned over."""
 
     base = 0x40013000
@@ -18,7 +17,7 @@ class Spi(Part):
     def __init__(self, machine: Machine, rcc: Rcc) -> None:
         super().__init__(machine)
         self.rcc = rcc
-        self.device: Callable[[int, int, float, float], int] = lambda word, mode, hz, end: 0xFFFF
+        self.device: Callable[[int, int, float, float], int] = lambda byte, mode, hz, end: 0xFF
         self.flip = 0.0
         self.flipped = 0
         self.on_dma: Callable[[], None] = lambda: None
@@ -35,23 +34,23 @@ class Spi(Part):
         """28.5.1, BR."""
         return float(self.rcc.pclk2_hz / (2 << (self.cr1 >> 3 & 7)))
 
-    def _noisy(self, word: int) -> int:
+    def _noisy(self, byte: int) -> int:
         if self.flip > 0.0:
-            for bit in range(16):
+            for bit in range(8):
                 if self.machine.random.random() < self.flip:
-                    word ^= 1 << bit
+                    byte ^= 1 << bit
                     self.flipped += 1
-        return word
+        return byte
 
-    def exchange(self, word: int, end_us: float) -> int:
-        """A frame on the wires."""
-        if not self.rcc.clock_on(0x44, 12) or not self.cr1 >> 6 & 1 or not self.cr1 >> 2 & 1 or not self.cr1 >> 11 & 1:
-            self.machine.violations.append("SPI1 used without its clock, or not as a 16-bit master")
-            return 0xFFFF
-        return self._noisy(self.device(self._noisy(word), self.cr1 & 3, self.sck_hz, end_us))
+    def exchange(self, byte: int, end_us: float) -> int:
+        """A byte each way on the wires."""
+        if not self.rcc.clock_on(0x44, 12) or not self.cr1 >> 6 & 1 or not self.cr1 >> 2 & 1 or self.cr1 >> 11 & 1:
+            self.machine.violations.append("SPI1 used without its clock, or not as a master of bytes")
+            return 0xFF
+        return self._noisy(self.device(self._noisy(byte), self.cr1 & 3, self.sck_hz, end_us))
 
     def read(self, offset: int) -> int:
-        """CR1, CR2, SR, DR. While SR is busy, time goes on to the frame's end or the next event: the program would ask
+        """CR1, CR2, SR, DR. While SR is busy, time goes on to the byte's end or the next event: the program would ask
         again and again.
         """
         if offset == 0x08:
@@ -73,9 +72,9 @@ class Spi(Part):
             self.on_dma()
         elif offset == 0x0C:
             if self.machine.time_us < self.done_at:
-                self.machine.violations.append("SPI1: a frame begun before the last one's end")
-            self.done_at = self.machine.time_us + 16e6 / self.sck_hz
-            self.dr = self.exchange(value, self.done_at)
+                self.machine.violations.append("SPI1: a byte begun before the last one's end")
+            self.done_at = self.machine.time_us + 8e6 / self.sck_hz
+            self.dr = self.exchange(value & 0xFF, self.done_at)
             self.rxne = True
         else:
             raise KeyError(offset)
@@ -134,8 +133,8 @@ class Dma2(Part):
             if (
                 cr >> 25 & 7 != 3
                 or cr >> 6 & 3 != direction
-                or cr >> 11 & 3 != 1
-                or cr >> 13 & 3 != 1
+                or cr >> 11 & 3 != 0
+                or cr >> 13 & 3 != 0
                 or not cr >> 10 & 1
             ):
                 self.machine.violations.append("DMA2: channel, direction, widths or increment wrong for SPI1")
@@ -144,15 +143,14 @@ class Dma2(Part):
             self.end = self.machine.at(1e12, lambda: None)
             return
         self.count = min(rx[0x04], tx[0x04])
-        self.end = self.machine.at(self.count * 16e6 / self.spi.sck_hz, self._finish)
+        self.end = self.machine.at(self.count * 8e6 / self.spi.sck_hz, self._finish)
 
     def _finish(self) -> None:
         rx, tx = self.streams[self.RX], self.streams[self.TX]
         self.end = None
         uc = self.machine.uc
-        out = struct.iter_unpack("<H", uc.mem_read(tx[0x0C], 2 * self.count))
-        words = [self.spi.exchange(word, self.machine.time_us) for (word,) in out]
-        uc.mem_write(rx[0x0C], struct.pack(f"<{self.count}H", *words))
+        out = uc.mem_read(tx[0x0C], self.count)
+        uc.mem_write(rx[0x0C], bytes(self.spi.exchange(byte, self.machine.time_us) for byte in out))
         for stream in (rx, tx):
             stream[0x04] -= self.count
             stream[0x00] &= ~1

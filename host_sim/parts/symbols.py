@@ -24,12 +24,14 @@ def _variables(path: Path) -> dict[str, tuple[int, Any]]:
         for unit in ELFFile(file).get_dwarf_info(relocate_dwarf_sections=False).iter_CUs():
             for die in unit.get_top_DIE().iter_children():
                 location = die.attributes.get("DW_AT_location")
-                if die.tag != "DW_TAG_variable" or location is None or "DW_AT_name" not in die.attributes:
+                header = "DW_AT_specification" in die.attributes  # declared there before
+                declared = die.get_DIE_from_attribute("DW_AT_specification") if header else die
+                if declared.tag != "DW_TAG_variable" or location is None or "DW_AT_name" not in declared.attributes:
                     continue
                 if isinstance(location.value, list) and location.value[:1] == [3]:  # DW_OP_addr
-                    name = die.attributes["DW_AT_name"].value.decode()
+                    name = declared.attributes["DW_AT_name"].value.decode()
                     address = int.from_bytes(bytes(location.value[1:5]), "little")
-                    found[name] = (address, _layout(_strip(die.get_DIE_from_attribute("DW_AT_type"))))
+                    found[name] = (address, _layout(_strip(declared.get_DIE_from_attribute("DW_AT_type"))))
     return found
 
 

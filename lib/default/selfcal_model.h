@@ -13,8 +13,9 @@
 #define SELFCAL_MODEL_CHANGES 0
 /* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units. */
 #define SELFCAL_MODEL_CHANNELS 0U
-/* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
+/* 1: each is one of port/sensors/sensor.h, in its unit; one is the supply. */
 #define SELFCAL_MODEL_CHANNELS_READ 1
+#define SELFCAL_MODEL_SUPPLY_READ 0
 /* With SELFCAL_FIXED no record overflows (lib/bank_kernel_fixed.c). The coarsest step of each axis that readings within
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */

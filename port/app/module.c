@@ -1,6 +1,6 @@
 #include "module.h"
 
-#include "sensor.h"
+#include "readings.h"
 
 /* 0: every sample counts as one of rest. */
 #ifndef BOARD_GATE
@@ -40,7 +40,7 @@ static void port_idle(void *context)
     board->sleep();
 }
 
-static const port_t port = {NULL, port_time_ms, sensor_sample, port_send, port_idle};
+static const port_t port = {NULL, port_time_ms, readings_sample, port_send, port_idle};
 
 /* ----------------------------------------------------------------------------------------------------------- module */
 
@@ -48,21 +48,21 @@ static void module_tell(void *context, selfcal_module_t *told)
 {
     (void)context;
     board->tell(told);
-    sensor_tell(told);
+    readings_tell(told);
 }
 
 /* Flash at work holds the processor up, and with it the interrupts that stamp samples: none is taken meanwhile. */
 static bool module_save_begin(void *context, bool keep_older)
 {
     board->feed();
-    sensor_pause(true);
+    readings_pause(true);
     return slots_begin(context, keep_older);
 }
 
 static bool module_save_end(void *context, bool whole)
 {
     const bool saved = slots_end(context, whole);
-    sensor_pause(false);
+    readings_pause(false);
     return saved;
 }
 
@@ -92,7 +92,7 @@ void module_command(const uint8_t data[8])
 #endif
 
 static const port_module_t module = {
-    &slots, module_tell, slots_stored, module_save_begin, slots_put, module_save_end, sensor_write_offsets,
+    &slots, module_tell, slots_stored, module_save_begin, slots_put, module_save_end, readings_write_offsets,
     module_random, module_sent, module_restart,
     BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
@@ -113,7 +113,7 @@ void module_run(const module_board_t *its_board)
 {
     board = its_board;
     slots.memory = board->memory;
-    if (!sensor_init(board->bus) || app_init(&app, &port, board->report_ms) != SELFCAL_OK) {
+    if (!readings_init(board->bus) || app_init(&app, &port, board->report_ms) != SELFCAL_OK) {
         return;
     }
     if (BOARD_GATE) {
@@ -122,7 +122,7 @@ void module_run(const module_board_t *its_board)
     app_module(&app, &module);
     for (;;) {
         board->poll();
-        sensor_poll();
+        readings_poll();
         (void)app_step(&app);
         feed();
     }

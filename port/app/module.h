@@ -1,10 +1,10 @@
 /* A module: the application with its sensor, saved state and watchdog. A board gives the rest as callbacks.
- * The main() of every board with an ADIS16405 ends in module_run(). One a program. */
+ * The main() of every board with a sensor ends in module_run(). One a program. */
 #ifndef MODULE_H
 #define MODULE_H
 
-#include "adis16405.h"
 #include "app.h"
+#include "sensor.h"
 #include "slots.h"
 
 /* As in selfcal.dbc. */
@@ -19,7 +19,7 @@ typedef enum {
 } reset_cause_t;
 
 typedef struct {
-    const adis16405_bus_t *bus;
+    const sensor_bus_t *bus;
     const slots_memory_t *memory;
     uint32_t report_ms;                     /* between reports of all axes */
     uint32_t (*time_ms)(void);              /* since start, modulo 2^32 */
@@ -27,7 +27,7 @@ typedef struct {
     bool (*send)(const selfcal_frame_t *frame); /* as port_t's */
     bool (*sent)(void);                     /* all frames that it took have left */
     void (*poll)(void);                     /* takes what came by the wire, and gives commands to module_command() */
-    void (*sleep)(void);                    /* until a data-ready, the wire, or the next millisecond */
+    void (*sleep)(void);                    /* until an interrupt of the sensor or the wire, or the next millisecond */
     void (*feed)(void);                     /* the watchdog, whose time is longer than an erase of the memory takes */
     void (*tell)(selfcal_module_t *told);   /* reset cause, fault address, clock, counters of the wire */
     bool (*random)(uint32_t *number);       /* for commands */

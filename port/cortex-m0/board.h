@@ -52,12 +52,9 @@ extern const slots_memory_t flash_memory;
 /* False: it gives none. 20 ms at most. */
 bool rng_number(uint32_t *number);
 
-/* spi.c: what adis16405_bus_t wants */
+/* spi.c */
 
-void spi_init(void);
-bool spi_word(void *context, uint16_t out, uint16_t *in);
-bool spi_burst(void *context);
-void spi_reset_line(void *context, bool low);
+extern const sensor_bus_t spi_bus;
 void spi_handler(void);
 void ready_handler(void);
 

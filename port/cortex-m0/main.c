@@ -1,4 +1,4 @@
-/* The application on an nRF51822 (Cortex-M0, 16 MHz) with an ADIS16405; telemetry as SLCAN. */
+/* The application on an nRF51822 (Cortex-M0, 16 MHz) with a sensor on SPI0; telemetry as SLCAN. */
 #include "board.h"
 #include "nrf51.h"
 
@@ -16,20 +16,6 @@
 
 static reset_cause_t reset_cause;
 
-static uint64_t bus_time_us(void *context)
-{
-    (void)context;
-    return clock_us();
-}
-
-static uint32_t bus_time_us32(void *context)
-{
-    (void)context;
-    return clock_us32();
-}
-
-static const adis16405_bus_t bus = {NULL, bus_time_us, bus_time_us32, spi_word, spi_burst, spi_reset_line};
-
 static void board_sleep(void)
 {
     __asm__ volatile("wfi" : : : "memory");
@@ -43,7 +29,7 @@ static void board_tell(selfcal_module_t *told)
 }
 
 static const module_board_t board_calls = {
-    &bus,        &flash_memory, BOARD_REPORT_MS, clock_ms,   clock_ms,    uart_send, uart_sent,
+    &spi_bus,    &flash_memory, BOARD_REPORT_MS, clock_ms,   clock_ms,    uart_send, uart_sent,
     uart_poll,   board_sleep,   watchdog_feed,   board_tell, rng_number,  board_reset,
 };
 
@@ -53,7 +39,6 @@ int main(void)
     clock_init();
     irq_on();
     uart_init();
-    spi_init();
     module_run(&board_calls);
     return 1; /* the model is not one for this sensor: the start-up code resets */
 }

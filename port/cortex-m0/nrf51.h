@@ -95,10 +95,9 @@ enum { NVMC_PAGE_BYTES = 1024 };
 #define SPI0_RXD REG32(0x40003518U)
 #define SPI0_TXD REG32(0x4000351CU)
 #define SPI0_FREQUENCY REG32(0x40003524U)
-#define SPI0_FREQUENCY_K250 0x04000000U
-#define SPI0_FREQUENCY_M1 0x10000000U
+#define SPI0_FREQUENCY_K125 0x02000000U /* twice the value is twice the frequency, up to 8 MHz */
 #define SPI0_CONFIG REG32(0x40003554U)
-#define SPI0_CONFIG_MODE3 0x6U
+#define SPI0_CONFIG_MODE(mode) (((mode)&1U) << 1 | ((mode)&2U) << 1)
 
 /* UART */
 #define UART0_STARTRX REG32(0x40002000U)

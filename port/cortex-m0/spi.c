@@ -1,14 +1,17 @@
-/* ADIS16405 on SPI0, mode 3, 1 MHz, or 250 kHz in the sensor's slow mode. Registers one frame at a time and polled;
- * bursts byte by byte from the interrupt: this SPI has no DMA, and TXD holds one byte in waiting. */
+/* The sensor on SPI0. exchange() is polled; begin() goes byte by byte from the interrupt: this SPI has no DMA, and TXD
+ * holds one byte in waiting. */
 #include "board.h"
-#include "sensor.h"
 #include "nrf51.h"
+#include "readings.h"
 
-enum { BURST_WORDS = 12, BURST_BYTES = 2 + 2 * BURST_WORDS, BURST_COMMAND = 0x3E };
-enum { BYTE_US = 100 }; /* a byte takes 8, or 32 */
+#define SCK_LEAST_HZ 125000U
+enum { SCK_DOUBLINGS = 6 };
+enum { BYTE_US = 100 }; /* a byte takes 64 at most */
 
-static volatile uint32_t sent, received;
-static volatile uint8_t burst[BURST_BYTES];
+static const uint8_t *going_out;
+static uint8_t *coming_in;
+static volatile uint16_t to_go, sent, received;
+static uint8_t stall_us;
 
 static void select_sensor(bool on)
 {
@@ -19,9 +22,14 @@ static void select_sensor(bool on)
     }
 }
 
-void spi_reset_line(void *context, bool low)
+static void let_go(void)
 {
-    (void)context;
+    select_sensor(false);
+    clock_spin_us(stall_us);
+}
+
+static void reset_line(bool low)
+{
     if (low) {
         GPIO_OUTCLR = BIT(PIN_RESET);
     } else {
@@ -29,11 +37,18 @@ void spi_reset_line(void *context, bool low)
     }
 }
 
-void spi_init(void)
+static void open(const sensor_wire_t *wire)
 {
+    stall_us = (uint8_t)wire->stall_us;
+    uint32_t doublings = 0;
+    while (doublings < SCK_DOUBLINGS && SCK_LEAST_HZ << (doublings + 1U) <= wire->sck_max_hz) {
+        doublings++;
+    }
     select_sensor(false);
-    spi_reset_line(NULL, false);
-    GPIO_OUTSET = BIT(PIN_SCK); /* idle in mode 3 */
+    reset_line(false);
+    if (wire->mode >= 2U) {
+        GPIO_OUTSET = BIT(PIN_SCK); /* as it idles */
+    }
     GPIO_PIN_CNF(PIN_CS) = GPIO_OUTPUT;
     GPIO_PIN_CNF(PIN_RESET) = GPIO_OUTPUT;
     GPIO_PIN_CNF(PIN_SCK) = GPIO_OUTPUT;
@@ -43,8 +58,8 @@ void spi_init(void)
     SPI0_PSELSCK = PIN_SCK;
     SPI0_PSELMOSI = PIN_MOSI;
     SPI0_PSELMISO = PIN_MISO;
-    SPI0_FREQUENCY = SENSOR_SCK_MAX_HZ < 1000000U ? SPI0_FREQUENCY_K250 : SPI0_FREQUENCY_M1;
-    SPI0_CONFIG = SPI0_CONFIG_MODE3;
+    SPI0_FREQUENCY = SPI0_FREQUENCY_K125 << doublings;
+    SPI0_CONFIG = SPI0_CONFIG_MODE(wire->mode);
     SPI0_ENABLE = 1U;
     GPIOTE_CONFIG0 = GPIOTE_RISING(PIN_READY);
     GPIOTE_IN0 = 0U;
@@ -53,7 +68,7 @@ void spi_init(void)
     irq_enable(IRQ_SPI0);
 }
 
-static bool exchange(uint8_t out, uint8_t *in)
+static bool exchange_byte(uint8_t out, uint8_t *in)
 {
     SPI0_READY = 0U;
     SPI0_TXD = out;
@@ -69,8 +84,8 @@ static bool exchange(uint8_t out, uint8_t *in)
     return true;
 }
 
-/* Breaks off a burst under way. */
-static void stop_burst(void)
+/* Breaks off a transfer under way. */
+static void stop_transfer(void)
 {
     SPI0_INTENCLR = SPI0_INTEN_READY;
     select_sensor(false);
@@ -79,59 +94,61 @@ static void stop_burst(void)
     SPI0_ENABLE = 1U;
 }
 
-bool spi_word(void *context, uint16_t out, uint16_t *in)
+static bool exchange(const uint8_t *out, uint8_t *in, size_t count)
 {
-    (void)context;
-    stop_burst();
-    uint8_t high = 0, low = 0;
+    stop_transfer();
     select_sensor(true);
-    const bool done = exchange((uint8_t)(out >> 8), &high) && exchange((uint8_t)out, &low);
-    select_sensor(false);
-    clock_spin_us(SENSOR_STALL_US);
-    *in = (uint16_t)((uint32_t)high << 8 | low);
+    bool done = true;
+    for (size_t i = 0; i < count && done; i++) {
+        done = exchange_byte(out[i], &in[i]);
+    }
+    let_go();
     return done;
 }
 
-bool spi_burst(void *context)
+static void send_next(void)
 {
-    (void)context;
-    stop_burst();
-    sent = 2;
-    received = 0;
+    if (sent < to_go) {
+        SPI0_TXD = going_out[sent];
+        sent++;
+    }
+}
+
+static bool begin(const uint8_t *out, uint8_t *in, size_t count)
+{
+    stop_transfer();
+    going_out = out;
+    coming_in = in;
+    to_go = (uint16_t)count;
+    sent = received = 0;
     select_sensor(true);
     SPI0_INTENSET = SPI0_INTEN_READY;
-    SPI0_TXD = BURST_COMMAND;
-    SPI0_TXD = 0U;
+    send_next();
+    send_next();
     return true;
 }
+
+const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line};
 
 void spi_handler(void)
 {
     if (SPI0_READY == 0U) {
-        return; /* still pending from a burst that stop_burst() broke off */
+        return; /* still pending from a transfer that stop_transfer() broke off */
     }
     SPI0_READY = 0U; /* before RXD is read: that lets the next byte in */
     const uint8_t byte = (uint8_t)SPI0_RXD;
-    if (sent < BURST_BYTES) {
-        SPI0_TXD = 0U;
-        sent++;
-    }
-    burst[received] = byte;
+    send_next();
+    coming_in[received] = byte;
     received++;
-    if (received == BURST_BYTES) {
+    if (received == to_go) {
         SPI0_INTENCLR = SPI0_INTEN_READY;
-        select_sensor(false);
-        clock_spin_us(SENSOR_STALL_US);
-        uint16_t words[BURST_WORDS];
-        for (size_t i = 0; i < BURST_WORDS; i++) {
-            words[i] = (uint16_t)((uint32_t)burst[2U * i + 2U] << 8 | burst[2U * i + 3U]);
-        }
-        sensor_burst(words, true);
+        let_go();
+        readings_done(true);
     }
 }
 
 void ready_handler(void)
 {
     GPIOTE_IN0 = 0U;
-    sensor_ready();
+    readings_ready();
 }

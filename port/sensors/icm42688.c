@@ -42,10 +42,9 @@ enum { GYRO_ST_DATA = 0x5F, ACCEL_ST_DATA = 0x3B, OFFSET_USER0 = 0x77 }; /* bank
 #define HEADER_KIND 0xFCU
 #define EMPTY 0x80U
 
-enum { SHORT_PACKET = 16, FIFO_BYTES = 2048, FIFO_PACKETS = FIFO_BYTES / ICM42688_PACKET };
-#define G 9.80665F
+enum { PACKET = 20, CHUNK = 8, SHORT_PACKET = 16, FIFO_BYTES = 2048, FIFO_PACKETS = FIFO_BYTES / PACKET };
 #define GYRO_STEP (2000.0F / 262144.0F)
-#define ACCEL_STEP (16.0F * G / 131072.0F)
+#define ACCEL_STEP (16.0F * SENSOR_G / 131072.0F)
 
 /* Self-test, at 250 deg/s and 4 g. */
 #define GYRO_LSB_PER_DPS (32768.0F / 250.0F)
@@ -58,30 +57,46 @@ enum { TEST_SAMPLES = 32 };   /* at least */
 #define SPIN_US 60000U        /* the data sheet: 45 ms from power-on of the gyro */
 #define STRAIN_US 200000U     /* the self-test's deflection settles */
 #define GATHER_US 70000U
-#define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
 #define CHECK_US 10000000U    /* between readings of the settings */
-#define BACKOFF_MIN_US 100000U
-#define BACKOFF_MAX_US 10000000U
 #define BLIND_US 1000000U     /* from here on the processor's clock counts: a timestamp's turns are unsure */
-enum { PROVEN_SAMPLES = 1000 };
 enum { LEARNING = 64 };       /* samples that the period is learned from, before it is followed slowly */
-/* All axes as before: from the third in a row on withheld, the sixteenth is a fault. */
-enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16 };
 /* Timestamps out of place in a row: the packets do not follow each other after all. */
 enum { MISMATCHES = 4 };
 
-enum { STEP_RESET, STEP_SPIN, STEP_LEVEL, STEP_STRAIN, STEP_RESPONSE, STEP_RELAX };
+typedef struct {
+    sensor_state_t common;
+    uint64_t checked_us;        /* when the settings were read last */
+    uint64_t last_us;           /* of the last sample */
+    uint64_t read_us;           /* of the chunk */
+    uint32_t ticks_q16;         /* of a period, in timestamps / 65536 */
+    uint32_t dropped;           /* packets since the last sample, none of them good */
+    float level[SENSOR_AXES];   /* readings before the self-test */
+    int16_t temperature;        /* INT16_MIN: none yet */
+    uint16_t last_stamp;
+    bool anchored;              /* `last_us` is of a sample */
+    bool continuous;            /* the next packet follows the last */
+    bool blind;                 /* `last_stamp` is of before a reset */
+    uint8_t rate;               /* ODR code */
+    uint8_t codes[SENSOR_AXES]; /* factory's responses to a self-test */
+    uint8_t mismatches;         /* packets in a row out of place */
+    uint8_t next, held, behind; /* packets of the chunk: the next one, all; in the FIFO after them */
+    uint8_t chunk[1 + CHUNK * PACKET];
+} icm42688_t;
+
+static icm42688_t *of(sensor_state_t *state) {
+    return (icm42688_t *)(void *)state;
+}
 
 /* --- registers --- */
 
 static uint64_t now_of(const icm42688_t *self) {
-    return self->bus->time_us(self->bus->context);
+    return self->common.bus->time_us();
 }
 
 /* `count` registers from `address` on, 14 at most. */
 static bool read_registers(icm42688_t *self, uint8_t address, uint8_t *values, size_t count) {
     uint8_t out[15] = {(uint8_t)(READ | address)}, in[15];
-    if (!self->bus->transfer(self->bus->context, out, in, 1U + count)) {
+    if (!self->common.bus->exchange(out, in, 1U + count)) {
         return false;
     }
     memcpy(values, in + 1, count);
@@ -91,7 +106,7 @@ static bool read_registers(icm42688_t *self, uint8_t address, uint8_t *values, s
 static bool write_byte(icm42688_t *self, uint8_t address, uint8_t value) {
     const uint8_t out[2] = {address, value};
     uint8_t in[2];
-    return self->bus->transfer(self->bus->context, out, in, 2U);
+    return self->common.bus->exchange(out, in, 2U);
 }
 
 /* And reads back: a byte has no checksum. */
@@ -114,12 +129,8 @@ static bool read_bank(icm42688_t *self, uint8_t bank, uint8_t address, uint8_t *
 
 /* --- offsets --- */
 
-static float offset_step(size_t axis) {
-    return axis < 3U ? 1.0F / 32.0F : 0.5e-3F * G;
-}
-
 /* Six numbers of 12 bits in nine bytes of bank 4: a byte with the high bits of two between their low ones. */
-static void pack_offsets(const int16_t added[ICM42688_AXES], uint8_t bytes[9]) {
+static void pack_offsets(const int16_t added[SENSOR_AXES], uint8_t bytes[9]) {
     for (size_t pair = 0; pair < 3U; pair++) {
         const unsigned first = (unsigned)added[2U * pair] & 0xFFFU, second = (unsigned)added[2U * pair + 1U] & 0xFFFU;
         bytes[3U * pair] = (uint8_t)(first & 0xFFU);
@@ -128,7 +139,7 @@ static void pack_offsets(const int16_t added[ICM42688_AXES], uint8_t bytes[9]) {
     }
 }
 
-static bool write_offsets(icm42688_t *self, const int16_t added[ICM42688_AXES]) {
+static bool write_offsets(icm42688_t *self, const int16_t added[SENSOR_AXES]) {
     uint8_t bytes[9];
     pack_offsets(added, bytes);
     bool written = write_register(self, BANK_SEL, 4U);
@@ -138,79 +149,61 @@ static bool write_offsets(icm42688_t *self, const int16_t added[ICM42688_AXES]) 
     return write_register(self, BANK_SEL, 0U) && written;
 }
 
-bool icm42688_offsets(icm42688_t *self, const float wanted[ICM42688_AXES], float got[ICM42688_AXES]) {
-    int16_t added[ICM42688_AXES];
-    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
-        const float steps = wanted[axis] / offset_step(axis);
-        if (!(steps > -2048.4F && steps < 2047.4F)) {
-            return false;
-        }
-        added[axis] = (int16_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
-        got[axis] = (float)added[axis] * offset_step(axis);
-    }
-    if (self->state == ICM42688_RUNNING) {
+static sensor_fault_t relaxed(sensor_state_t *state);
+
+static bool offsets(sensor_state_t *state, const int16_t added[SENSOR_AXES]) {
+    icm42688_t *self = of(state);
+    const bool set_up = state->condition == SENSOR_STARTING && state->sensor->start[state->step].act == relaxed;
+    if (state->condition == SENSOR_RUNNING || set_up) {
         if (!write_offsets(self, added) || !flush(self)) {
-            (void)write_offsets(self, self->added);
+            (void)write_offsets(self, state->added);
             (void)flush(self);
             return false;
         }
     }
-    memcpy(self->added, added, sizeof added);
     return true;
 }
 
 /* --- start --- */
 
-static void enter(icm42688_t *self, uint8_t step) {
-    self->state = ICM42688_STARTING;
-    self->step = step;
-    self->step_us = now_of(self);
+static bool init(sensor_state_t *state, float rate_hz, sensor_wire_t *wire) {
+    static const struct {
+        uint16_t rate_hz;
+        uint8_t code;
+    } rates[] = {{1000, 6}, {500, 15}, {200, 7}, {100, 8}, {50, 9}, {25, 10}};
+    icm42688_t *self = of(state);
+    if (!icm42688_has_rate(rate_hz)) {
+        return false;
+    }
+    *wire = (sensor_wire_t){24000000U, 0U, 3U};
+    for (size_t i = 0; i < sizeof rates / sizeof rates[0]; i++) {
+        if (fabsf(rate_hz - (float)rates[i].rate_hz) < 1.0F) {
+            self->rate = rates[i].code;
+            state->period_us = 1000000U / rates[i].rate_hz;
+        }
+    }
+    self->ticks_q16 = state->period_us * 61440U; /* 30/32 of 65536: the PLL's unit */
+    self->temperature = INT16_MIN;
+    return true;
 }
 
-static void begin(icm42688_t *self) {
+static void stop(sensor_state_t *state) {
+    of(state)->next = of(state)->held = 0;
+}
+
+static sensor_fault_t reset(sensor_state_t *state) {
+    icm42688_t *self = of(state);
     (void)write_byte(self, BANK_SEL, 0U);
     (void)write_byte(self, DEVICE_CONFIG, RESET);
     self->next = self->held = 0;
     self->continuous = false;
     self->blind = true;
-    enter(self, STEP_RESET);
+    return SENSOR_NO_FAULT;
 }
 
-static void fail(icm42688_t *self, icm42688_fault_t fault) {
-    self->state = ICM42688_FAILED;
-    self->fault = fault;
-    self->step_us = now_of(self);
-    self->next = self->held = 0;
-    self->counters.faults++;
-    if (self->good >= PROVEN_SAMPLES) {
-        self->backoff_us = BACKOFF_MIN_US;
-    } else {
-        self->backoff_us = self->backoff_us < BACKOFF_MAX_US / 2U ? self->backoff_us * 2U : BACKOFF_MAX_US;
-    }
-    self->good = 0;
-}
-
-bool icm42688_init(icm42688_t *self, const icm42688_bus_t *bus, float rate_hz) {
-    static const struct {
-        float rate_hz;
-        uint8_t code;
-        uint32_t period_us;
-    } rates[] = {{1000.0F, 6, 1000}, {500.0F, 15, 2000}, {200.0F, 7, 5000},
-                 {100.0F, 8, 10000}, {50.0F, 9, 20000},  {25.0F, 10, 40000}};
-    memset(self, 0, sizeof *self);
-    self->bus = bus;
-    self->temperature = INT16_MIN;
-    self->backoff_us = BACKOFF_MIN_US / 2U;
-    for (size_t i = 0; i < sizeof rates / sizeof rates[0]; i++) {
-        if (fabsf(rate_hz - rates[i].rate_hz) <= 1e-3F * rates[i].rate_hz) {
-            self->rate = rates[i].code;
-            self->period_us = rates[i].period_us;
-            self->ticks_q16 = rates[i].period_us * 61440U; /* 30/32 of 65536: the PLL's unit */
-            begin(self);
-            return true;
-        }
-    }
-    return false;
+static sensor_fault_t probe(sensor_state_t *state) {
+    uint8_t identity;
+    return read_registers(of(state), WHO_AM_I, &identity, 1U) && identity == IDENTITY ? SENSOR_NO_FAULT : SENSOR_ABSENT;
 }
 
 /* Bytes in the FIFO. */
@@ -225,7 +218,7 @@ static bool fifo_count(icm42688_t *self, uint32_t *count) {
 
 static bool read_fifo(icm42688_t *self, size_t bytes) {
     uint8_t out[sizeof self->chunk] = {READ | FIFO_DATA};
-    return self->bus->transfer(self->bus->context, out, self->chunk, 1U + bytes);
+    return self->common.bus->exchange(out, self->chunk, 1U + bytes);
 }
 
 static int16_t word_of(const uint8_t *bytes) {
@@ -234,15 +227,15 @@ static int16_t word_of(const uint8_t *bytes) {
 }
 
 /* Mean of the short packets that wait, gx to az, LSB. */
-static bool mean(icm42688_t *self, float result[ICM42688_AXES]) {
-    int32_t sum[ICM42688_AXES] = {0};
+static bool mean(icm42688_t *self, float result[SENSOR_AXES]) {
+    int32_t sum[SENSOR_AXES] = {0};
     size_t taken = 0;
     uint32_t count;
     if (!fifo_count(self, &count)) {
         return false;
     }
     for (size_t left = count / SHORT_PACKET; left > 0U;) {
-        const size_t packets = left < ICM42688_CHUNK ? left : ICM42688_CHUNK;
+        const size_t packets = left < CHUNK ? left : CHUNK;
         if (!read_fifo(self, packets * SHORT_PACKET)) {
             return false;
         }
@@ -252,31 +245,34 @@ static bool mean(icm42688_t *self, float result[ICM42688_AXES]) {
             if ((packet[0] & HEADER_KIND) != HEADER_16) {
                 return false;
             }
-            for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+            for (size_t axis = 0; axis < SENSOR_AXES; axis++) {
                 sum[axis] += word_of(packet + (axis < 3U ? 7U : 1U) + 2U * (axis % 3U));
             }
             taken++;
         }
     }
-    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+    for (size_t axis = 0; axis < SENSOR_AXES; axis++) {
         result[axis] = (float)sum[axis] / (float)(taken > 0U ? taken : 1U);
     }
     return taken >= TEST_SAMPLES;
 }
 
-static bool prepare_test(icm42688_t *self) {
-    return read_bank(self, 1U, GYRO_ST_DATA, self->codes, 3U) &&
-           read_bank(self, 2U, ACCEL_ST_DATA, self->codes + 3, 3U) &&
-           write_register(self, INTF_CONFIG0, BIG_ENDIAN_NO_I2C) && write_register(self, TMST_CONFIG, TIMESTAMPS) &&
-           write_register(self, GYRO_CONFIG0, GYRO_250 | RATE_1KHZ) &&
-           write_register(self, ACCEL_CONFIG0, ACCEL_4G | RATE_1KHZ) &&
-           write_register(self, FIFO_CONFIG1, PACKETS_OF_16) && write_register(self, FIFO_CONFIG, STREAM) &&
-           write_byte(self, PWR_MGMT0, BOTH_LOW_NOISE); /* no access for 200 us now */
+static sensor_fault_t prepare_test(sensor_state_t *state) {
+    icm42688_t *self = of(state);
+    const bool prepared =
+        read_bank(self, 1U, GYRO_ST_DATA, self->codes, 3U) &&
+        read_bank(self, 2U, ACCEL_ST_DATA, self->codes + 3, 3U) &&
+        write_register(self, INTF_CONFIG0, BIG_ENDIAN_NO_I2C) && write_register(self, TMST_CONFIG, TIMESTAMPS) &&
+        write_register(self, GYRO_CONFIG0, GYRO_250 | RATE_1KHZ) &&
+        write_register(self, ACCEL_CONFIG0, ACCEL_4G | RATE_1KHZ) &&
+        write_register(self, FIFO_CONFIG1, PACKETS_OF_16) && write_register(self, FIFO_CONFIG, STREAM) &&
+        write_byte(self, PWR_MGMT0, BOTH_LOW_NOISE); /* no access for 200 us now */
+    return prepared ? SENSOR_NO_FAULT : SENSOR_SET_UP;
 }
 
 /* Whether each axis moved as at the factory, or by a plausible amount if the factory has left no code. */
-static bool responded(const icm42688_t *self, const float moved[ICM42688_AXES]) {
-    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+static bool responded(const icm42688_t *self, const float moved[SENSOR_AXES]) {
+    for (size_t axis = 0; axis < SENSOR_AXES; axis++) {
         const bool gyro = axis < 3U;
         const float response = fabsf(moved[axis] - self->level[axis]);
         float least = gyro ? 60.0F * GYRO_LSB_PER_DPS : 0.05F * ACCEL_LSB_PER_G;
@@ -296,73 +292,39 @@ static bool responded(const icm42688_t *self, const float moved[ICM42688_AXES]) 
     return true;
 }
 
-static bool set_up(icm42688_t *self) {
-    return write_register(self, SELF_TEST_CONFIG, 0U) && write_register(self, FIFO_CONFIG, 0U) &&
-           write_register(self, GYRO_CONFIG0, self->rate) && write_register(self, ACCEL_CONFIG0, self->rate) &&
-           write_register(self, FIFO_CONFIG1, PACKETS_OF_20) && write_offsets(self, self->added) &&
-           write_register(self, FIFO_CONFIG, STREAM);
+static sensor_fault_t begin_gathering(sensor_state_t *state) {
+    (void)flush(of(state));
+    return SENSOR_NO_FAULT;
 }
 
-static void expect(icm42688_t *self) {
-    self->progress_us = now_of(self);
-    self->packets_seen = 0;
+static sensor_fault_t deflect(sensor_state_t *state) {
+    icm42688_t *self = of(state);
+    return mean(self, self->level) && write_register(self, SELF_TEST_CONFIG, TEST_ALL) ? SENSOR_NO_FAULT
+                                                                                       : SENSOR_SELF_TEST;
 }
 
-static void run(icm42688_t *self) {
-    self->state = ICM42688_RUNNING;
-    self->equal = 0;
+static sensor_fault_t judge(sensor_state_t *state) {
+    float moved[SENSOR_AXES];
+    return mean(of(state), moved) && responded(of(state), moved) ? SENSOR_NO_FAULT : SENSOR_SELF_TEST;
+}
+
+static sensor_fault_t set_up(sensor_state_t *state) {
+    icm42688_t *self = of(state);
+    const bool done =
+        write_register(self, SELF_TEST_CONFIG, 0U) && write_register(self, FIFO_CONFIG, 0U) &&
+        write_register(self, GYRO_CONFIG0, self->rate) && write_register(self, ACCEL_CONFIG0, self->rate) &&
+        write_register(self, FIFO_CONFIG1, PACKETS_OF_20) && write_offsets(self, state->added) &&
+        write_register(self, FIFO_CONFIG, STREAM);
+    return done ? SENSOR_NO_FAULT : SENSOR_SET_UP;
+}
+
+static sensor_fault_t relaxed(sensor_state_t *state) {
+    icm42688_t *self = of(state);
+    (void)flush(self);
     self->dropped = 0;
     self->mismatches = 0;
     self->checked_us = now_of(self);
-    expect(self);
-}
-
-static void start_on(icm42688_t *self) {
-    static const uint32_t wait[] = {RESET_US, SPIN_US, GATHER_US, STRAIN_US, GATHER_US, STRAIN_US};
-    if (now_of(self) - self->step_us < wait[self->step]) {
-        return;
-    }
-    uint8_t identity;
-    float moved[ICM42688_AXES];
-    switch (self->step) {
-    case STEP_RESET:
-        if (!read_registers(self, WHO_AM_I, &identity, 1U) || identity != IDENTITY) {
-            fail(self, ICM42688_ABSENT);
-        } else if (!prepare_test(self)) {
-            fail(self, ICM42688_SET_UP);
-        } else {
-            enter(self, STEP_SPIN);
-        }
-        return;
-    case STEP_SPIN:
-        (void)flush(self);
-        enter(self, STEP_LEVEL);
-        return;
-    case STEP_LEVEL:
-        if (!mean(self, self->level) || !write_register(self, SELF_TEST_CONFIG, TEST_ALL)) {
-            fail(self, ICM42688_SELF_TEST);
-        } else {
-            enter(self, STEP_STRAIN);
-        }
-        return;
-    case STEP_STRAIN:
-        (void)flush(self);
-        enter(self, STEP_RESPONSE);
-        return;
-    case STEP_RESPONSE:
-        if (!mean(self, moved) || !responded(self, moved)) {
-            fail(self, ICM42688_SELF_TEST);
-        } else if (!set_up(self)) {
-            fail(self, ICM42688_SET_UP);
-        } else {
-            enter(self, STEP_RELAX);
-        }
-        return;
-    default:
-        (void)flush(self);
-        run(self);
-        return;
-    }
+    return SENSOR_NO_FAULT;
 }
 
 /* --- run --- */
@@ -384,56 +346,42 @@ static bool altered(icm42688_t *self) {
     return false;
 }
 
-static void watch(icm42688_t *self) {
-    const uint64_t now = now_of(self);
-    const uint64_t silence = SILENCE_US > 10U * self->period_us ? SILENCE_US : 10U * self->period_us;
+static void watch(sensor_state_t *state, uint64_t now) {
+    icm42688_t *self = of(state);
     if (now - self->checked_us >= CHECK_US) {
         self->checked_us = now;
         if (altered(self)) {
-            fail(self, ICM42688_SET_UP);
-            return;
-        }
-    }
-    uint32_t count;
-    if (self->equal >= REPEATS_STUCK) {
-        fail(self, ICM42688_STUCK);
-    } else if (now - self->progress_us > silence && self->next == self->held) {
-        if (self->packets_seen > 0U) {
-            fail(self, ICM42688_NO_DATA);
-        } else if (!fifo_count(self, &count) || count < ICM42688_PACKET || count > FIFO_BYTES) { /* floating lines */
-            fail(self, ICM42688_SILENT);
+            sensor_fail(state, SENSOR_SET_UP);
         }
     }
 }
 
-void icm42688_poll(icm42688_t *self) {
-    switch (self->state) {
-    case ICM42688_STARTING: start_on(self); break;
-    case ICM42688_RUNNING: watch(self); break;
-    default:
-        if (now_of(self) - self->step_us >= self->backoff_us) {
-            begin(self);
-        }
-        break;
-    }
+/* True: the FIFO holds packets, `count` bytes. False as well: the lines float. */
+static bool filled(icm42688_t *self, uint32_t *count) {
+    return fifo_count(self, count) && *count >= PACKET && *count <= FIFO_BYTES;
+}
+
+static bool waits(sensor_state_t *state) {
+    uint32_t count;
+    return of(state)->next < of(state)->held || filled(of(state), &count);
 }
 
 /* Reads the next packets; false: there are none. */
 static bool fetch(icm42688_t *self) {
     uint32_t count;
-    if (!fifo_count(self, &count) || count < ICM42688_PACKET || count > FIFO_BYTES) {
+    if (!filled(self, &count)) {
         return false;
     }
-    uint32_t packets = count / ICM42688_PACKET;
+    const uint32_t packets = count / PACKET;
     if (packets + 1U >= FIFO_PACKETS) {
         if (self->continuous) {
-            self->counters.overruns++;
+            self->common.counters.overruns++;
         }
         self->continuous = false;
     }
-    const uint8_t held = (uint8_t)(packets < ICM42688_CHUNK ? packets : ICM42688_CHUNK);
+    const uint8_t held = (uint8_t)(packets < CHUNK ? packets : CHUNK);
     self->read_us = now_of(self);
-    if (!read_fifo(self, (size_t)held * ICM42688_PACKET)) {
+    if (!read_fifo(self, (size_t)held * PACKET)) {
         self->continuous = false;
         return false;
     }
@@ -444,11 +392,11 @@ static bool fetch(icm42688_t *self) {
 }
 
 /* Six numbers of 20 bits, gx to az. False: not a packet, or bits set that a sensor leaves 0. */
-static bool unpack(const uint8_t *packet, int32_t raw[ICM42688_AXES]) {
+static bool unpack(const uint8_t *packet, int32_t raw[SENSOR_AXES]) {
     if ((packet[0] & HEADER_KIND) != HEADER) {
         return false;
     }
-    for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
+    for (size_t axis = 0; axis < SENSOR_AXES; axis++) {
         const bool gyro = axis < 3U;
         const uint8_t *high = packet + (gyro ? 7U : 1U) + 2U * (axis % 3U);
         const uint8_t low = packet[17U + axis % 3U];
@@ -457,7 +405,7 @@ static bool unpack(const uint8_t *packet, int32_t raw[ICM42688_AXES]) {
         if ((nibble & (gyro ? 1U : 3U)) != 0U || value == 0x80000U) { /* the latter: no valid sample */
             return false;
         }
-        raw[axis] = (int32_t)(value ^ 0x80000U) - 0x80000;
+        raw[axis] = ((int32_t)(value ^ 0x80000U) - 0x80000) / (gyro ? 2 : 4);
     }
     return true;
 }
@@ -465,9 +413,9 @@ static bool unpack(const uint8_t *packet, int32_t raw[ICM42688_AXES]) {
 /* Periods from the last sample to one at `us` with this timestamp, after a break. */
 static uint32_t periods(const icm42688_t *self, uint64_t us, uint16_t stamp) {
     const uint64_t passed = us > self->last_us ? us - self->last_us : 0U;
-    uint64_t count = (passed + self->period_us / 2U) / self->period_us;
+    uint64_t count = (passed + self->common.period_us / 2U) / self->common.period_us;
     if (!self->blind && passed < BLIND_US) { /* whole turns from the clock, the rest from the timestamp */
-        const uint64_t ticks = (passed * self->ticks_q16 / self->period_us) >> 16;
+        const uint64_t ticks = (passed * self->ticks_q16 / self->common.period_us) >> 16;
         const uint32_t part = (uint16_t)(stamp - self->last_stamp);
         const uint64_t turns = ticks > part ? (ticks - part + 0x8000U) >> 16 : 0U;
         count = ((((turns << 16) + part) << 16) + self->ticks_q16 / 2U) / self->ticks_q16;
@@ -485,9 +433,9 @@ static bool in_place(icm42688_t *self, uint16_t stamp, uint32_t count) {
         return false;
     }
     if (count == 1U) {
-        const int64_t nominal = (int64_t)self->period_us << 16;
+        const int64_t nominal = (int64_t)self->common.period_us << 16;
         const int64_t error = ((int64_t)step << 16) - (int64_t)self->ticks_q16;
-        const int64_t ticks = (int64_t)self->ticks_q16 + error / (self->good < LEARNING ? 8 : 64);
+        const int64_t ticks = (int64_t)self->ticks_q16 + error / (self->common.good < LEARNING ? 8 : 64);
         if (ticks > nominal - nominal / 6 && ticks < nominal + nominal / 6) {
             self->ticks_q16 = (uint32_t)ticks;
         }
@@ -498,11 +446,11 @@ static bool in_place(icm42688_t *self, uint16_t stamp, uint32_t count) {
 /* Whether a good packet with this timestamp is a sample, and how many are missing before it. */
 static bool placed(icm42688_t *self, uint64_t us, uint16_t stamp, uint32_t *missing) {
     if (self->continuous && self->dropped == 0U && stamp == self->last_stamp) {
-        self->counters.stale++;
+        self->common.counters.stale++;
         return false;
     }
     if (self->continuous && !in_place(self, stamp, self->dropped + 1U)) {
-        self->counters.damaged++;
+        self->common.counters.damaged++;
         self->dropped++;
         if (++self->mismatches >= MISMATCHES) {
             self->continuous = false;
@@ -513,11 +461,8 @@ static bool placed(icm42688_t *self, uint64_t us, uint16_t stamp, uint32_t *miss
     return true;
 }
 
-static bool take(icm42688_t *self, const int32_t raw[ICM42688_AXES], uint64_t us, uint16_t stamp) {
-    self->equal = memcmp(raw, self->last, sizeof self->last) == 0 ? self->equal + 1U : 0U;
-    memcpy(self->last, raw, sizeof self->last);
-    if (self->equal > REPEATS_TAKEN) {
-        self->counters.repeated++;
+static bool take(icm42688_t *self, const int32_t raw[SENSOR_AXES], uint64_t us, uint16_t stamp) {
+    if (sensor_repeats(&self->common, raw)) {
         self->dropped++;
         return false;
     }
@@ -527,26 +472,23 @@ static bool take(icm42688_t *self, const int32_t raw[ICM42688_AXES], uint64_t us
     self->blind = false;
     self->dropped = 0;
     self->mismatches = 0;
-    self->good++;
-    self->counters.samples++;
-    expect(self);
     return true;
 }
 
-bool icm42688_sample(icm42688_t *self, float reading[ICM42688_AXES], uint32_t *missing) {
-    while (self->state == ICM42688_RUNNING && (self->next < self->held || fetch(self))) {
-        const uint8_t *packet = self->chunk + 1U + (size_t)self->next * ICM42688_PACKET;
+static bool read_sample(sensor_state_t *state, int32_t raw[SENSOR_AXES], uint32_t *missing) {
+    icm42688_t *self = of(state);
+    while (self->next < self->held || fetch(self)) {
+        const uint8_t *packet = self->chunk + 1U + (size_t)self->next * PACKET;
         self->next++;
         if ((packet[0] & EMPTY) != 0U && packet[0] == 0xFFU) { /* the count was too high */
             self->next = self->held;
             return false;
         }
-        self->packets_seen++;
-        const uint64_t us = self->read_us - (uint64_t)(self->held - self->next + self->behind) * self->period_us;
+        state->signs++;
+        const uint64_t us = self->read_us - (uint64_t)(self->held - self->next + self->behind) * self->common.period_us;
         const uint16_t stamp = (uint16_t)((unsigned)packet[15] << 8 | packet[16]);
-        int32_t raw[ICM42688_AXES];
         if (!unpack(packet, raw)) {
-            self->counters.damaged++;
+            self->common.counters.damaged++;
             self->dropped++;
             if (++self->mismatches >= MISMATCHES) { /* out of step with the packets */
                 (void)flush(self);
@@ -557,15 +499,44 @@ bool icm42688_sample(icm42688_t *self, float reading[ICM42688_AXES], uint32_t *m
         if (!placed(self, us, stamp, missing) || !take(self, raw, us, stamp)) {
             continue;
         }
-        for (size_t axis = 0; axis < ICM42688_AXES; axis++) {
-            reading[axis] = (float)raw[axis] * (axis < 3U ? 0.5F * GYRO_STEP : 0.25F * ACCEL_STEP);
-        }
         self->temperature = word_of(packet + 13);
         return true;
     }
     return false;
 }
 
-float icm42688_temperature(const icm42688_t *self) {
-    return self->temperature == INT16_MIN ? NAN : 25.0F + (float)self->temperature / 132.48F;
+static float side(const sensor_state_t *state, unsigned channel) {
+    const int16_t temperature = ((const icm42688_t *)(const void *)state)->temperature;
+    const bool known = channel == SENSOR_TEMPERATURE && temperature != INT16_MIN;
+    return known ? 25.0F + (float)temperature / 132.48F : NAN;
 }
+
+static const sensor_step_t icm42688_steps[] = {
+    {0, reset},
+    {RESET_US, probe},
+    {0, prepare_test},
+    {SPIN_US, begin_gathering},
+    {GATHER_US, deflect},
+    {STRAIN_US, begin_gathering},
+    {GATHER_US, judge},
+    {0, set_up},
+    {STRAIN_US, relaxed},
+};
+static icm42688_t sensor;
+
+const sensor_t icm42688 = {
+    .state = &sensor.common,
+    .bytes = sizeof sensor,
+    .start = icm42688_steps,
+    .steps = sizeof icm42688_steps / sizeof icm42688_steps[0],
+    .step = {GYRO_STEP, ACCEL_STEP},
+    .offset_step = {1.0F / 32.0F, 0.5e-3F * SENSOR_G},
+    .offset_limit = {2048, 2048},
+    .init = init,
+    .stop = stop,
+    .watch = watch,
+    .waits = waits,
+    .read = read_sample,
+    .side = side,
+    .offsets = offsets,
+};

@@ -50,12 +50,9 @@ void systick_handler(void);
 
 /* ----------------------------------------------------------------------------------------------------------- sensor */
 
-void spi_init(void);
-bool spi_word(void *context, uint16_t out, uint16_t *in);
-bool spi_burst(void *context);
-void spi_reset_line(void *context, bool low);
+extern const sensor_bus_t spi_bus;
 void sensor_ready_handler(void);
-void sensor_burst_handler(void);
+void sensor_done_handler(void);
 
 /* ------------------------------------------------------------------------------------------------------------- wire */
 

@@ -105,6 +105,6 @@ uint64_t clock_us(void)
 void clock_spin_us(uint32_t us)
 {
     /* 2 to 4 cycles a turn */
-    uint32_t turns = us * (board_clock.hclk_hz / 2000000U);
+    uint32_t turns = us * (board_clock.hclk_hz / 2000000U) + 1U;
     __asm__ volatile(".syntax unified\n1: subs %0, #1\n bne 1b" : "+r"(turns) : : "cc");
 }

@@ -1,4 +1,4 @@
-/* The application on an STM32F405 with an ADIS16405: wiring and flashing in port/README.md. */
+/* The application on an STM32F405 with a sensor on SPI1: wiring and flashing in port/README.md. */
 #include "board.h"
 #include "stm32f405.h"
 
@@ -12,20 +12,6 @@
 
 static reset_cause_t reset_cause;
 static board_fault_t last_fault;
-
-static uint64_t bus_time_us(void *context)
-{
-    (void)context;
-    return clock_us();
-}
-
-static uint32_t bus_time_us32(void *context)
-{
-    (void)context;
-    return clock_us32();
-}
-
-static const adis16405_bus_t bus = {NULL, bus_time_us, bus_time_us32, spi_word, spi_burst, spi_reset_line};
 
 static void board_sleep(void)
 {
@@ -48,7 +34,7 @@ static void board_tell(selfcal_module_t *told)
 }
 
 static const module_board_t board_calls = {
-    &bus, &flash_memory, BOARD_REPORT_MS, clock_ms, clock_ticks, BOARD_CAN_KBITPS > 0 ? can_send : usart_send,
+    &spi_bus, &flash_memory, BOARD_REPORT_MS, clock_ms, clock_ticks, BOARD_CAN_KBITPS > 0 ? can_send : usart_send,
     BOARD_CAN_KBITPS > 0 ? can_sent : usart_sent, BOARD_CAN_KBITPS > 0 ? can_poll : usart_poll, board_sleep,
     watchdog_feed, board_tell, rng_number, board_reset,
 };
@@ -67,7 +53,6 @@ int main(void)
     } else {
         usart_init(BOARD_USART_BAUD);
     }
-    spi_init();
     module_run(&board_calls);
     return 1; /* the model is not one for this sensor: the start-up code resets */
 }

@@ -96,6 +96,6 @@ __attribute__((section(".vectors"), used)) static const vector_t vectors[16 + IR
     X12, {.call = can_tx_handler},                    /* to 19 CAN1_TX */
     X, X, {.call = can_error_handler},                /* to 22 CAN1_SCE */
     X12, X, X, {.call = usart_handler},               /* to 37 USART1 */
-    X12, X4, X, X, {.call = sensor_burst_handler},    /* to 56 DMA2_Stream0 */
+    X12, X4, X, X, {.call = sensor_done_handler},     /* to 56 DMA2_Stream0 */
     X12, X12, X,                                      /* to 81 FPU */
 };

@@ -113,8 +113,6 @@
 #define DMA_SCR_TCIE BIT(4)
 #define DMA_SCR_TO_PERIPHERAL BIT(6)
 #define DMA_SCR_MINC BIT(10)
-#define DMA_SCR_PSIZE_16 BIT(11)
-#define DMA_SCR_MSIZE_16 BIT(13)
 #define DMA_SCR_PL_HIGH (2U << 16)
 #define DMA_SCR_CHSEL_POS 25U
 #define DMA_LISR_TEIF0 BIT(3)
@@ -154,7 +152,6 @@
 #define SPI_CR1_SPE BIT(6)
 #define SPI_CR1_SSI BIT(8)
 #define SPI_CR1_SSM BIT(9)
-#define SPI_CR1_DFF16 BIT(11)
 #define SPI_CR2_RXDMAEN BIT(0)
 #define SPI_CR2_TXDMAEN BIT(1)
 #define SPI_SR_RXNE BIT(0)

@@ -2,10 +2,11 @@
 
     python tests/bench/image_sizes.py TARGET...
 
-For each TARGET reads build/TARGET/selfcal.elf (`make firmware`), what gcc says of each function's stack beside its
-objects (.su) and port/TARGET/budget.json: greatest `flash`, `ram` (without stack) and `stack` in bytes, and under
-`calls` for each source file that calls through pointers the const tables of functions it calls through, or for a
-function of it (`app_commands.c:app_command`) the functions. Exit code 1 above a budget.
+For each TARGET reads build/TARGET/selfcal.elf (`make firmware`), or with --sensor NAME that in build/TARGET-NAME, what
+gcc says of each function's stack beside its objects (.su) and port/TARGET/budget.json: greatest `flash`, `ram` (without
+stack) and `stack` in bytes, and under `calls` for each source file that calls through pointers the const tables of
+functions it calls through, or for a function of it (`app_commands.c:app_command`) the functions. SENSOR stands for the
+name of the image's sensor, and `SENSOR.start` for one member of its struct. Exit code 1 above a budget.
 
 The worst stack is that of the deepest path through the call graph of the linked image, read from its disassembly, from
 the reset vector, and upon it the deepest of the interrupt handlers with what the processor pushes (they share one
@@ -32,6 +33,10 @@ from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "host_sim"))
+
+from parts.symbols import place  # noqa: E402  of host_sim
+
 BUILD = ROOT / "build"
 #: The boards of port/boards.txt by name: core, clock in Hz, seconds between reports.
 BOARDS = {
@@ -40,6 +45,8 @@ BOARDS = {
     if (words := line.split()) and words[0][0] != "#"
 }
 TARGETS = tuple(BOARDS)
+#: The sensor of an image that names none.
+SENSOR = "adis16405"
 #: What a processor pushes on an exception and may add to align: without and with an FPU (ARMv7-M ARM B1.5.7).
 EXCEPTION = {False: 32 + 4, True: 104 + 4}
 KINDS = ("flash", "ram", "stack")
@@ -155,6 +162,7 @@ class Image:
     """A linked image and what gcc said when it compiled its objects into the folder `objects` beside it."""
 
     def __init__(self, elf: Path) -> None:
+        self.elf = elf
         self.functions = disassembly(elf)
         frames = stated_frames(elf.parent / "objects")
         with elf.open("rb") as stream:
@@ -177,9 +185,12 @@ class Image:
 
     def words(self, name: str) -> list[int]:
         """The words of a const object. Raises FirmwareError if there is none of that name."""
-        if name not in self.symbols:
+        if "." in name:
+            address, size = place(self.elf, name)
+        elif name in self.symbols:
+            address, size = self.symbols[name]
+        else:
             raise FirmwareError(f"no object '{name}'")
-        address, size = self.symbols[name]
         for start, data in self._bytes:
             if start <= address and address + size <= start + len(data):
                 return [word for (word,) in struct.iter_unpack("<I", data[address - start : address - start + size])]
@@ -188,10 +199,17 @@ class Image:
     def functions_in(self, name: str) -> set[int]:
         """Addresses of the functions that a const object points to, or that of a function itself.
 
+        A member of an object, `sensor.start`, may point to a function, or to a const object that does.
         A name that ends in `?` may be missing: then nothing linked it, so the pointer is null.
         """
         if name.endswith("?"):
             return self.functions_in(name[:-1]) if name[:-1] in self.symbols else set()
+        if "." in name:
+            (word,) = self.words(name)
+            if word == 0:
+                return set()
+            tables = {table for table in self.objects if self.symbols[table][0] == word}
+            return {word & ~1} & set(self.functions) | {f for table in tables for f in self.functions_in(table)}
         if name not in self.objects:
             return {address for address, function in self.functions.items() if function.name == name}
         return {word & ~1 for word in self.words(name) if word & 1 and word & ~1 in self.functions}
@@ -263,13 +281,13 @@ class Image:
         return self.functions[handler].name in ("unexpected", "board_reset", "board_fault")
 
 
-def measure(target: str) -> tuple[dict[str, int], str]:
+def measure(target: str, sensor: str = SENSOR) -> tuple[dict[str, int], str]:
     """Flash, RAM and stack of a target's image in bytes, and the deepest path. Raises FirmwareError."""
-    elf = BUILD / target / "selfcal.elf"
+    elf = BUILD / (target if sensor == SENSOR else f"{target}-{sensor}") / "selfcal.elf"
     if not elf.is_file():
         raise FirmwareError(f"there is no {elf.relative_to(ROOT)}: make firmware")
     image = Image(elf)
-    budget = read_budget(target)
+    budget = read_budget(target, sensor)
     stack, path = image.stack(budget["calls"], budget["giving_way"])
     room = image.symbols["link_stack"][0] - image.symbols["link_stack_low"][0]
     if stack > room:
@@ -277,9 +295,10 @@ def measure(target: str) -> tuple[dict[str, int], str]:
     return {"flash": image.flash(), "ram": image.ram(), "stack": stack}, path
 
 
-def read_budget(target: str) -> Budget:
-    """The budget file of a target."""
-    budget: Budget = json.loads((ROOT / "port" / target / "budget.json").read_text(encoding="utf-8"))
+def read_budget(target: str, sensor: str = SENSOR) -> Budget:
+    """The budget file of a target, with the name of the image's sensor put in."""
+    text = (ROOT / "port" / target / "budget.json").read_text(encoding="utf-8")
+    budget: Budget = json.loads(text.replace("SENSOR", sensor))
     return budget
 
 
@@ -288,12 +307,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("target", nargs="+", choices=TARGETS)
     parser.add_argument("--path", action="store_true", help="print the deepest path of calls too")
+    parser.add_argument("--sensor", default=SENSOR, help=f"of the images (default: {SENSOR})")
     arguments = parser.parse_args()
     failed = False
     print(f"{'bytes':10} " + "".join(f"{kind:>10}{'budget':>10}" for kind in KINDS))
     for target in arguments.target:
         try:
-            sizes, path = measure(target)
+            sizes, path = measure(target, arguments.sensor)
         except FirmwareError as error:
             print(f"{target}: {error}", file=sys.stderr)
             failed = True

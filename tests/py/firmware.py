@@ -73,14 +73,19 @@ def image(
     target: str = "stm32f405",
     rate_hz: float = QUIET_RATE_HZ,
     node: int | None = None,
+    sensor: str = image_sizes.SENSOR,
 ) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: at `rate_hz`, bank at
-    `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds). `node`: its number on its bus."""
+    `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds). `node`: its number on its bus.
+    `sensor`: one of port/sensors, with the model file of its name."""
     folder = ROOT / "build" / "firmware" / (f"{name}-extended" if EXTENDED else name)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        document = yaml.safe_load(Path(Model.load().path).read_text())
+        model = Model.load().path
+        if sensor != image_sizes.SENSOR:
+            model = model.with_name(f"{sensor}.yaml")
+        document = yaml.safe_load(model.read_text())
         if quiet:
             document["bank_rate_hz"] = bank_hz
             document["hypotheses"] = dict.fromkeys(laws, 1)
@@ -94,6 +99,7 @@ def image(
                 old.write_bytes(file.read_bytes())
         makefile = f"port/{target}/{target}.mk"
         command = ["make", "-s", "-f", makefile, target, f"MODEL_DIR={folder}", f"OUT={folder}"]
+        command += [f"SENSOR={sensor}"]
         command += [] if node is None else [f"NODE={node}"]
         subprocess.run([*command, f"CFLAGS={flags}"], cwd=ROOT, check=True)
     return folder / "selfcal.elf"
@@ -199,7 +205,7 @@ class Tap:
     def foreign(self) -> int:
         """Pushed samples that the sensor made with other settings than the driver's."""
         sensor, value = self.board.sensor, self.board.value
-        wanted = value("sensor.sample_period"), value("sensor.filter")
+        wanted = value("sensor.sample_period"), 0x0401  # 300 deg/s, two taps
         settings = self._made(sensor.made_with)
         return sum(settings[sample] != wanted for _, sample in self.pushed if sample in settings)
 

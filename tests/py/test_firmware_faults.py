@@ -180,7 +180,7 @@ def test_a_reset_while_the_flash_is_at_work() -> None:
     board.run(3.0)
     assert board.sensor.resets >= 3  # power, start, spike
     assert set_up(board) == before
-    assert board.value("sensor.state") == 1
+    assert board.value("sensor.common.condition") == RUNNING
     assert len(tap.pushed) > taken + 50
     assert not board.machine.violations
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
@@ -199,7 +199,7 @@ def test_a_reset_while_samples_wait() -> None:
             uc.reg_write(arm.UC_ARM_REG_R0, 0)
             uc.reg_write(arm.UC_ARM_REG_PC, uc.reg_read(arm.UC_ARM_REG_LR))
 
-    sample = board.machine.symbols["adis16405_sample"] & ~1
+    sample = board.machine.symbols["sensor_read"] & ~1
     board.machine.uc.hook_add(UC_HOOK_CODE, none, None, sample, sample)
     board.run(2.0)
     away = True
@@ -208,8 +208,8 @@ def test_a_reset_while_samples_wait() -> None:
     board.run(0.5)
     assert board.value("sensor.head") - board.value("sensor.tail") > 100
     board.run(12.0)
-    assert board.value("sensor.counters.faults") == 1
-    assert board.value("sensor.state") == 1
+    assert board.value("sensor.common.counters.faults") == 1
+    assert board.value("sensor.common.condition") == RUNNING
     away = False
     before = len(tap.pushed)
     board.run(1.0)
@@ -230,14 +230,14 @@ def test_the_sensor_is_ready_before_its_driver(target: str) -> None:
         early += 1
         board.machine.pend(EXC_IRQ0 + 6)  # EXTI0 and GPIOTE
 
-    place = board.machine.symbols["adis16405_init"] & ~1
+    place = board.machine.symbols["sensor_open"] & ~1
     board.machine.uc.hook_add(UC_HOOK_CODE, ready, None, place, place)
     board.machine.reset("software")
     board.run(3.0)
     assert early == 1
     assert [cause for _, cause in board.machine.resets] == ["software"]
     assert not board.machine.faults
-    assert board.value("sensor.state") == 1
+    assert board.value("sensor.common.condition") == RUNNING
 
 
 def test_altered_settings_are_found() -> None:
@@ -250,7 +250,7 @@ def test_altered_settings_are_found() -> None:
     assert board.sensor.reads[0x38] >= 2 + 1 + 1  # written, at the end of the start, after 10 s
     board.sensor.registers[0x38] = 0x0101
     board.run(10.1)
-    assert (board.value("sensor.state"), board.value("sensor.fault")) != (1, 0)
+    assert (board.value("sensor.common.condition"), board.value("sensor.common.fault")) != (RUNNING, 0)
     board.run(2.0)
     assert status(board)["sensor_fault"] == SET_UP
     assert status(board)["sensor_state"] == RUNNING
@@ -942,10 +942,10 @@ def test_flash_that_refuses_is_told_and_loses_nothing(target: str) -> None:
         board.flash.fail_at = board.flash.operations + (k if k == 100 else board.flash.operations - start - k)
         board.run(5.0)
         assert board.value("app.told.state_save_failures") == 1
-        assert board.value("sensor.state") == 1
-        before = board.value("sensor.counters.samples")
+        assert board.value("sensor.common.condition") == RUNNING
+        before = board.value("sensor.common.counters.samples")
         board.run(1.5)  # a save may fall into it
-        assert board.value("sensor.counters.samples") > before
+        assert board.value("sensor.common.counters.samples") > before
         assert not board.machine.resets
         kept = board.retained()
         board.power_cycle(kept)

@@ -189,7 +189,7 @@ def test_images_with_settings_keep_the_budgets(target: str, flags: str) -> None:
     [
         ("app/module.c", "-DBOARD_SAVE_PERIOD_S=0", "BOARD_SAVE_PERIOD_S: 1 to"),
         ("app/module.c", "-DBOARD_SAVE_PERIOD_S=4294968U", "BOARD_SAVE_PERIOD_S: 1 to"),
-        ("app/adis16405.c", "-DADIS16405_QUEUE=1000", "ADIS16405_QUEUE must be a power of two"),
+        ("sensors/adis16405.c", "-DSENSOR_QUEUE=1000", "SENSOR_QUEUE must be a power of two"),
         ("app/app_commands.c", "-DAPP_COMMAND_KEY=0x1ULL", "the_key_has_two_halves"),
         ("stm32f405/main.c", "-DBOARD_REPORT_MS=0", "BOARD_REPORT_MS: 100 to"),
         ("stm32f405/main.c", "-DBOARD_CAN_KBITPS=800", "BOARD_CAN_KBITPS: 125 to 1000"),
@@ -205,9 +205,41 @@ def test_options_that_cannot_work_do_not_compile(source: str, flag: str, complai
     assert complaint in said_of(source, model, core, flag)
 
 
-def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str) -> str:
+@pytest.mark.parametrize(
+    ("rate", "channel", "complaint"),
+    [
+        (200.0, "temp, unit: degC", ""),
+        (1000.0, "temp, unit: degC", ""),
+        (819.2, "temp, unit: degC", "the_sensor_makes_the_rate"),
+        (400.0, "temp, unit: degC", "the_sensor_makes_the_rate"),
+        (100.0, "supply, unit: V", "the_sensor_has_the_channels"),
+        (100.0, "fan, unit: rpm", "the_sensor_has_the_channels"),
+    ],
+)
+def test_models_that_the_other_sensor_cannot_keep_do_not_compile(
+    rate: float, channel: str, complaint: str, tmp_path: Path
+) -> None:
+    """The rates of the data sheet; a temperature and no supply."""
+    text = Model.load().path.with_name("icm42688.yaml").read_text()
+    regressor = f"regressors: [{{name: x, kind: column, column: {channel}, reference: 5, sd: {{gyro: 0.5}}}}]\n"
+    (tmp_path / "model.yaml").write_text(text + regressor)
+    codegen(tmp_path / "model.yaml", tmp_path, target="cortex-m4f", rate=rate)
+    said = said_of("app/readings.c", tmp_path, sensor="icm42688")
+    assert complaint in said
+    assert (said == "") == (complaint == "")
+
+
+def test_a_sensor_and_its_model_file_have_one_lattice() -> None:
+    """Range, step and default rate: of the data sheets, as the drivers and the model files have them."""
+    model = Model.load(Model.load().path.with_name("icm42688.yaml"))
+    assert model.axes["gx"].lsb == pytest.approx(2000.0 / 2**18) and model.axes["gx"].range == 2000.0
+    assert model.axes["az"].lsb == pytest.approx(16.0 * 9.80665 / 2**17)
+    assert model.axes["az"].range == pytest.approx(16.0 * 9.80665)
+
+
+def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str, sensor: str = "adis16405") -> str:
     """What the compiler has against a source with the model of a folder; it fails if that is anything."""
-    folders = [f"-I{folder}" for folder in ("lib", "port", "port/app", model)]
+    folders = [f"-I{folder}" for folder in ("lib", "port", "port/app", "port/sensors", model)] + [f"-DSENSOR={sensor}"]
     compiler = ["arm-none-eabi-gcc", "-std=c99", "-mthumb", "-Wall", "-Wextra", "-Wpedantic", *CORES[core], *folders]
     command = [*compiler, "-fsyntax-only", f"port/{source}", *flags]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -223,12 +255,12 @@ def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str) -> 
         ("app/app.c", "unit: m/s^2", "unit: mg", "each axis of the model must be one that telemetry has"),
         ("app/app.c", "[gx, gy, gz]", "[gx, gy, w]", "each axis of the model must be one that telemetry has"),
         # by 1638.4 / n Hz, n = 1 .. 128, of the data sheet, to 0.1 %
-        ("app/sensor.c", "819.2", "546.1", ""),
-        ("app/sensor.c", "819.2", "12.8", ""),
-        ("app/sensor.c", "819.2", "12.7", "the_sensor_makes_the_rate"),
-        ("app/sensor.c", "819.2", "821.0", "the_sensor_makes_the_rate"),
-        ("app/sensor.c", "819.2", "100.0", "the_sensor_makes_the_rate"),
-        ("app/sensor.c", "819.2", "1638.4", "the_rate_can_be_read"),
+        ("app/readings.c", "819.2", "546.1", ""),
+        ("app/readings.c", "819.2", "12.8", ""),
+        ("app/readings.c", "819.2", "12.7", "the_sensor_makes_the_rate"),
+        ("app/readings.c", "819.2", "821.0", "the_sensor_makes_the_rate"),
+        ("app/readings.c", "819.2", "100.0", "the_sensor_makes_the_rate"),
+        ("app/readings.c", "819.2", "1638.4", "the_sensor_makes_the_rate"),  # two bursts do not fit
     ],
 )
 def test_models_that_the_board_cannot_keep_do_not_compile(

@@ -116,11 +116,11 @@ def test_full_rate_queue() -> None:
         nonlocal waiting
         waiting = max(waiting, made.value("sensor.head") - made.value("sensor.tail"))
 
-    take = made.machine.symbols["adis16405_sample"] & ~1
+    take = made.machine.symbols["sensor_read"] & ~1
     made.machine.uc.hook_add(UC_HOOK_CODE, look, None, take, take)
     made.run(20.0 if MANY > 1 else 1.3)
-    seen = made.value("sensor.counters.samples")
-    lost = sum(missing for missing, _ in tap.seen) + made.value("sensor.counters.overruns")
+    seen = made.value("sensor.common.counters.samples")
+    lost = sum(missing for missing, _ in tap.seen) + made.value("sensor.common.counters.overruns")
     tell("819.2 Hz, Cortex-M0 at 16 MHz", seen, seen - lost, f"samples; {waiting} wait at most")
     assert well(made)
     assert seen > 700
@@ -225,7 +225,7 @@ def test_a_reset_during_a_report() -> None:
     assert made.value("app.imu.computing")
     axis = made.value("app.stage")
     assert (axis, made.value("app.imu.work.hypothesis")) >= (0, 2)
-    assert made.value("sensor.counters.faults") >= 1
+    assert made.value("sensor.common.counters.faults") >= 1
     assert set_up(made) == settings
     assert tap.wrong() == tap.mistimed() == tap.foreign() == 0
     long_ago = -10_000 % 2**32  # ten seconds before the start

@@ -23,18 +23,19 @@ sys.path.insert(0, str(ROOT / "host_sim"))
 from parts import icm42688
 from parts.icm42688 import FIFO_DATA, G, Icm42688, Sample
 
-STATES = ("starting", "running", "failed")
+STATES = ("off", "starting", "running", "failed")
 NONE, ABSENT, SET_UP, SELF_TEST, SILENT, NO_DATA, STUCK = range(7)
 GYRO_LSB, ACCEL_LSB = 2000.0 / 2**18, 16.0 * G / 2**17  # of 19 and 18 bits, deg/s and m/s^2
 MODULUS = 2**15  # sample numbers that gz can tell apart: 125 deg/s, which the self-test has room for
 
-#: Access to the driver's struct.
+#: Access to the driver's structs.
 SHIM = """
 #include "icm42688.h"
-size_t shim_size(void) { return sizeof(icm42688_t); }
-int shim_state(const icm42688_t *self) { return (int)self->state; }
-int shim_fault(const icm42688_t *self) { return (int)self->fault; }
-const icm42688_counters_t *shim_counters(const icm42688_t *self) { return &self->counters; }
+const sensor_t *shim_sensor(void) { return &icm42688; }
+int shim_state(void) { return (int)icm42688.state->condition; }
+int shim_fault(void) { return (int)icm42688.state->fault; }
+const sensor_counters_t *shim_counters(void) { return &icm42688.state->counters; }
+float shim_side(unsigned channel) { return icm42688.side(icm42688.state, channel); }
 """
 
 
@@ -46,15 +47,21 @@ class Clock:
 
 
 class Bus(ctypes.Structure):
-    TIME = ctypes.CFUNCTYPE(ctypes.c_uint64, ctypes.c_void_p)
-    TRANSFER = ctypes.CFUNCTYPE(
-        ctypes.c_bool, ctypes.c_void_p, ctypes.POINTER(ctypes.c_uint8), ctypes.POINTER(ctypes.c_uint8), ctypes.c_size_t
+    TIME = ctypes.CFUNCTYPE(ctypes.c_uint64)
+    TIME_32 = ctypes.CFUNCTYPE(ctypes.c_uint32)
+    OPEN = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+    EXCHANGE = ctypes.CFUNCTYPE(
+        ctypes.c_bool, ctypes.POINTER(ctypes.c_uint8), ctypes.POINTER(ctypes.c_uint8), ctypes.c_size_t
     )
-    _fields_ = (("context", ctypes.c_void_p), ("time_us", TIME), ("transfer", TRANSFER))
+    RESET = ctypes.CFUNCTYPE(None, ctypes.c_bool)
+    _fields_ = (
+        ("time_us", TIME), ("time_us32", TIME_32), ("open", OPEN), ("exchange", EXCHANGE), ("begin", EXCHANGE),
+        ("reset_line", RESET),
+    )  # fmt: skip
 
 
 class Counters(ctypes.Structure):
-    NAMES = ("samples", "stale", "repeated", "damaged", "overruns", "faults")
+    NAMES = ("samples", "stale", "repeated", "alarms", "damaged", "anomalies", "overruns", "faults")
     _fields_ = tuple((name, ctypes.c_uint32) for name in NAMES)
 
 
@@ -75,18 +82,19 @@ def numbered(k: int) -> Sample:
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     folder = tmp_path_factory.mktemp("driver")
     (folder / "shim.c").write_text(SHIM, encoding="utf-8")
-    sources = (ROOT / "port" / "sensors" / "icm42688.c", folder / "shim.c")
+    sensors = ROOT / "port" / "sensors"
+    sources = (sensors / "sensor.c", sensors / "icm42688.c", folder / "shim.c")
     warnings = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wdouble-promotion", "-Werror")
     checked = ("-g", "-fsanitize=undefined", "-fno-sanitize-recover=all")
-    compiler = ("gcc", "-std=c99", "-O1", *warnings, *checked, "-shared", "-fPIC", f"-I{sources[0].parent}")
+    compiler = ("gcc", "-std=c99", "-O1", *warnings, *checked, "-shared", "-fPIC", f"-I{sensors}")
     subprocess.run([*compiler, *map(str, sources), "-lm", "-o", str(folder / "driver.so")], check=True)
     loaded = ctypes.CDLL(str(folder / "driver.so"))
-    loaded.shim_size.restype = ctypes.c_size_t
     loaded.shim_counters.restype = ctypes.POINTER(Counters)
-    loaded.icm42688_temperature.restype = ctypes.c_float
-    for name in ("init", "offsets", "sample"):
-        getattr(loaded, f"icm42688_{name}").restype = ctypes.c_bool
-    loaded.icm42688_init.argtypes = (ctypes.c_void_p, ctypes.POINTER(Bus), ctypes.c_float)
+    loaded.shim_sensor.restype = ctypes.c_void_p
+    loaded.shim_side.restype = ctypes.c_float
+    for name in ("open", "offsets", "read"):
+        getattr(loaded, f"sensor_{name}").restype = ctypes.c_bool
+    loaded.sensor_open.argtypes = (ctypes.c_void_p, ctypes.POINTER(Bus), ctypes.c_float)
     return loaded
 
 
@@ -97,14 +105,17 @@ class Product:
         self.clock = Clock()
         self.part = Icm42688(self.clock, numbered)
         self.library, self.loop_us = library, loop_us
-        self.memory = ctypes.create_string_buffer(library.shim_size())
-        self.bus = Bus(None, Bus.TIME(lambda _: int(self.clock.time_us)), Bus.TRANSFER(self._transfer))
+        self.sensor = ctypes.c_void_p(library.shim_sensor())
+        self.bus = Bus(
+            Bus.TIME(lambda: int(self.clock.time_us)), Bus.TIME_32(lambda: int(self.clock.time_us) & 0xFFFFFFFF),
+            Bus.OPEN(lambda wire: None), Bus.EXCHANGE(self._exchange), Bus.EXCHANGE(), Bus.RESET(),
+        )  # fmt: skip
         self.broken = False
         #: Reading and missing samples before it, each.
         self.taken: list[tuple[tuple[float, ...], int]] = []
-        self.known = library.icm42688_init(self.memory, ctypes.byref(self.bus), rate_hz)
+        self.known = library.sensor_open(self.sensor, ctypes.byref(self.bus), rate_hz)
 
-    def _transfer(self, _: int, out: ctypes._Pointer, into: ctypes._Pointer, count: int) -> bool:
+    def _exchange(self, out: ctypes._Pointer, into: ctypes._Pointer, count: int) -> bool:
         if self.broken:
             return False
         self.part.select(True)
@@ -118,8 +129,8 @@ class Product:
         end = self.clock.time_us + 1e6 * seconds
         reading, missing = Six(), ctypes.c_uint32()
         while self.clock.time_us < end:
-            self.library.icm42688_poll(self.memory)
-            while self.library.icm42688_sample(self.memory, reading, ctypes.byref(missing)):
+            self.library.sensor_poll(self.sensor)
+            while self.library.sensor_read(self.sensor, reading, ctypes.byref(missing)):
                 self.taken.append((tuple(reading), missing.value))
             self.clock.time_us += self.loop_us
 
@@ -131,15 +142,15 @@ class Product:
 
     @property
     def state(self) -> str:
-        return STATES[self.library.shim_state(self.memory)]
+        return STATES[self.library.shim_state()]
 
     @property
     def fault(self) -> int:
-        return int(self.library.shim_fault(self.memory))
+        return int(self.library.shim_fault())
 
     @property
     def counters(self) -> Counters:
-        return self.library.shim_counters(self.memory).contents  # type: ignore[no-any-return]
+        return self.library.shim_counters().contents  # type: ignore[no-any-return]
 
     def numbers(self, offset: float = 0.0) -> list[int]:
         """The number of each sample taken, as its gz has it."""
@@ -305,7 +316,7 @@ def test_every_sample_arrives(library: ctypes.CDLL, rate: float, tick: float, er
     assert all(missing == 0 for _, missing in product.taken)
     for number, (reading, _) in zip(numbers, product.taken, strict=True):
         assert reading == pytest.approx(numbered(number), rel=1e-6, abs=1e-9)  # floats of exact integers
-    assert library.icm42688_temperature(product.memory) == pytest.approx(-12.25, abs=0.5 / 132.48)
+    assert library.shim_side(0) == pytest.approx(-12.25, abs=0.5 / 132.48)
     assert product.counters.damaged == product.counters.stale == product.counters.overruns == 0
     assert product.clock.violations == []
 
@@ -429,7 +440,7 @@ def test_a_reset_that_nobody_asked_for(library: ctypes.CDLL) -> None:
     """Its FIFO is off then: the driver starts it again, with the offsets."""
     product = Product(library, 1000.0)
     product.until("running", 1.0)
-    assert library.icm42688_offsets(product.memory, Six(0.5, 0, 0, 0, 0, 0), Six())
+    assert library.sensor_offsets(product.sensor, Six(0.5, 0, 0, 0, 0, 0), Six())
     product.run(0.2)
     product.part.power_on()
     product.until("failed", 0.5)
@@ -447,7 +458,7 @@ def test_offsets(library: ctypes.CDLL) -> None:
     product.run(0.1)
     wanted = (1.0, -0.031, 63.96, -0.05, 0.1, -9.7)
     got = Six()
-    assert library.icm42688_offsets(product.memory, Six(*wanted), got)
+    assert library.sensor_offsets(product.sensor, Six(*wanted), got)
     steps = [1 / 32] * 3 + [0.5e-3 * G] * 3
     for value, want, step in zip(got, wanted, steps, strict=True):
         assert abs(value - want) <= 0.5001 * step and value / step == pytest.approx(round(value / step), abs=1e-3)
@@ -462,9 +473,9 @@ def test_offsets(library: ctypes.CDLL) -> None:
     for axis, beyond in ((0, 64.1), (2, -64.1), (4, 1.03 * G), (1, math.nan)):
         refused = [0.0] * 6
         refused[axis] = beyond
-        assert not library.icm42688_offsets(product.memory, Six(*refused), Six())
+        assert not library.sensor_offsets(product.sensor, Six(*refused), Six())
     product.part.writes_fail = {(4, 0x7A)}
-    assert not library.icm42688_offsets(product.memory, Six(0, 0, 1.0, 0, 0, 0), Six())
+    assert not library.sensor_offsets(product.sensor, Six(0, 0, 1.0, 0, 0, 0), Six())
 
 
 @pytest.mark.parametrize("at", [(0, 0x80), (0, 0x20), (15, 0x04), (17, 0x10), (18, 0x20), (19, 0x01)])

@@ -182,8 +182,9 @@ def _header(model: Model, tables: Tables, start: str) -> str:
 #define SELFCAL_MODEL_CHANGES {int(tables.handling.steps or tables.handling.variance_changes)}
 /* Channels that the regressors take beside the readings: selfcal_model_channel_name, in these units{_units(tables)}. */
 #define SELFCAL_MODEL_CHANNELS {len(tables.channels)}U
-/* 1: each is one that the ADIS16405 gives, in the unit of port/app/sensor.c. */
+/* 1: each is one of port/sensors/sensor.h, in its unit; one is the supply. */
 #define SELFCAL_MODEL_CHANNELS_READ {int(set(tables.channels) <= set(SIDE_CHANNELS.values()))}
+#define SELFCAL_MODEL_SUPPLY_READ {int(SIDE_CHANNELS["supply"] in tables.channels)}
 /* With SELFCAL_FIXED no record overflows (lib/bank_kernel_fixed.c). The coarsest step of each axis that readings within
  * its range can lead to, 2^exponent of the unit. Rounding moves a likelihood by 3e-3 nats at 10^5 bank samples where
  * sigma_v is 2^17 of these; by a tenth of that at rest, where a step is 2^-20 sigma_v. */

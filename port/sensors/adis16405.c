@@ -15,7 +15,7 @@ enum {
     ALM_CTRL = 0x48,
     PRODUCT_ID = 0x56
 };
-#define WRITE 0x8000U
+#define WRITE 0x80U
 #define PRODUCT 16405U
 #define GLOB_CMD_RESET 0x80U
 #define MSC_CTRL_READY 0x06U          /* data-ready on DIO1, rising */
@@ -47,14 +47,10 @@ enum { SIGN_ALIKE = 4, SIGN_BEYOND = 7000, SIGN_UNSURE = 8192 - SIGN_BEYOND };
  * registers are believed. */
 enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
-/* All six channels the same as before: by chance once in 10^4 to 10^8 samples (noise of 0.6 to 18 LSB a channel).
- * From the third in a row on they are withheld, the sixteenth is a fault. */
-enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16 };
 enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor that is stuck still gives none */
 #define RESET_PULSE_US 1000U
 #define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
-#define SILENCE_US 150000U    /* without a sample; at least 10 periods as well */
 /* Samples further apart than this and 1.5 periods, or closer than 3/4 of one: something else may have reset the
  * sensor, which takes 170 ms and leaves a rate of its own. What follows is taken once the settings have been found
  * to stand. */
@@ -66,21 +62,82 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
 #define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
-#define BACKOFF_MIN_US 100000U
-#define BACKOFF_MAX_US 10000000U
-enum { PROVEN_SAMPLES = 1000 };
 /* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones
  * are not taken: the sensor's clock is another. After a start none is taken before one that is in its place. Steps
  * beyond two periods and a half tell nothing: the 5 % that the clock may be off add up. */
 enum { OFF_RATE_TAKEN = 3 };
 
-enum { STEP_PULSE, STEP_BOOT, STEP_SELF_TEST };
+/* Readings that wait for the main loop: 1.25 s at 819.2 Hz. A power of two; 16 bytes each. */
+#ifndef SENSOR_QUEUE
+#define SENSOR_QUEUE 1024U
+#endif
+#if SENSOR_QUEUE < 8 || (SENSOR_QUEUE & (SENSOR_QUEUE - 1)) != 0
+#error "SENSOR_QUEUE must be a power of two, 8 at least"
+#endif
+
+/* The sensor makes 1638.4 / n Hz. */
+#define DIVIDER(rate_hz) ((uint32_t)(1638.4F / (rate_hz) + 0.5F))
+
+/* A burst: the command, then a word of each output register. */
+enum { BURST_WORDS = 12, BURST_BYTES = 2 + 2 * BURST_WORDS };
+static const uint8_t burst_out[BURST_BYTES] = {GLOB_CMD};
+
+enum { GYRO_RANGE_300 = 4, TAPS_LN2 = 1 }; /* SENS_AVG: 300 deg/s, Bartlett filter of 2 taps */
+#define FILTER ((uint16_t)(GYRO_RANGE_300 << 8 | TAPS_LN2))
+
+typedef struct {
+    sensor_state_t common;
+    uint16_t sample_period;    /* SMPL_PRD */
+    int16_t base[SENSOR_AXES]; /* offset registers as a reset leaves them */
+    uint8_t settling;          /* samples to leave out after they were written */
+    uint32_t period_q8;        /* sample period, us / 256 */
+    uint32_t nominal_q8;
+    volatile bool diagnosis_wanted;
+    uint64_t diagnosis_us;     /* when DIAG_STAT was read last */
+    /* main loop, of the samples */
+    uint64_t seen_us;          /* stamp of the last reading taken from the queue */
+    uint64_t checked_us;       /* when the settings were read last */
+    uint64_t last_us;          /* stamp of the last sample delivered */
+    bool doubtful;             /* none is delivered until the settings have been found to stand */
+    bool anchored;
+    uint64_t anchored_us;      /* stamp of `common.last` */
+    uint8_t unsure;            /* readings in a row that could be negative ones less their sign */
+    uint8_t excuses;           /* readings of DIAG_STAT in a row that say over-range */
+    uint8_t marks;             /* resets that left MARK */
+    bool based;                /* `base` is known */
+    uint32_t off_rate;         /* readings in a row that came no whole number of periods after the one before */
+    uint8_t unproven;
+    volatile uint16_t side[SENSOR_SIDE]; /* as read; 0: none yet */
+    /* shared with the interrupt handlers */
+    volatile bool listening, reading;
+    volatile uint32_t stamp;
+    bool second;
+    uint16_t first_words[BURST_WORDS];
+    uint8_t burst_in[BURST_BYTES];
+    volatile uint32_t head, tail; /* count up for ever */
+    volatile struct {
+        uint32_t stamp;
+        int16_t raw[SENSOR_AXES];
+    } queue[SENSOR_QUEUE];
+} adis16405_t;
+
+static adis16405_t *of(sensor_state_t *state)
+{
+    return (adis16405_t *)(void *)state;
+}
+
+static bool word(adis16405_t *self, uint8_t high, uint8_t low, uint16_t *value)
+{
+    const uint8_t out[2] = {high, low};
+    uint8_t in[2] = {0};
+    const bool done = self->common.bus->exchange(out, in, sizeof out);
+    *value = (uint16_t)((uint32_t)in[0] << 8 | in[1]);
+    return done;
+}
 
 static bool read_register(adis16405_t *self, uint8_t address, uint16_t *value)
 {
-    const adis16405_bus_t *bus = self->bus;
-    uint16_t ignored;
-    return bus->word(bus->context, (uint16_t)(address << 8), &ignored) && bus->word(bus->context, 0U, value);
+    return word(self, address, 0U, value) && word(self, 0U, 0U, value);
 }
 
 /* Twice, and alike: a register has no checksum either. */
@@ -93,7 +150,7 @@ static bool read_surely(adis16405_t *self, uint8_t address, uint16_t *value)
 static bool write_byte(adis16405_t *self, uint8_t address, uint16_t value)
 {
     uint16_t ignored;
-    return self->bus->word(self->bus->context, (uint16_t)(WRITE | (unsigned)address << 8 | (value & 0xFFU)), &ignored);
+    return word(self, WRITE | address, (uint8_t)value, &ignored);
 }
 
 static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
@@ -104,14 +161,10 @@ static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
 }
 
 /* Bits of an offset register: 13 of 0.0125 deg/s, 12 of 3.33 mg, two's complement. */
+enum { GYRO_OFFSET_LIMIT = 4096, ACCEL_OFFSET_LIMIT = 2048 };
 static int32_t offset_limit(size_t channel)
 {
-    return channel < 3U ? 4096 : 2048;
-}
-
-static float offset_step(const adis16405_t *self, size_t channel)
-{
-    return channel < 3U ? 0.0125F : self->scale[channel];
+    return channel < 3U ? GYRO_OFFSET_LIMIT : ACCEL_OFFSET_LIMIT;
 }
 
 /* Whether the settings are those of the start: GOOD if so, ALTERED if one read twice alike is not. */
@@ -121,10 +174,10 @@ static settings_t settings(adis16405_t *self)
 {
     static const uint8_t address[] = {SMPL_PRD, SENS_AVG, MSC_CTRL, ALM_MAG1};
     enum { COUNT = sizeof address };
-    const uint16_t wanted[COUNT] = {self->sample_period, self->filter, MSC_CTRL_READY, MARK};
+    const uint16_t wanted[COUNT] = {self->sample_period, FILTER, MSC_CTRL_READY, MARK};
     uint16_t found[1 + COUNT];
     for (unsigned i = 0; i <= COUNT; i++) { /* an answer comes with the next word */
-        if (!self->bus->word(self->bus->context, (uint16_t)(i < COUNT ? address[i] << 8 : 0), &found[i])) {
+        if (!word(self, i < COUNT ? address[i] : 0U, 0U, &found[i])) {
             return UNSURE;
         }
     }
@@ -167,14 +220,14 @@ static bool restore_offsets(adis16405_t *self)
     if (!read_surely(self, ALM_MAG1, &word)) {
         return false;
     }
-    bool write[ADIS16405_AXES];
+    bool write[SENSOR_AXES];
     const bool marked = word == MARK;
     if (marked && !self->based && self->marks < MARKS_REFUSED) {
         self->marks++;
         return false;
     }
-    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        write[channel] = marked || self->added[channel] != 0;
+    for (size_t channel = 0; channel < SENSOR_AXES; channel++) {
+        write[channel] = marked || self->common.added[channel] != 0;
         if (marked && self->based) {
             continue;
         }
@@ -192,100 +245,59 @@ static bool restore_offsets(adis16405_t *self)
     if (!write_register(self, ALM_MAG1, MARK)) {
         return false;
     }
-    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        const int32_t value = self->base[channel] + self->added[channel];
+    for (size_t channel = 0; channel < SENSOR_AXES; channel++) {
+        const int32_t value = self->base[channel] + self->common.added[channel];
         if (write[channel] && ((channel == 0U && value < 0) || !write_offset(self, channel, value))) {
-            return false; /* of another part's saved state, say: until it is taken back (adis16405_offsets(), all 0) */
+            return false; /* of another part's saved state, say: until it is taken back (sensor_offsets(), all 0) */
         }
     }
     return true;
 }
 
-static void enter(adis16405_t *self, uint8_t step, uint64_t now)
+static bool init(sensor_state_t *state, float rate_hz, sensor_wire_t *wire)
 {
-    self->state = ADIS16405_STARTING;
-    self->step = step;
-    self->step_us = now;
-}
-
-/* From here on the sensor is to give samples. */
-static void expect(adis16405_t *self, uint64_t now)
-{
-    self->progress_us = now;
-    self->ready_seen = self->ready_count;
-}
-
-static void begin(adis16405_t *self, uint64_t now)
-{
-    (void)write_byte(self, GLOB_CMD, GLOB_CMD_RESET);
-    self->bus->reset_line(self->bus->context, true);
-    enter(self, STEP_PULSE, now);
-}
-
-static void fail(adis16405_t *self, adis16405_fault_t fault, uint64_t now)
-{
-    self->listening = false;
-    self->tail = self->head; /* what waits may be of a sensor that was no longer set up */
-    self->state = ADIS16405_FAILED;
-    self->fault = fault;
-    self->step_us = now;
-    self->counters.faults++;
-    if (self->good >= PROVEN_SAMPLES) {
-        self->backoff_us = BACKOFF_MIN_US;
-    } else {
-        self->backoff_us = self->backoff_us < BACKOFF_MAX_US / 2U ? self->backoff_us * 2U : BACKOFF_MAX_US;
-    }
-    self->good = 0;
-}
-
-bool adis16405_init(adis16405_t *self, const adis16405_bus_t *bus, const adis16405_config_t *config)
-{
-    memset(self, 0, sizeof *self);
-    self->bus = bus;
-    if (!ADIS16405_HAS_RATE(config->rate_hz) || config->filter_taps_ln2 > 4U) {
+    adis16405_t *self = of(state);
+    if (!adis16405_has_rate(rate_hz)) {
         return false;
     }
-    const uint32_t n = ADIS16405_DIVIDER(config->rate_hz);
+    const uint32_t n = DIVIDER(rate_hz);
+    const bool slow = n > 10U;
+    *wire = (sensor_wire_t){slow ? 300000U : 1000000U, slow ? 80U : 10U, 3U};
     self->sample_period = (uint16_t)(n - 1U);
     self->nominal_q8 = (uint32_t)(256.0F * 1e6F / 1638.4F * (float)n + 0.5F);
     self->period_q8 = self->nominal_q8;
-    uint16_t range;
-    float gyro;
-    switch (config->range_deg_s) {
-    case 300: range = 4U; gyro = 0.05F; break;
-    case 150: range = 2U; gyro = 0.025F; break;
-    case 75: range = 1U; gyro = 0.0125F; break;
-    default: return false;
-    }
-    self->filter = (uint16_t)((unsigned)range << 8 | config->filter_taps_ln2);
-    for (size_t i = 0; i < ADIS16405_AXES; i++) {
-        self->scale[i] = i < 3U ? gyro : 3.33e-3F * 9.80665F;
-    }
-    self->backoff_us = BACKOFF_MIN_US / 2U;
-    begin(self, bus->time_us(bus->context));
+    state->period_us = self->nominal_q8 >> 8;
     return true;
+}
+
+static void stop(sensor_state_t *state)
+{
+    adis16405_t *self = of(state);
+    self->listening = false;
+    self->tail = self->head; /* what waits may be of a sensor that was no longer set up */
 }
 
 /* ----------------------------------------------------------------------------------------------- interrupt handlers */
 
 static void start_burst(adis16405_t *self)
 {
-    self->reading = self->bus->burst(self->bus->context);
+    self->reading = self->common.bus->begin(burst_out, self->burst_in, sizeof burst_out);
     if (!self->reading) {
-        self->counters.damaged++;
+        self->common.counters.damaged++;
     }
 }
 
-void adis16405_ready(adis16405_t *self)
+static void ready(sensor_state_t *state)
 {
-    const uint32_t now = self->bus->time_us32(self->bus->context);
-    self->ready_count++;
+    adis16405_t *self = of(state);
+    const uint32_t now = state->bus->time_us32();
+    state->signs++;
     if (!self->listening) {
         return;
     }
     if (self->reading) {
-        self->counters.overruns++;
-        if (now - self->stamp < 4U * (self->nominal_q8 >> 8)) {
+        self->common.counters.overruns++;
+        if (now - self->stamp < 4U * state->period_us) {
             return; /* else the burst has died: break it off */
         }
     }
@@ -298,24 +310,25 @@ void adis16405_ready(adis16405_t *self)
 static bool fresh(adis16405_t *self, const uint16_t words[])
 {
     uint16_t all = 0xFFFFU, any = 0;
-    for (size_t i = 0; i < ADIS16405_AXES; i++) {
+    for (size_t i = 0; i < SENSOR_AXES; i++) {
         all &= words[FIRST_CHANNEL + i];
         any |= words[FIRST_CHANNEL + i];
     }
     if ((any & EA) != 0U) {
-        self->counters.alarms++;
+        self->common.counters.alarms++;
         self->diagnosis_wanted = true;
         return false;
     }
     if ((all & ND) == 0U) {
-        self->counters.stale++;
+        self->common.counters.stale++;
         return false;
     }
     return true;
 }
 
-void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WORDS], bool whole)
+static void done(sensor_state_t *state, bool whole)
 {
+    adis16405_t *self = of(state);
     if (!self->reading) {
         return;
     }
@@ -324,8 +337,12 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
         return;
     }
     if (!whole) {
-        self->counters.damaged++;
+        self->common.counters.damaged++;
         return;
+    }
+    uint16_t words[BURST_WORDS];
+    for (size_t i = 0; i < BURST_WORDS; i++) {
+        words[i] = (uint16_t)((uint32_t)self->burst_in[2U * i + 2U] << 8 | self->burst_in[2U * i + 3U]);
     }
     if (!self->second) {
         if (fresh(self, words)) {
@@ -335,52 +352,55 @@ void adis16405_burst(adis16405_t *self, const uint16_t words[ADIS16405_BURST_WOR
         }
         return;
     }
-    for (size_t i = FIRST_CHANNEL; i < FIRST_CHANNEL + ADIS16405_AXES; i++) {
+    for (size_t i = FIRST_CHANNEL; i < FIRST_CHANNEL + SENSOR_AXES; i++) {
         if (((words[i] ^ self->first_words[i]) & (VALUE | EA)) != 0U || (words[i] & ND) != 0U) {
-            self->counters.damaged++; /* ND again: a sample came in between, and the words may be of either */
+            self->common.counters.damaged++; /* ND again: a sample came in between, and the words may be of either */
             return;
         }
     }
-    for (size_t i = 0; i < 2U; i++) {
-        const size_t word = i == 0U ? SUPPLY_WORD : TEMPERATURE_WORD;
-        if (((words[word] ^ self->first_words[word]) & VALUE) == 0U) {
-            self->side[i] = (uint16_t)(SIDE_READ | (words[word] & 0xFFFU));
+    for (size_t i = 0; i < SENSOR_SIDE; i++) {
+        const size_t at = i == SENSOR_SUPPLY ? SUPPLY_WORD : TEMPERATURE_WORD;
+        if (((words[at] ^ self->first_words[at]) & VALUE) == 0U) {
+            self->side[i] = (uint16_t)(SIDE_READ | (words[at] & 0xFFFU));
         }
     }
     const uint32_t head = self->head;
-    if (head - self->tail == ADIS16405_QUEUE) {
-        self->counters.overruns++;
+    if (head - self->tail == SENSOR_QUEUE) {
+        self->common.counters.overruns++;
         return;
     }
-    self->queue[head % ADIS16405_QUEUE].stamp = self->stamp;
-    for (size_t i = 0; i < ADIS16405_AXES; i++) {
+    self->queue[head % SENSOR_QUEUE].stamp = self->stamp;
+    for (size_t i = 0; i < SENSOR_AXES; i++) {
         const uint32_t value = words[FIRST_CHANNEL + i] & VALUE;
-        self->queue[head % ADIS16405_QUEUE].raw[i] = (int16_t)((int32_t)(value ^ 0x2000U) - 0x2000);
+        self->queue[head % SENSOR_QUEUE].raw[i] = (int16_t)((int32_t)(value ^ 0x2000U) - 0x2000);
     }
     self->head = head + 1U;
 }
 
 /* -------------------------------------------------------------------------------------------------------- main loop */
 
-float adis16405_temperature(const adis16405_t *self)
+/* Either has 12 bits. Temperature: two's complement, 0.14 degC each, 0 at 25 degC. Supply: 2.418 mV each. If the two
+ * readings of a burst differ, the value before stands. */
+static float side(const sensor_state_t *state, unsigned channel)
 {
-    const uint32_t side = self->side[1]; /* 12 bits, two's complement, 0.14 degC each, 0 at 25 degC */
-    return (side & SIDE_READ) != 0U ? 25.0F + 0.14F * (float)((int32_t)((side & 0xFFFU) ^ 0x800U) - 0x800) : NAN;
-}
-
-float adis16405_supply(const adis16405_t *self)
-{
-    const uint32_t side = self->side[0]; /* 12 bits, 2.418 mV each */
-    return (side & SIDE_READ) != 0U ? 2.418e-3F * (float)(side & 0xFFFU) : NAN;
+    const uint32_t read = ((const adis16405_t *)(const void *)state)->side[channel];
+    const uint32_t value = read & 0xFFFU;
+    if ((read & SIDE_READ) == 0U) {
+        return NAN;
+    }
+    if (channel == SENSOR_SUPPLY) {
+        return 2.418e-3F * (float)value;
+    }
+    return 25.0F + 0.14F * (float)((int32_t)(value ^ 0x800U) - 0x800);
 }
 
 /* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died
  * is left. */
 static void hold(adis16405_t *self)
 {
-    const uint32_t start = self->bus->time_us32(self->bus->context);
+    const uint32_t start = self->common.bus->time_us32();
     self->listening = false;
-    while (self->reading && self->bus->time_us32(self->bus->context) - start < 4000U) {
+    while (self->reading && self->common.bus->time_us32() - start < 4000U) {
     }
     self->reading = false;
 }
@@ -391,54 +411,52 @@ static void listen(adis16405_t *self)
     self->listening = true;
 }
 
-void adis16405_pause(adis16405_t *self, bool on)
+static void pause(sensor_state_t *state, bool on)
 {
-    if (self->state != ADIS16405_RUNNING) {
+    adis16405_t *self = of(state);
+    if (state->condition != SENSOR_RUNNING) {
         return;
     }
     if (on) {
         hold(self);
     } else {
-        expect(self, self->bus->time_us(self->bus->context));
+        sensor_expect(state);
         listen(self);
     }
 }
 
-bool adis16405_offsets(adis16405_t *self, const float wanted[ADIS16405_AXES], float got[ADIS16405_AXES])
+static sensor_fault_t self_tested(sensor_state_t *state);
+
+/* With a negative XGYRO_OFF the part loses the sign bit of negative x rates (the anomaly above): it is refused. So a
+ * positive x bias stays. */
+static bool offsets(sensor_state_t *state, const int16_t added[SENSOR_AXES])
 {
-    int16_t added[ADIS16405_AXES];
-    if (self->state == ADIS16405_STARTING && self->step == STEP_SELF_TEST) {
+    adis16405_t *self = of(state);
+    if (state->condition == SENSOR_STARTING && state->sensor->start[state->step].act == self_tested) {
         return false; /* the registers have been written for this start */
     }
-    for (size_t channel = 0; channel < ADIS16405_AXES; channel++) {
-        const float steps = wanted[channel] / offset_step(self, channel);
-        if (!(steps > -4096.0F && steps < 4096.0F)) {
-            return false;
-        }
-        added[channel] = (int16_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
+    for (size_t channel = 0; channel < SENSOR_AXES; channel++) {
         const int32_t value = self->base[channel] + added[channel], limit = offset_limit(channel);
         if (self->based && (value < -limit || value >= limit || (channel == 0U && value < 0))) {
             return false;
         }
-        got[channel] = (float)added[channel] * offset_step(self, channel);
     }
-    if (self->state == ADIS16405_RUNNING) {
+    if (state->condition == SENSOR_RUNNING) {
         hold(self);
         self->tail = self->head;
-        bool done = true;
-        for (size_t channel = 0; channel < ADIS16405_AXES && done; channel++) {
-            done = added[channel] == self->added[channel] ||
-                   write_offset(self, channel, self->base[channel] + added[channel]);
+        bool written = true;
+        for (size_t channel = 0; channel < SENSOR_AXES && written; channel++) {
+            written = added[channel] == state->added[channel] ||
+                      write_offset(self, channel, self->base[channel] + added[channel]);
         }
-        self->settling = (uint8_t)(2U + (2U << (self->filter & 7U)));
-        expect(self, self->bus->time_us(self->bus->context));
-        if (!done) {
-            fail(self, ADIS16405_SET_UP, self->progress_us); /* the restart writes what was added before */
+        self->settling = (uint8_t)(2U + (2U << TAPS_LN2));
+        if (!written) {
+            sensor_fail(state, SENSOR_SET_UP); /* the restart writes what was added before */
             return false;
         }
+        sensor_expect(state);
         listen(self);
     }
-    memcpy(self->added, added, sizeof added);
     return true;
 }
 
@@ -448,76 +466,76 @@ static bool diagnose(adis16405_t *self, uint16_t *bits)
     if (!read_register(self, DIAG_STAT, bits) || *bits == 0xFFFFU) { /* floating lines */
         return false;
     }
-    self->diagnosis |= *bits;
-    self->diagnosis_us = self->bus->time_us(self->bus->context);
+    self->common.diagnosis |= *bits;
+    self->diagnosis_us = self->common.bus->time_us();
     self->diagnosis_wanted = false;
     return true;
 }
 
-static void start_on(adis16405_t *self, uint64_t now)
+static sensor_fault_t reset(sensor_state_t *state)
 {
-    const uint64_t passed = now - self->step_us;
+    (void)write_byte(of(state), GLOB_CMD, GLOB_CMD_RESET);
+    state->bus->reset_line(true);
+    return SENSOR_NO_FAULT;
+}
+
+static sensor_fault_t let_go(sensor_state_t *state)
+{
+    state->bus->reset_line(false);
+    return SENSOR_NO_FAULT;
+}
+
+static sensor_fault_t probe(sensor_state_t *state)
+{
     uint16_t value;
-    switch (self->step) {
-    case STEP_PULSE:
-        if (passed >= RESET_PULSE_US) {
-            self->bus->reset_line(self->bus->context, false);
-            enter(self, STEP_BOOT, now);
-        }
-        return;
-    case STEP_BOOT:
-        if (passed < START_US) {
-            return;
-        }
-        if (!read_surely(self, PRODUCT_ID, &value) || value != PRODUCT) {
-            fail(self, ADIS16405_ABSENT, now);
-        } else if (!write_register(self, SMPL_PRD, self->sample_period) ||
-                   !write_register(self, SENS_AVG, self->filter) || !write_register(self, ALM_CTRL, 0U) ||
-                   !write_register(self, MSC_CTRL, MSC_CTRL_READY) || !restore_offsets(self)) {
-            fail(self, ADIS16405_SET_UP, now);
-        } else if (!diagnose(self, &value) || !write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH)) {
-            fail(self, ADIS16405_SELF_TEST, now);
-        } else {
-            enter(self, STEP_SELF_TEST, self->bus->time_us(self->bus->context)); /* the set-up took 20 ms if slow */
-        }
-        return;
-    default: break;
+    return read_surely(of(state), PRODUCT_ID, &value) && value == PRODUCT ? SENSOR_NO_FAULT : SENSOR_ABSENT;
+}
+
+static sensor_fault_t set_up(sensor_state_t *state)
+{
+    adis16405_t *self = of(state);
+    uint16_t ignored;
+    if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, FILTER) ||
+        !write_register(self, ALM_CTRL, 0U) || !write_register(self, MSC_CTRL, MSC_CTRL_READY) ||
+        !restore_offsets(self)) {
+        return SENSOR_SET_UP;
     }
+    const bool begun = diagnose(self, &ignored) && write_byte(self, MSC_CTRL + 1U, MSC_CTRL_SELF_TEST_HIGH);
+    return begun ? SENSOR_NO_FAULT : SENSOR_SELF_TEST;
+}
+
+static sensor_fault_t self_tested(sensor_state_t *state)
+{
+    adis16405_t *self = of(state);
+    const uint64_t now = state->bus->time_us();
+    uint16_t value;
     if (!read_surely(self, MSC_CTRL, &value) || value != MSC_CTRL_READY) {
-        if (passed >= SELF_TEST_US) {
-            fail(self, ADIS16405_SELF_TEST, now);
-        }
-        return;
+        return now - state->step_us >= SELF_TEST_US ? SENSOR_SELF_TEST : SENSOR_NOT_YET;
     }
     if (!diagnose(self, &value) || (value & DIAG_SELF_TEST) != 0U) {
-        fail(self, ADIS16405_SELF_TEST, now);
-        return;
+        return SENSOR_SELF_TEST;
     }
     if ((value & DIAG_FATAL) != 0U) {
-        fail(self, ADIS16405_STATUS, now);
-        return;
+        return SENSOR_STATUS;
     }
     settings_t found = UNSURE;
     for (int i = 0; i < CHECKS_TRIED && found == UNSURE; i++) {
         found = settings(self);
     }
     if (found != GOOD) { /* reset by something else in between */
-        fail(self, ADIS16405_SET_UP, now);
-        return;
+        return SENSOR_SET_UP;
     }
-    self->state = ADIS16405_RUNNING;
-    expect(self, now);
     self->seen_us = now;
     self->checked_us = now;
     self->off_rate = OFF_RATE_TAKEN;
     self->doubtful = false;
-    self->equal = 0;
     self->unproven = CHANGES_ASKED;
     self->anchored = false;
     self->unsure = 0;
     self->settling = 0;
     self->excuses = 0;
     listen(self);
+    return SENSOR_NO_FAULT;
 }
 
 /* Looks after the settings; false: they have been altered, and the sensor is set up anew. */
@@ -529,15 +547,16 @@ static bool look_after(adis16405_t *self, uint64_t now)
     self->checked_us = now;
     self->doubtful = self->doubtful && found != GOOD;
     if (found == ALTERED) {
-        fail(self, ADIS16405_SET_UP, now);
+        sensor_fail(&self->common, SENSOR_SET_UP);
     }
     return found != ALTERED;
 }
 
-static void watch(adis16405_t *self, uint64_t now)
+static void watch(sensor_state_t *state, uint64_t now)
 {
+    adis16405_t *self = of(state);
     const uint64_t unchecked = now - self->checked_us;
-    const uint32_t period = self->nominal_q8 >> 8;
+    const uint32_t period = state->period_us;
     const bool room = !self->reading && (uint32_t)now - self->stamp + CHECK_ROOM_US < period - period / 4U;
     if (unchecked >= CHECK_US && (room || unchecked >= 5ULL * CHECK_US) && !look_after(self, now)) {
         return;
@@ -548,50 +567,35 @@ static void watch(adis16405_t *self, uint64_t now)
         const bool read = diagnose(self, &bits);
         listen(self);
         if (read && (bits & DIAG_FATAL) != 0U) {
-            fail(self, ADIS16405_STATUS, now);
+            sensor_fail(state, SENSOR_STATUS);
             return;
         }
         if (read && (bits & DIAG_OVER_RANGE) != 0U && self->excuses < EXCUSES) {
             self->excuses++; /* the samples are refused, the sensor is well */
-            expect(self, now);
+            sensor_expect(state);
         }
-    }
-    const uint64_t silence = SILENCE_US > 10U * period ? SILENCE_US : 10U * period;
-    if (now - self->progress_us > silence && self->head == self->tail) {
-        /* One data-ready may come from plugging; a sensor gives one a period. */
-        fail(self, self->ready_count - self->ready_seen < 3U ? ADIS16405_SILENT : ADIS16405_NO_DATA, now);
-    } else if (self->equal >= REPEATS_STUCK) {
-        fail(self, ADIS16405_STUCK, now);
     }
 }
 
-void adis16405_poll(adis16405_t *self)
+static bool waits(sensor_state_t *state)
 {
-    const uint64_t now = self->bus->time_us(self->bus->context);
-    switch (self->state) {
-    case ADIS16405_STARTING: start_on(self, now); break;
-    case ADIS16405_RUNNING: watch(self, now); break;
-    default:
-        if (now - self->step_us >= self->backoff_us) {
-            begin(self, now);
-        }
-        break;
-    }
+    return of(state)->head != of(state)->tail;
 }
 
 /* XGYRO_OUT less its sign bit, judged by what went before. */
-static bool sign_lost(adis16405_t *self, int16_t x)
+static bool sign_lost(adis16405_t *self, int32_t x)
 {
     if (self->anchored) {
-        return x - self->last[0] >= SIGN_STEP;
+        return x - self->common.last[0] >= SIGN_STEP;
     }
     if (x > SIGN_BEYOND) {
         self->unsure = 0;
         return true;
     }
-    const bool alike = self->unsure > 0U && x - self->last[0] < SIGN_STEP && self->last[0] - x < SIGN_STEP;
+    const int32_t step = x - self->common.last[0];
+    const bool alike = self->unsure > 0U && step < SIGN_STEP && step > -SIGN_STEP;
     self->unsure = x >= SIGN_UNSURE ? (uint8_t)(alike ? self->unsure + 1U : 1U) : 0U;
-    self->last[0] = x;
+    self->common.last[0] = x;
     return self->unsure > 0U && self->unsure < SIGN_ALIKE;
 }
 
@@ -617,21 +621,18 @@ static bool off_grid(uint64_t step, uint64_t period)
     return 8U * (step < right ? right - step : step - right) >= period;
 }
 
-bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t *missing)
+static bool read_sample(sensor_state_t *state, int32_t raw[SENSOR_AXES], uint32_t *missing)
 {
+    adis16405_t *self = of(state);
     while (self->tail != self->head) {
         const uint32_t tail = self->tail;
-        int16_t raw[ADIS16405_AXES];
-        const uint64_t now = self->bus->time_us(self->bus->context);
-        const uint64_t stamp = now - (uint32_t)((uint32_t)now - self->queue[tail % ADIS16405_QUEUE].stamp);
-        for (size_t i = 0; i < ADIS16405_AXES; i++) {
-            raw[i] = self->queue[tail % ADIS16405_QUEUE].raw[i];
+        const uint64_t now = state->bus->time_us();
+        const uint64_t stamp = now - (uint32_t)((uint32_t)now - self->queue[tail % SENSOR_QUEUE].stamp);
+        for (size_t i = 0; i < SENSOR_AXES; i++) {
+            raw[i] = self->queue[tail % SENSOR_QUEUE].raw[i];
         }
         self->tail = tail + 1U;
-        if (self->state != ADIS16405_RUNNING) {
-            continue;
-        }
-        const uint64_t step = stamp - self->seen_us, period = self->nominal_q8 >> 8, doubt = period + period / 2U;
+        const uint64_t step = stamp - self->seen_us, period = state->period_us, doubt = period + period / 2U;
         self->seen_us = stamp;
         if (2U * step < 5U * period) {
             self->off_rate = off_grid(step, period) ? self->off_rate + 1U : 0U;
@@ -652,31 +653,48 @@ bool adis16405_sample(adis16405_t *self, float reading[ADIS16405_AXES], uint32_t
             self->unsure = 0;
         }
         if (sign_lost(self, raw[0])) {
-            self->counters.anomalies++;
+            self->common.counters.anomalies++;
             continue;
         }
-        self->equal = memcmp(raw, self->last, sizeof raw) == 0 ? self->equal + 1U : 0U;
-        memcpy(self->last, raw, sizeof raw);
+        const bool repeats = sensor_repeats(state, raw);
         self->anchored = true;
         self->anchored_us = stamp;
-        if (self->equal == 0U && self->unproven > 0U) {
+        if (state->equal == 0U && self->unproven > 0U) {
             self->unproven--;
         }
-        if (self->unproven > 0U || self->equal > REPEATS_TAKEN) {
-            self->counters.repeated += self->equal > 0U ? 1U : 0U;
+        if (repeats || self->unproven > 0U) {
             continue;
         }
-        const uint32_t passed = self->counters.samples > 0U ? periods(self, stamp) : 1U;
+        const uint32_t passed = state->counters.samples > 0U ? periods(self, stamp) : 1U;
         *missing = passed > 0U ? passed - 1U : 0U;
         self->last_us = stamp;
-        expect(self, now);
         self->excuses = 0;
-        self->good++;
-        self->counters.samples++;
-        for (size_t i = 0; i < ADIS16405_AXES; i++) {
-            reading[i] = (float)raw[i] * self->scale[i];
-        }
         return true;
     }
     return false;
 }
+
+static const sensor_step_t adis16405_steps[] = {
+    {0, reset}, {RESET_PULSE_US, let_go}, {START_US, probe}, {0, set_up}, {0, self_tested},
+};
+static adis16405_t sensor;
+
+const sensor_t adis16405 = {
+    .state = &sensor.common,
+    .bytes = sizeof sensor,
+    .start = adis16405_steps,
+    .steps = sizeof adis16405_steps / sizeof adis16405_steps[0],
+    .step = {0.05F, 3.33e-3F * SENSOR_G},
+    .offset_step = {0.0125F, 3.33e-3F * SENSOR_G},
+    .offset_limit = {GYRO_OFFSET_LIMIT, ACCEL_OFFSET_LIMIT},
+    .init = init,
+    .stop = stop,
+    .watch = watch,
+    .waits = waits,
+    .read = read_sample,
+    .side = side,
+    .offsets = offsets,
+    .pause = pause,
+    .ready = ready,
+    .done = done,
+};
