@@ -11,11 +11,11 @@
 #define HEADER(name) QUOTED(name.h)
 #include HEADER(SENSOR)
 
-/* No constants, and no image, if one would divide by zero. (An array's size must be an integer constant expression: no
+/* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no
  * quotient of floats.) */
 static const int the_sensor_makes_the_rate = 1 / OF(SENSOR, has_rate)(SELFCAL_MODEL_RATE_HZ);
-static const int the_sensor_has_the_channels =
-    1 / (SELFCAL_MODEL_CHANNELS_READ && (OF(SENSOR, has_supply) || !SELFCAL_MODEL_SUPPLY_READ));
+enum { CHANNELS_KNOWN = SELFCAL_MODEL_CHANNELS_READ && (OF(SENSOR, has_supply) || !SELFCAL_MODEL_SUPPLY_READ) };
+typedef char the_sensor_has_the_channels[CHANNELS_KNOWN ? 1 : -1];
 typedef char the_axes_and_channels_are_the_ports[PORT_AXES == (int)SENSOR_AXES && PORT_SIDE == (int)SENSOR_SIDE &&
                                                  PORT_SUPPLY == (int)SENSOR_SUPPLY ? 1 : -1];
 
@@ -30,8 +30,7 @@ bool readings_init(const sensor_bus_t *bus)
         }
         channel[axis] = (uint8_t)at;
     }
-    return the_sensor_makes_the_rate != 0 && the_sensor_has_the_channels != 0 &&
-           sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
+    return the_sensor_makes_the_rate != 0 && sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
 }
 
 void readings_ready(void)
