@@ -318,7 +318,7 @@ def main() -> int:
             print(f"{target}: {error}", file=sys.stderr)
             failed = True
             continue
-        budget = read_budget(target)
+        budget = read_budget(target, arguments.sensor)
         limits = {"flash": budget["flash"], "ram": budget["ram"], "stack": budget["stack"]}
         print(f"{target:10} " + "".join(f"{sizes[kind]:10,}{limits[kind]:10,}" for kind in KINDS))
         if arguments.path:

@@ -313,6 +313,7 @@ def flash(
         (("st-flash", "dfu-util"), {}, "st-flash --reset write build/stm32f405/selfcal.bin 0x08000000"),
         (("dfu-util",), {}, "dfu-util -a 0 -s 0x08000000:leave -D build/stm32f405/selfcal.bin"),
         (("openocd", "dfu-util"), {"FLASHER": "dfu-util"}, "dfu-util -a 0"),
+        (("st-flash",), {"SENSOR": "icm42688"}, "st-flash --reset write build/stm32f405-icm42688/selfcal.bin"),
     ],
 )
 def test_flash_takes_what_is_there(

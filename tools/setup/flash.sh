@@ -1,6 +1,7 @@
 #!/bin/sh
 # Write build/TARGET/selfcal into a module: flash.sh TARGET (make flash TARGET=...), by the first writer of
-# port/boards.txt that is there. FLASHER names one of them; OPENOCD_INTERFACE is openocd's file for the probe.
+# port/boards.txt that is there. With SENSOR=... it is build/TARGET-SENSOR/selfcal.
+# FLASHER names a writer; OPENOCD_INTERFACE is openocd's file for the probe.
 set -u
 target=$1
 
@@ -35,8 +36,10 @@ if [ -z "$flasher" ]; then
 fi
 
 make --no-print-directory firmware || exit 1
-image=build/$target/selfcal
-flags=$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../; s/^ *\(.\)/ \1/' "build/$target/flags" 2>/dev/null)
+folder=build/$target
+case ${SENSOR:-adis16405} in adis16405) ;; *) folder=$folder-$SENSOR ;; esac
+image=$folder/selfcal
+flags=$(sed 's/APP_COMMAND_KEY=[^ ]*/APP_COMMAND_KEY=.../; s/^ *\(.\)/ \1/' "$folder/flags" 2>/dev/null)
 echo "$flasher writes $image$flags"
 case $flasher in
 openocd) exec openocd -f "$interface" -f "$chip" -c "program $image.elf verify reset exit" ;;
