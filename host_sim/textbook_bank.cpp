@@ -20,16 +20,27 @@ struct Drift {
     Eigen::RowVectorXd output, level;
     double white;            // variance of the white noise beside it
     double innovation = 0.0; // variance of e_i over r_i, the last state but one, in place of that
+    double scatter = 0.0;    // over r_i - 1: variance that a mean has about the block's where readings are lost
 };
 
 // A term at the last of `block` samples, and its mean over them, from the term before: sample by sample.
 struct Block {
     double phi, mean;              // of the term, of its mean
     double var, covariance, of_mean; // of the noise in either
+    double scatter;                  // variance of m readings drawn from the block about its mean, over M/m - 1
 };
 
 Block block_of(double phi, double step, std::size_t block) {
-    Block sum{1.0, 0.0, 0.0, 0.0, 0.0};
+    Block sum{1.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    // Without replacement the mean of m has the variance (M/m - 1) s^2/M about the mean of all, with s^2 the mean over
+    // pairs of half of their squared difference.
+    double apart = 0.0, reach = 1.0;
+    for (std::size_t lag = 1; lag < block; ++lag) {
+        apart = phi * phi * apart + step;
+        reach *= phi;
+        const double left = (1.0 - reach) * (1.0 - reach) * (phi < 1.0 ? step / (1.0 - phi * phi) : 0.0);
+        sum.scatter += static_cast<double>(block - lag) * 0.5 * (apart + left);
+    }
     for (std::size_t k = 0; k < block; ++k) {
         sum.phi *= phi;
         sum.var = phi * phi * sum.var + step;
@@ -38,7 +49,8 @@ Block block_of(double phi, double step, std::size_t block) {
         sum.mean += sum.phi;
     }
     const auto m = static_cast<double>(block);
-    return {sum.phi, sum.mean / m, sum.var, sum.covariance / m, sum.of_mean / (m * m)};
+    const double pairs = std::max(m * (m - 1.0) / 2.0, 1.0);
+    return {sum.phi, sum.mean / m, sum.var, sum.covariance / m, sum.of_mean / (m * m), sum.scatter / pairs / m};
 }
 
 // An oscillation at the states i, i + 1, and the mean of its reading over `block` samples.
@@ -108,6 +120,7 @@ Drift drift_of(const Law &law, const Node &node, double dt_s, std::size_t block)
         const Block over = block_of(phi, step, block);
         drift.transition(i, i) = over.phi;
         drift.step(i, i) = over.var;
+        drift.scatter += over.scatter;
         if (block > 1) {
             const Eigen::Index mean = i + static_cast<Eigen::Index>(law.terms.size());
             drift.transition(mean, mean) = 0.0;
@@ -143,6 +156,7 @@ template <int size> class Filter {
         const Eigen::Index bias = drift.output.size();
         const Eigen::Index n = bias + 1 + static_cast<Eigen::Index>(record.regressors);
         r_ = drift.white;
+        scatter_ = drift.scatter;
         innovation_ = drift.innovation;
         new_ = bias - 2;
         transition_ = Square::Identity(n, n);
@@ -194,7 +208,7 @@ template <int size> class Filter {
 
     // Adds ln N(nu; 0, s), the factor of (11), to ln_p.
     double update(double y, double r) {
-        const double variance_v = r * r_;
+        const double variance_v = r * r_ + (r - 1.0) * scatter_;
         const double nu = y - h_ * mean_;
         const double s = h_ * covariance_ * h_.transpose() + variance_v;
         const Vector gain = covariance_ * h_.transpose() / s;
@@ -206,7 +220,7 @@ template <int size> class Filter {
     }
 
     const Record &record_;
-    double r_, innovation_;
+    double r_, innovation_, scatter_;
     Eigen::Index new_; // place of e_i, if there is one
     double ln_p_ = 0.0;
     Square transition_, step_, covariance_;

@@ -6,7 +6,8 @@
 // Known disturbances z (temperature, time, ...) enter as the paper's bias does: constant states with a row of H each.
 // y_i = x0 + x_i + c' z_i + v_i,  c ~ N(0, diag(sd^2)).
 // A reading may be the mean of `block` samples of the drift and of white noise (Record::block). The drift is then the
-// state at the last of them, and its mean over them a second state, which is read.
+// state at the last of them, and its mean over them a second state, which is read. Where r_i is not 1 the block has
+// block/r_i readings, those of a random part of it: their mean scatters about the block's.
 // Two deviations from the print:
 //   - the Gauss-Markov noise gain is the exact sigma_m sqrt(1 - phi^2); the printed one,
 //     sigma_m sqrt(2 / (alpha dt)) (1 - phi), is (alpha dt)^2 / 24 off it, relatively;

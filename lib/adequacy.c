@@ -236,7 +236,16 @@ static selfcal_real_t innovate(selfcal_real_t state[], size_t states, selfcal_re
     return innovation;
 }
 
-/* One bank sample; z, or 0 for the first. `w`: of the channels. */
+/* White noise of a bank sample whose block has lost readings, over sigma_v^2. */
+static selfcal_real_t noise_of(const selfcal_filter_law_t *law, selfcal_real_t r, uint32_t block) {
+    selfcal_real_t lost = R(0.0);
+    for (size_t a = 0; a < law->states && r != R(1.0); a++) {
+        lost += averaged_lost(law->noise[a], R(1.0) - law->pole[a], block);
+    }
+    return R(1.0) + averaged_noise_less_1(r, lost);
+}
+
+/* One bank sample of noise r; z, or 0 for the first. `w`: of the channels. */
 static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_real_t r, uint32_t gap,
                              const selfcal_real_t channel[], selfcal_real_t w[]) {
     const size_t states = watch->law.states;
@@ -423,7 +432,8 @@ static void take(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_
         for (size_t k = 0; k < columns; k++) {
             y = r_fma(-watch->law.coefficient[k], input[SELFCAL_ADEQUACY_CHANNELS + k], y);
         }
-        z[axis] = watch->running ? filter(watch, y, batch->r[at], gap, channel, w[axis]) : R(0.0);
+        const selfcal_real_t noise = noise_of(&watch->law, batch->r[at], bank->model->block);
+        z[axis] = watch->running ? filter(watch, y, noise, gap, channel, w[axis]) : R(0.0);
     }
     for (uint8_t axis = 0; axis < axes && self->count > 0U; axis++) {
         if (self->watch[axis].running) {

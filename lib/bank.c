@@ -350,14 +350,16 @@ static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real
 
 /* Gains while the variance still moves. 1/s is rounded to the same side for thousands of samples where P changes
  * slowly, and would tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
-static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, gains_t *gains) {
+static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, uint32_t block, gains_t *gains) {
     const span_t span = gains->span;
+    const selfcal_real_t lost = batch->part ? averaged_lost(node->q, node->beta, block) : R(0.0);
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
     selfcal_real_t a = R(0.0), short_of = R(0.0);
     selfcal_moving_t *now = &node->gains.moving;
     const selfcal_real_t pull = now->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_real_t r = batch->r[i];
+        const selfcal_real_t r_less_1 = batch->part ? averaged_noise_less_1(batch->r[i], lost) : R(0.0);
+        const selfcal_real_t r = R(1.0) + r_less_1;
         const selfcal_real_t p = r_fmax(node->p_inf + now->d, R(0.0));
         const selfcal_real_t s = r + p;
         const selfcal_real_t inv_s = R(1.0) / s;
@@ -369,8 +371,8 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
         gains->u[i] = u * inv_s;
         short_of += r_fma_exact(-inv_s, s, R(1.0)) - inv_s * sum_error(r, p, s);
         a = r_fma(u, gains->u[i], a);
-        now->e = r_fma(-g, now->e, now->e) - pull * inv_s * r_fma(R(1.0) - r, node->p_inf, now->d);
-        now->d = now->c * inv_s * r_fma(r, now->d, (r - R(1.0)) * p * node->p_inf);
+        now->e = r_fma(-g, now->e, now->e) - pull * inv_s * r_fma(-r_less_1, node->p_inf, now->d);
+        now->d = now->c * r_fma(r * inv_s, now->d, r_less_1 * gain * node->p_inf); /* no product leaves a float */
         /* selfcal_rate() made samples better than the model's: 1 + (s - 1) would lose the digits of s */
         if (r < R(0.5)) {
             const selfcal_wide_t ln_s = log((selfcal_wide_t)r + (selfcal_wide_t)p);
@@ -378,7 +380,7 @@ static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, ga
             sum_add(&node->ln_s, hi, (selfcal_real_t)(ln_s - (selfcal_wide_t)hi));
             continue;
         }
-        const selfcal_real_t s_less_1 = (r - R(1.0)) + p;
+        const selfcal_real_t s_less_1 = r_less_1 + p;
         product_less_1 = r_fma(product_less_1, s_less_1, product_less_1 + s_less_1);
         if (product_less_1 > R(1e15)) {
             sum_add(&node->ln_s, r_log1p(product_less_1), R(0.0));
@@ -462,7 +464,7 @@ static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
             }
         } else {
             selfcal_bank_leave_level(self, j);
-            gains_varying(batch, node, &gains);
+            gains_varying(batch, node, self->model->block, &gains);
             run(self, j, &gains);
             if (r_fabs(now->d) <= CONVERGED * node->p_inf) {
                 now->d = R(0.0);

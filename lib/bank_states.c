@@ -348,13 +348,16 @@ static void state_gains_steady(const selfcal_term_node_t *term, size_t order, te
 
 /* What the rounding of 1/s loses on the mean of the span goes into the scale, as in bank.c. */
 static void state_gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, selfcal_term_node_t *term,
-                                size_t order,
-                          term_gains_t *gains) {
+                                size_t order, uint32_t block, term_gains_t *gains) {
     const span_t span = gains->sums.span;
     selfcal_wide_t product = 1.0, ln_s = 0.0, short_of = 0.0;
+    selfcal_real_t lost = R(0.0);
     bool rests = false;
+    for (size_t a = 0; a < order && batch->part; a++) {
+        lost += in_pair(term, a) ? R(0.0) : averaged_lost(term->q[a], term->beta[a], block);
+    }
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_wide_t r = (selfcal_wide_t)batch->r[i];
+        const selfcal_wide_t r = 1.0 + (selfcal_wide_t)averaged_noise_less_1(batch->r[i], lost);
         const gain_t gain = gain_of(term, order, r);
         const selfcal_real_t inv_s = (selfcal_real_t)(1.0 / gain.s);
         gains->sums.inv_s[i] = inv_s;
@@ -429,7 +432,7 @@ static void run_states(selfcal_t *self, size_t j, const span_t *span) {
         node->steady += span->to - span->from;
     } else {
         settle(node, term, order);
-        state_gains_varying(batch, node, term, order, &gains);
+        state_gains_varying(batch, node, term, order, self->model->block, &gains);
     }
     innovations_t column[1 + SELFCAL_REGRESSORS_MAX], reading;
     selfcal_sum_t *a = p > 0U ? &self->columns->a[j * SELFCAL_REGRESSORS_ROWS(p + 1U)] : NULL;

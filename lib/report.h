@@ -121,6 +121,10 @@ selfcal_real_t selfcal_expected_beta(const selfcal_work_t *work, selfcal_real_t 
 void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
                       expectation_t *e);
 
+/* ln of a node's mean noise over sigma_v: half of ln(1 + truth.noise_less_1) without drift, more beside one that moves
+ * within a block. */
+selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t beta);
+
 /* The predicted drift variance that a filter converges to, over its sigma_v^2. */
 selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta);
 

@@ -50,6 +50,16 @@ static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *
     return more;
 }
 
+selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t beta) {
+    const selfcal_real_t less_1 = work->truth.noise_less_1;
+    if (less_1 == R(0.0)) {
+        return R(0.0);
+    }
+    const selfcal_real_t q = r_exp(R(2.0) * ln_rho) * (beta > R(0.0) ? beta * (R(2.0) - beta) : R(1.0));
+    const selfcal_real_t lost = averaged_lost(q, beta, work->bank->model->block);
+    return R(0.5) * r_log1p(averaged_noise_less_1(R(1.0) + less_1, lost));
+}
+
 /* `beta`: selfcal_expected_beta() the alpha. */
 void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
                       expectation_t *e) {
@@ -62,7 +72,8 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
     expected_t real;
-    ln_rho -= truth->ln_noise;
+    const selfcal_real_t ln_noise = selfcal_expected_noise(work, ln_rho, beta);
+    ln_rho -= ln_noise;
     if (truth->wide) {
         wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
         real.v_less_1 = (selfcal_real_t)wide.v_less_1;
@@ -90,6 +101,7 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
         e->ln_sigma = (selfcal_wide_t)(R(0.5) * (ln_v - r_log1p(real.s_less_1)));
         e->profile = (selfcal_wide_t)(R(-0.5) * n * (ln_v - (selfcal_real_t)truth->ln_v));
     }
+    e->ln_sigma -= (selfcal_wide_t)ln_noise;
 }
 
 selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta) {

@@ -102,7 +102,7 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
         work->hypothesis = place_of(work, k).hypothesis;
         if (hypothesis_of(work)->rho == NULL) {
             selfcal_bank_ln_s(work->bank, k, &field.node);
-            truth->ln_noise = R(0.5) * (selfcal_real_t)field.node.ln_s / weight;
+            truth->noise_less_1 = r_expm1((selfcal_real_t)field.node.ln_s / weight);
         }
     }
     if (work->at == 0U) {
@@ -110,21 +110,10 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
         work->per_bias_sd = 1.0 / (selfcal_wide_t)work->bank->prior_sd[work->axis];
     }
     for (uint16_t k = step_part(work, step_nodes(work), model->nodes); k < work->at; k++) {
-        const selfcal_place_t place = place_of(work, k);
-        work->hypothesis = place.hypothesis;
+        work->hypothesis = place_of(work, k).hypothesis;
         selfcal_node_field(work, k, &field);
         selfcal_bank_ln_s(work->bank, k, &field.node);
         keep_node(work, k, &field);
-        /* as its filters settle an even record comes to 8 nats, and to 16 with some gaps: no more counts as missed */
-        if (has_expectation(work)) {
-            selfcal_real_t s_less_1 = work->bank->node[k].p_inf;
-            if (truth->ln_noise != R(0.0)) {
-                const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
-                s_less_1 = selfcal_expected_settled(place.ln_rho - truth->ln_noise, beta);
-            }
-            const selfcal_real_t ln_s = weight * r_fma(R(2.0), truth->ln_noise, r_log1p(s_less_1));
-            truth->missed = r_fmax(truth->missed, r_fabs((selfcal_real_t)field.node.ln_s - ln_s) - R(16.0));
-        }
     }
     if (work->at < model->nodes) {
         return;

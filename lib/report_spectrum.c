@@ -30,6 +30,9 @@
 /* A float's digits of those nats, over the 0.01. */
 #define FAR_EVEN R(2e-4)
 
+/* Nats below the best node up to which a node counts for what the splines have to hold. */
+#define NEAR R(30.0)
+
 /* Half of ln 0.1. */
 #define HALF_LN_LEAST R(-1.1512925)
 /* Lines are so far apart in ln omega, as far as there are so many. */
@@ -104,7 +107,8 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
 static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const bool pole = has_pole(work);
-    const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - work->truth.ln_noise));
+    const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
+    const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - selfcal_expected_noise(work, place.ln_rho, beta)));
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
     selfcal_truth_t *truth = &work->truth;
@@ -115,7 +119,8 @@ static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
 static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t off, selfcal_real_t deficit) {
     const selfcal_truth_t *truth = &work->truth;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
-    const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->ln_noise == R(0.0);
+    const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U &&
+        truth->noise_less_1 == R(0.0);
     const selfcal_real_t far = (even ? FAR_EVEN : FAR) * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
     if (even && UNSETTLED > R(20.0) * e->p_sq * n * n && work->bank->model->nodes > UNSETTLED_NODES) {
@@ -166,6 +171,17 @@ static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t
     }
 }
 
+/* What gaps and uneven noise add to ln_s of a node, beyond 8 nats as the filters settle and as much for some gaps. */
+static void count_missed(selfcal_work_t *work, uint16_t k, selfcal_place_t place) {
+    const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
+    const selfcal_real_t ln_noise = selfcal_expected_noise(work, place.ln_rho, beta);
+    const selfcal_real_t s_less_1 = selfcal_expected_settled(place.ln_rho - ln_noise, beta);
+    const selfcal_real_t ln_s = (selfcal_real_t)work->bank->weight * r_fma(R(2.0), ln_noise, r_log1p(s_less_1));
+    selfcal_node_view_t node;
+    selfcal_bank_ln_s(work->bank, k, &node);
+    work->truth.missed = r_fmax(work->truth.missed, r_fabs((selfcal_real_t)node.ln_s - ln_s) - R(16.0));
+}
+
 /* First the best node of all, for the process that made the data; then every node. Its row is its variance over the
  * expected one, less the best node's, by lines and edges of their prior deviations. All begins anew where the process
  * was too slow. */
@@ -194,7 +210,10 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
         speed_up(work, place, scatter, &e);
         work->at = 0;
     } else {
-        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off),
-                work->field[0][work->best_node] - work->field[0][k]);
+        const selfcal_real_t deficit = work->field[0][work->best_node] - work->field[0][k];
+        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), deficit);
+        if (deficit < NEAR) {
+            count_missed(work, k, place);
+        }
     }
 }

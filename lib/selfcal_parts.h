@@ -49,9 +49,9 @@ selfcal_status_t selfcal_push_with(selfcal_t *self, const float sample[], const 
 bool selfcal_retired(const selfcal_t *self, uint8_t axis);
 
 /* `count` samples are missing. The prediction over the gap is exact for up to 2^32 - 1 bank intervals (136 years at 1
- * Hz); a longer gap is taken for that. A block with half or more of its samples counts as their mean, its variance
- * raised by block / used. A block with fewer is dropped. Before the first sample they are counted alone: the first
- * block begins with the first sample. */
+ * Hz); a longer gap is taken for that. A block with half or more of its samples counts as their mean. Its white noise
+ * is raised by block / used, what a drift moves within the block is not. A block with fewer is dropped. Before the
+ * first sample they are counted alone: the first block begins with the first sample. */
 selfcal_status_t selfcal_skip(selfcal_t *self, uint64_t count);
 
 /* Motion was seen in the bank interval in progress. It yields no value, and samples until its end count as missing.

@@ -46,6 +46,7 @@ def written(record: Record, path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("block", [1, 10])
 @pytest.mark.parametrize(
     "terms",
     [
@@ -56,8 +57,9 @@ def written(record: Record, path: Path) -> Path:
         Terms(walk=True, color="ar", bands=((0.1, 0.01, -0.5),), trial=0.2),
     ],
 )
-def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
-    """Against the dense covariance of the record, gaps and uneven noise included.
+def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms, block: int) -> None:
+    """Against the dense covariance of the record, gaps and uneven noise included. Means of `block` readings have more
+    noise where some are lost.
 
     The filter keeps its gain while s moves by less than 6e-6: over 500 samples 1e-4 nats, and coefficients to 1e-5."""
     random = np.random.default_rng(7)
@@ -68,8 +70,9 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     columns = np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -1.05, "color": 0.3, "ln_band": -0.4}
     theta = np.array([guess.get(name, -3.0 if name == "ln_width" else 0.02) for name in terms.names])
-    series = Series(y, dt, r, columns)
-    m = matrices(terms, theta, dt, series.duration_s)
+    series = Series(y, dt, r, columns, block=block)
+    m = matrices(terms, theta, dt, series.duration_s, block)
+    assert (m.lost > 0.0) == (block > 1 and (terms.walk or terms.markov or terms.flicker))
     # Covariance of h x_i and h x_j from the state model itself, by its definition.
     driven = np.zeros_like(m.Q)
     if m.driver >= 0:
@@ -77,7 +80,7 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms) -> None:
     P = [m.P0 + driven * (r[0] - 1.0)]
     for i in range(1, n):
         P.append(m.F @ P[-1] @ m.F.T + m.Q + driven * (r[i] - 1.0))
-    cov = np.diag(m.R * r)
+    cov = np.diag(m.R * r + m.lost * (r - 1.0))
     for i in range(n):
         ahead = P[i] @ m.h
         for j in range(i, n):

@@ -203,7 +203,8 @@ public:
         return selfcal_retired(&bank_, axis);
     }
 
-    nb::dict report(uint8_t axis, uint8_t mask) {
+    // The bias over all laws is the one `ahead_s` after the last bank interval.
+    nb::dict report(uint8_t axis, uint8_t mask, float ahead_s) {
         selfcal_report_t r{};
         std::vector<selfcal_coefficients_t> coefficients(hypotheses_.size());
         {
@@ -214,6 +215,8 @@ public:
                 status = selfcal_report_step(work_.get(), &r);
             check(status);
         }
+        if (ahead_s > 0.0F)
+            check(selfcal_predict(&r, &model_, ahead_s, &r.bias_mean, &r.bias_sd));
         nb::list hypotheses;
         for (size_t h = 0; h < hypotheses_.size(); h++) {
             const selfcal_posterior_t &p = r.hypothesis[h];
@@ -553,7 +556,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def("rate", &Bank::rate)
         .def("reopen", &Bank::reopen)
         .def("retired", &Bank::retired)
-        .def("report", &Bank::report, nb::arg("axis"), nb::arg("mask") = 0)
+        .def("report", &Bank::report, nb::arg("axis"), nb::arg("mask") = 0, nb::arg("ahead_s") = 0.0F)
         .def("predict", &Bank::predict)
         .def("node", &Bank::node)
         .def("log_likelihood", &Bank::log_likelihood)

@@ -2,6 +2,8 @@
 //
 // y_i = h x_i + sum_k c_k z_ik + v_i,  x_(i+1) = F x_i + w_i,  w ~ N(0, Q),  v_i ~ N(0, R r_i),  x_0 ~ N(0, P0).
 // White noise with memory is a state: r then scales the noise of the state `driver` (-1: none) that enters at i.
+// Readings that are block means have more noise where the block has lost readings: R r_i + lost (r_i - 1), at least a
+// tenth of R r_i (lib/averages.h).
 // One Kalman filter runs over the record and over every column z_k (de Jong 1991): with the whitened innovations
 // nu_y and u_k, the Gram matrix G = sum [nu_y, u]' [nu_y, u] and D = sum ln s are all that the likelihood of any
 // coefficients needs: the least squares estimate is c = G_uu^-1 G_uy.
@@ -111,7 +113,7 @@ template <int V> Dual<V> ln(const Dual<V> &a) { return a.through(std::log(a.valu
 
 // The matrices of a model, and their derivatives by each of `count` parameters, one after the other.
 struct Matrices {
-    const double *F, *Q, *h, *P0, *R;
+    const double *F, *Q, *h, *P0, *R, *lost;
 };
 
 struct Input {
@@ -149,7 +151,7 @@ template <class T, int D> using Square = T[D][D];
 // model the first ones are 0.
 template <class T, int D> struct Model {
     Square<T, D> F = {}, Q = {}, P0 = {};
-    T h[D] = {}, R;
+    T h[D] = {}, R, lost;
     int driver;
 
     explicit Model(const Input &in) {
@@ -164,6 +166,12 @@ template <class T, int D> struct Model {
             }
         }
         take(R, in.m.R, in.by.R, 0, 1, in.count);
+        take(lost, in.m.lost, in.by.lost, 0, 1, in.count);
+    }
+
+    T noise(double r) const {
+        const T all = R * r + lost * (r - 1.0), least = R * (0.1 * r);
+        return value_of(all) < value_of(least) ? least : all;
     }
 };
 
@@ -241,7 +249,7 @@ template <class T, int D> struct Jump {
         copy<T, D>(m.Q, B);
         for (int a = 0; a < D; a++)
             for (int b = 0; b < D; b++)
-                C[a][b] = m.h[a] * m.h[b] / (m.R * r);
+                C[a][b] = m.h[a] * m.h[b] / m.noise(r);
         if (m.driver >= 0)
             B[m.driver][m.driver] = B[m.driver][m.driver] * r;
         for (int k = 0; k < doublings; k++) {
@@ -350,7 +358,7 @@ template <class T, int D, bool PLAIN> struct Filter {
     void covariance(std::size_t i) {
         const bool present = std::isfinite(in.y[i]);
         T Ph[D], K[D], A[D][D], FA[D][D];
-        s = m.R * in.r[i];
+        s = m.noise(in.r[i]);
         for (int a = 0; a < D; a++) {
             Ph[a] = 0.0;
             for (int b = 0; b < D; b++)
@@ -907,7 +915,8 @@ bool check(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, c
 }
 
 nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
-              const Matrix &P0, double R, int driver, const std::vector<std::size_t> &marks, bool innovations) {
+              const Matrix &P0, double R, double lost, int driver, const std::vector<std::size_t> &marks,
+              bool innovations) {
     const bool diagonal = check(y, z, r, F, Q, h, P0, driver);
     const std::size_t n = y.shape(0), d = h.shape(0), p = z.shape(0);
     for (std::size_t k = 0; k < marks.size(); k++)
@@ -925,7 +934,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
     Out x = array(out.x, {m, std::size_t(c), d});
     Out white = array(innovations ? out.white : fresh(0), {innovations ? n : 0, std::size_t(c)});
     Out s = array(innovations ? out.s : fresh(0), {innovations ? n : 0});
-    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R, &lost};
     const Input in{y.data(), z.data(), r.data(), n, c, model, {}, d, 0, driver, marks.data(), m};
     {
         nb::gil_scoped_release released;
@@ -935,7 +944,7 @@ nb::tuple run(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F
 }
 
 nb::tuple shifts(const Vector &y, const Matrix &z, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h,
-                 const Matrix &P0, double R, int driver) {
+                 const Matrix &P0, double R, double lost, int driver) {
     check(y, z, r, F, Q, h, P0, driver);
     const std::size_t n = y.shape(0), d = h.shape(0), c = z.shape(0) + 1;
     std::vector<double> D(1), counted(1), x(c * d), white(n * c);
@@ -944,7 +953,7 @@ nb::tuple shifts(const Vector &y, const Matrix &z, const Vector &r, const Matrix
     Out impulse = array(fresh(n), {n});
     const Sums out{G.data(), D.data(), counted.data(), x.data(), white.data(), nullptr};
     const Shifts made{A.data(), B.data(), impulse.data()};
-    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R, &lost};
     const Input in{y.data(), z.data(), r.data(), n, static_cast<int>(c), model, {}, d, 0, driver, &end, 1};
     {
         nb::gil_scoped_release released;
@@ -956,8 +965,8 @@ nb::tuple shifts(const Vector &y, const Matrix &z, const Vector &r, const Matrix
 // Sums over y alone, a record less its columns, with their derivatives by each parameter. `F_by` and so on are the
 // matrices' derivatives.
 nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix &Q, const Vector &h, const Matrix &P0,
-                 double R, const Cube &F_by, const Cube &Q_by, const Matrix &h_by, const Cube &P0_by,
-                 const Vector &R_by, int driver) {
+                 double R, double lost, const Cube &F_by, const Cube &Q_by, const Matrix &h_by, const Cube &P0_by,
+                 const Vector &R_by, const Vector &lost_by, int driver) {
     const std::size_t n = y.shape(0), d = h.shape(0), count = h_by.shape(0);
     const Matrix none(nullptr, {0, n});
     const bool diagonal = check(y, none, r, F, Q, h, P0, driver);
@@ -966,7 +975,7 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
     for (const Cube &by : {F_by, Q_by, P0_by})
         if (by.shape(0) != count || by.shape(1) != d || by.shape(2) != d)
             throw std::invalid_argument("shapes of the derivatives do not fit");
-    if (h_by.shape(1) != d || R_by.shape(0) != count)
+    if (h_by.shape(1) != d || R_by.shape(0) != count || lost_by.shape(0) != count)
         throw std::invalid_argument("shapes of the derivatives do not fit");
     std::vector<double> x(states_max);
     double G = 0.0, D = 0.0, counted = 0.0;
@@ -974,8 +983,8 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
     const Slopes by{fresh(count), fresh(count), fresh(count * count), fresh(count * count)};
     Out G_by = array(by.G, {count}), D_by = array(by.D, {count});
     Out innovations = array(by.innovations, {count, count}), spread = array(by.spread, {count, count});
-    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R};
-    const Matrices model_by{F_by.data(), Q_by.data(), h_by.data(), P0_by.data(), R_by.data()};
+    const Matrices model{F.data(), Q.data(), h.data(), P0.data(), &R, &lost};
+    const Matrices model_by{F_by.data(), Q_by.data(), h_by.data(), P0_by.data(), R_by.data(), lost_by.data()};
     const Input in{y.data(), nullptr, r.data(), n, 1, model, model_by, d, count, driver, &n, 1};
     {
         nb::gil_scoped_release released;
@@ -991,10 +1000,11 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
 
 NB_MODULE(_likelihood, m) {
     using namespace nb::literals;
-    m.def("run", &run, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a, "marks"_a, "innovations"_a);
-    m.def("shifts", &shifts, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "driver"_a);
-    m.def("slopes", &slopes, "y"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "F_by"_a, "Q_by"_a, "h_by"_a, "P0_by"_a,
-          "R_by"_a, "driver"_a);
+    m.def("run", &run, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "driver"_a, "marks"_a,
+          "innovations"_a);
+    m.def("shifts", &shifts, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "driver"_a);
+    m.def("slopes", &slopes, "y"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "F_by"_a, "Q_by"_a, "h_by"_a,
+          "P0_by"_a, "R_by"_a, "lost_by"_a, "driver"_a);
     m.attr("STATES_MAX") = states_max;
     m.attr("COLUMNS_MAX") = columns_max;
 }

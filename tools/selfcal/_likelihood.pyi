@@ -17,6 +17,7 @@ def run(
     h: NDArray[np.float64],
     P0: NDArray[np.float64],
     R: float,
+    lost: float,
     driver: int,
     marks: Sequence[int],
     innovations: bool,
@@ -37,6 +38,7 @@ def shifts(
     h: NDArray[np.float64],
     P0: NDArray[np.float64],
     R: float,
+    lost: float,
     driver: int,
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
 def slopes(
@@ -47,11 +49,13 @@ def slopes(
     h: NDArray[np.float64],
     P0: NDArray[np.float64],
     R: float,
+    lost: float,
     F_by: NDArray[np.float64],
     Q_by: NDArray[np.float64],
     h_by: NDArray[np.float64],
     P0_by: NDArray[np.float64],
     R_by: NDArray[np.float64],
+    lost_by: NDArray[np.float64],
     driver: int,
 ) -> tuple[
     float,

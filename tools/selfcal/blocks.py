@@ -28,8 +28,9 @@ class Blocks:
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
     those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
-    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. Blocks beyond MOST_DENSE
-    intervals are not worked out.
+    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. `after`: samples from
+    the last whole block to the last usable sample, missing ones included. Blocks beyond MOST_DENSE intervals are not
+    worked out.
     """
 
     mean: NDArray[np.float64]
@@ -37,6 +38,7 @@ class Blocks:
     within_sd: float
     kept_out: Mapping[str, int]
     z: NDArray[np.float64]
+    after: int = 0
 
 
 def usable_blocks(
@@ -106,6 +108,7 @@ def block_means(
     count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
     if not usable.all():
         samples, at, columns = samples[usable], at[usable], columns[usable]
+    after = int(at[-1] + 1) % block
     index = np.floor_divide(at, block, out=at)
     end = int(np.searchsorted(index, count))
     values, index, rows = samples[:end], index[:end], columns[:end]
@@ -126,4 +129,4 @@ def block_means(
     squares = float(np.square(scatter, out=scatter).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within, counts, z[first:])
+    return Blocks(mean[first:], r[first:], within, counts, z[first:], after)

@@ -11,6 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
 #: Terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
 MOST_TERMS = 3
 #: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
@@ -144,6 +147,32 @@ def averaged(x: float, block: int) -> tuple[float, float]:
     if x < 1e-3:  # right to x^2 / 20; the difference below would lose its digits
         return gain, (1.0 - 1.0 / block**2) * x / 3.0
     return gain, gain - (1.0 + phi + 2.0 * phi * math.expm1(-x) / rate) / rate
+
+
+def swing(period_s: float, damping: float, time_s: float) -> NDArray[np.float64]:
+    """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
+
+    The states are x and x' / w: both have the stationary variance of x, and do not correlate."""
+    w = 2.0 * math.pi / period_s
+    share = math.sqrt(1.0 - damping * damping)
+    decay, turn = math.exp(-damping * w * time_s), w * share * time_s
+    c, s = decay * math.cos(turn), decay * math.sin(turn) / share
+    return np.array([[c + damping * s, s], [-s, c - damping * s]])
+
+
+def lost_of(x: float, block: int) -> float:
+    """What lost readings add to the white noise of a mean of `block` readings, beyond its share, over r - 1.
+
+    r is the block over the readings left, and `x` is as in averaged(). The number is relative to the variance of the
+    first-order process; at x = 0, of a walk, to its step variance. No more of the drift's rest is missing, and the
+    readings left, at random, scatter about the mean of all.
+    """
+    if block == 1:
+        return 0.0
+    if x == 0.0:
+        return (1.0 + 1.0 / block) / 6.0
+    gain, rest = averaged(x, block)
+    return (rest + (1.0 - gain + rest) / (block - 1.0)) / gain
 
 
 def _flicker() -> Law:

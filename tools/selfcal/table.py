@@ -121,6 +121,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {bias['unit']} apart"
                 meaning = "noise is below that, N includes the rounding, the bias may stick"
                 failed.append(f"not adequate: {name}: lattice: {step}: {meaning}")
+            elif not outcome["passed"] and check == "drift_in_average":
+                share = f"the drift hides {100.0 * outcome['value']:.0f} % of the white noise"
+                failed.append(
+                    f"not adequate: {name}: drift_in_average: {share}: average less, with a higher --decimate"
+                )
             elif not outcome["passed"] and check == "outliers":
                 share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
                 failed.append(f"not adequate: {name}: outliers: {share}, too many for noise: lost words of the bus?")

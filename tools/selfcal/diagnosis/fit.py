@@ -48,13 +48,15 @@ SIZES = (*DRIFT_SIZES, "ln_swing", "ln_band")
 class Series:
     """One axis on an even grid: `y` float64[n] (NaN: missing), `dt` s, `r` float64[n] variance of the white noise
     relative to the nominal one. `columns` [p, n] of known disturbances; the first is the bias, all ones. A fit has
-    settled when a step changes ln likelihood by less than `ftol`."""
+    settled when a step changes ln likelihood by less than `ftol`. `y` are means of `block` readings; `r` is above 1
+    where some are lost."""
 
     y: Array
     dt: float
     r: Array
     columns: Array
     ftol: float = FTOL
+    block: int = 1
 
     @property
     def n(self) -> int:
@@ -158,13 +160,13 @@ def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
-    m = matrices(terms, theta, series.dt, series.duration_s)
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     at = list(marks) or [series.y.size]
 
     def of(columns: Array) -> tuple[Array, ...]:
         work.count(series.y.size, len(columns))
         found: tuple[Array, ...] = _likelihood.run(
-            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver, at, innovations
+            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, innovations
         )
         return found
 
@@ -210,10 +212,10 @@ class Shifts:
 
 def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
-    m = matrices(terms, theta, series.dt, series.duration_s)
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
 
     def of(columns: Array) -> tuple[Array, ...]:
-        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.driver)
+        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver)
         return tuple(np.asarray(one) for one in found)
 
     G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
@@ -233,18 +235,18 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
     the likelihood by none of theirs. sigma is free in the information."""
     work.count(series.y.size, at.theta.size)
     terms, theta = at.terms, at.theta
-    m = matrices(terms, theta, series.dt, series.duration_s)
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     near = [
-        [matrices(terms, theta + sign * move, series.dt, series.duration_s) for sign in (1.0, -1.0)]
+        [matrices(terms, theta + sign * move, series.dt, series.duration_s, series.block) for sign in (1.0, -1.0)]
         for move in NEAR * np.eye(theta.size)
     ]
-    F_by, Q_by, h_by, P0_by, R_by = (
+    F_by, Q_by, h_by, P0_by, R_by, lost_by = (
         np.ascontiguousarray([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
-        for name in ("F", "Q", "h", "P0", "R")
+        for name in ("F", "Q", "h", "P0", "R", "lost")
     )
     whole = series.y - at.c @ series.columns
     rss, _, n, rss_by, D_by, innovations, spread = _likelihood.slopes(
-        whole, series.r, m.F, m.Q, m.h, m.P0, m.R, F_by, Q_by, h_by, P0_by, R_by, m.driver
+        whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F_by, Q_by, h_by, P0_by, R_by, lost_by, m.driver
     )
     rss = max(rss, 1e-300)
     information = n / rss * innovations + 0.5 * (spread - np.outer(D_by, D_by) / n)

@@ -226,6 +226,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             lsb=found.step if found is not None and each == 1 else 0.0,
             stated_lsb=group.lsb,
             redrawn=each > 1,
+            block=each,
             below_lattice=found is not None and found.too_coarse,
         )
     present = np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0])

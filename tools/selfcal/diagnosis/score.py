@@ -197,7 +197,7 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
         G, D, n, x, _, _ = passed(series, fit.terms, theta, marks.tolist())
         value, c = _posterior(G, D, n, prior)
         ln_evidence[k] = value + ln_share
-        m = matrices(fit.terms, theta, series.dt, series.duration_s)
+        m = matrices(fit.terms, theta, series.dt, series.duration_s, series.block)
         drift = x[:, 0] - np.einsum("mp,mps->ms", c, x[:, 1:])
         for horizon, places in horizons.items():
             ahead, at = _ahead(horizon, state.dt) - 1, np.searchsorted(marks, places)

@@ -53,7 +53,7 @@ class State:
     theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
     they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
     noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
-    the model file's. `ftol`: of its fits, see Series.
+    the model file's. `ftol`: of its fits, `block`: readings of a mean, see Series.
     """
 
     axis: str
@@ -72,11 +72,12 @@ class State:
     redrawn: bool = False
     below_lattice: bool = False
     ftol: float = FTOL
+    block: int = 1
 
     @property
     def series(self) -> Series:
         columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
-        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol)
+        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
 
     @property
     def best(self) -> Fit:

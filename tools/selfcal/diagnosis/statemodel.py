@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.laws import lost_of, swing
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -83,7 +85,8 @@ class Terms:
 class Matrices:
     """Transition F, process noise Q, observation h, first covariance P0, and the variance R of the white noise.
 
-    `driver`: the state that white noise with memory enters by, -1 without."""
+    `driver`: the state that white noise with memory enters by, -1 without. `lost`: white noise that a mean of half of
+    its readings has beyond twice R."""
 
     F: Array
     Q: Array
@@ -91,17 +94,7 @@ class Matrices:
     P0: Array
     R: float
     driver: int = -1
-
-
-def swing(period_s: float, damping: float, time_s: float) -> Array:
-    """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
-
-    The states are x and x' / w: both have the stationary variance of x, and do not correlate."""
-    w = 2.0 * math.pi / period_s
-    share = math.sqrt(1.0 - damping * damping)
-    decay, turn = math.exp(-damping * w * time_s), w * share * time_s
-    c, s = decay * math.cos(turn), decay * math.sin(turn) / share
-    return np.array([[c + damping * s, s], [-s, c - damping * s]])
+    lost: float = 0.0
 
 
 @lru_cache(maxsize=64)
@@ -114,8 +107,8 @@ def flicker_rates(duration_s: float, dt: float) -> tuple[float, ...]:
     return tuple(float(rate) for rate in np.logspace(low, high, count))
 
 
-def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matrices:
-    """The state model of `terms` at the parameters `theta`.
+def matrices(terms: Terms, theta: Array, dt: float, duration_s: float, block: int = 1) -> Matrices:
+    """The state model of `terms` at the parameters `theta`, for means of `block` readings.
 
     Flicker noise of coefficient B has the two-sided spectrum B^2 / (2 pi f), as in `simulate` and in IEEE 952. Terms of
     variance v whose rates are a factor g apart make v / (2 ln g f), so v = B^2 ln g / pi.
@@ -129,19 +122,21 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
     single = terms.walk + terms.markov + len(rates) + (terms.color == "ar")
     size = max(1, single + 2 * pairs)
     F, Q, P0, h = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
-    R, driver, k = 1.0, -1, 0
+    R, driver, k, lost = 1.0, -1, 0, 0.0
 
     def markov(variance: float, rate: float) -> None:
-        nonlocal k
+        nonlocal k, lost
         F[k, k] = math.exp(-rate * dt)
         Q[k, k] = -variance * math.expm1(-2.0 * rate * dt)
         P0[k, k] = variance
         h[k] = 1.0
+        lost += variance * lost_of(rate * dt, block)
         k += 1
 
     if terms.walk:
         F[k, k] = h[k] = 1.0
         Q[k, k] = math.exp(2.0 * value["ln_rho"])
+        lost += Q[k, k] * lost_of(0.0, block)
         k += 1
     if terms.markov:
         markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
@@ -179,4 +174,4 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float) -> Matric
         P0[k, k] = P0[k + 1, k + 1] = variance
         h[k] = 1.0
         k += 2
-    return Matrices(F, Q, h, P0, R, driver)
+    return Matrices(F, Q, h, P0, R, driver, lost)

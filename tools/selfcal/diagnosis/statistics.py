@@ -298,10 +298,11 @@ def simulated(state: State, random: np.random.Generator) -> Array:
     """One record of the fitted model, read out as the recording: gaps, lattice, limits."""
     fit = state.best
     n = state.y.size
-    m = matrices(fit.terms, fit.theta, fit.dt, fit.duration_s)
+    m = matrices(fit.terms, fit.theta, fit.dt, fit.duration_s, state.block)
     # Reading out on the lattice adds lsb^2 / 12, which the fitted white noise holds already.
     white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
-    y = np.sqrt(white * state.r) * random.standard_normal(n)
+    lost = fit.sigma**2 * m.lost * (state.r - 1.0)
+    y = np.sqrt(np.maximum(white * state.r + lost, 0.1 * white * state.r)) * random.standard_normal(n)
     y += _states(m, np.sqrt(state.r), random) * fit.sigma
     y += fit.c @ state.series.columns
     y = np.where(np.isfinite(state.y), y, np.nan)

@@ -92,16 +92,17 @@ class Bank:
         except ValueError as error:  # std::invalid_argument
             raise UserError(str(error)) from error
 
-    def report(self, axis: int, mask: int = 0) -> AxisResult:
-        """Posterior of one axis now, with the columns of `mask` in use, a bit each. Raises UserError of an axis that
-        failed, with too few bank samples, and where the priors leave nothing (with regressors an evidence of -inf)."""
+    def report(self, axis: int, mask: int = 0, ahead_s: float = 0.0) -> AxisResult:
+        """Posterior of one axis, with the columns of `mask` in use, a bit each. The bias is the one `ahead_s` after the
+        last bank interval, with the columns' values of that interval. Raises UserError of an axis that failed, with too
+        few bank samples, and where the priors leave nothing (with regressors an evidence of -inf)."""
         if self.raw.retired(axis):
             raise UserError(
                 f"{self.tables.axes[axis].name} was out of range or stuck for too long and is left out: choose the "
                 "others with --axis"
             )
         try:
-            report = self.raw.report(axis, mask)
+            report = self.raw.report(axis, mask, ahead_s)
         except ValueError as error:  # std::length_error
             raise UserError(_too_short(self.tables, self.raw.count, self.raw.weight)) from error
         log_evidence, probability, parameters, coefficients = {}, {}, {}, {}

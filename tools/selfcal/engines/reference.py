@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from selfcal import _reference
 from selfcal.errors import UserError
+from selfcal.laws import Law, swing
 from selfcal.model import Group, Prior
 from selfcal.result import AxisResult, Estimate
 
@@ -68,14 +69,15 @@ def identify_axis(
     z: _Floats | None = None,
     coefficient_sd: Sequence[float] = (),
     block: int = 1,
+    ahead_s: float = 0.0,
 ) -> AxisResult:
     """Posterior of one axis under the continuous priors of its group.
 
     `y` float64[n] in the group's unit every `dt` s, NaN where a sample is missing; `r` float64[n] is the factor on the
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
     of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
-    samples. Raises UserError without a
-    sample, and when a posterior would take more than `_MOST` nodes.
+    samples. The bias is the one `ahead_s` after the last of them. Raises UserError without a sample, and when a
+    posterior would take more than `_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
     n = int(np.isfinite(y).sum())
@@ -85,7 +87,9 @@ def identify_axis(
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
     columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
-    found = {name: _posterior(centred, dt, offset, group, name, factors, columns, block) for name in hypotheses}
+    found = {
+        name: _posterior(centred, dt, offset, group, name, factors, columns, block, ahead_s) for name in hypotheses
+    }
     ln_weight = {name: math.log(hypotheses[name]) + found[name].ln_evidence for name in found if hypotheses[name] > 0.0}
     top = max(ln_weight.values())
     total = sum(math.exp(value - top) for value in ln_weight.values())
@@ -112,13 +116,15 @@ def _posterior(
     r: _Floats | None,
     columns: tuple[_Floats, _Floats] | None,
     block: int,
+    ahead_s: float,
 ) -> _Posterior:
     z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
     means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
-    drift = [*(of.read or (1.0,)), *[0.0] * (means + (2 if of.coloured_noise else 0))]
+    beside = means + (2 if of.coloured_noise else 0)
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
-    now = np.concatenate([drift, [1.0], columns_now])
+    constant = np.concatenate([np.zeros(beside), [1.0], columns_now])
+    own_from = max(len(of.read), 1) + beside + 1
     names = of.parameters
     priors = [group.priors[name] for name in names]
     low = np.log([prior.min for prior in priors])
@@ -145,11 +151,13 @@ def _posterior(
             block,
         )
         ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
-        own = np.diagonal(covariance, axis1=1, axis2=2)[:, len(drift) + 1 :]
+        own = np.diagonal(covariance, axis1=1, axis2=2)[:, own_from:]
+        drift, gained = _later(of, drift_of, second, ahead_s)
+        now = np.hstack([drift, np.broadcast_to(constant, (len(x), constant.size))])
         return _Filtered(
             ln_p + ln_prior,
-            np.column_stack([mean @ now, mean[:, len(drift) + 1 :]]),
-            np.column_stack([np.einsum("i,mij,j->m", now, covariance, now), own]),
+            np.column_stack([(mean * now).sum(axis=1), mean[:, own_from:]]),
+            np.column_stack([np.einsum("mi,mij,mj->m", now, covariance, now) + gained, own]),
         )
 
     seeds = _modes(lambda x: filtered(x).value, low, high)
@@ -167,6 +175,28 @@ def _posterior(
         mean,
         var,
     )
+
+
+def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Floats, _Floats]:
+    """What the drift some time on takes of each state now [m, states], and the variance that it gains until then [m],
+    at the drift and second parameters [m]."""
+    taken: list[_Floats] = []
+    gained = np.zeros(drift.size)
+    for term in of.terms:
+        if term.kind == "walk":
+            taken.append(np.ones(drift.size))
+            gained = gained + (term.deviation * drift) ** 2 * time_s
+            continue
+        rate = term.bandwidth * (1.0 if term.stated else second)
+        variance = (term.deviation * drift * (second if term.by_ratio else 1.0)) ** 2 / (rate if of.has_walk else 1.0)
+        if term.kind == "oscillation":
+            row = swing(2.0 * math.pi / term.bandwidth, term.damping, time_s)[0]
+            taken += [np.full(drift.size, share) for share in row]
+            gained = gained + variance * (1.0 - float(row @ row))
+        else:
+            taken.append(np.exp(-rate * time_s) * np.ones(drift.size))
+            gained = gained - variance * np.expm1(-2.0 * rate * time_s)
+    return np.column_stack(taken or [np.ones(drift.size)]), gained
 
 
 def _ln_density(prior: Prior, x: _Floats) -> _Floats:

@@ -18,7 +18,7 @@ from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, ROUNDS, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
-from selfcal.diagnosis.verdict import joined, moves_within, of_checks
+from selfcal.diagnosis.verdict import joined, of_checks
 from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
 from selfcal.ending import Held, Stopped, abandon, held
 from selfcal.errors import UserError, note, printable
@@ -188,9 +188,9 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
 
 
 def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
-    """Axes without a cause must pass the checks of `identify`, where its means can have their drift."""
+    """Axes without a cause must pass the checks of `identify`."""
     for name, one in found.items():
-        if one.findings or one.state.below_lattice or moves_within(one.state, 1.0 / model.bank_rate_hz):
+        if one.findings or one.state.below_lattice:
             continue
         with suppress(UserError):  # no report, no checks
             look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)

@@ -228,6 +228,7 @@ def identify_axis(
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns, readings.counted)
     blocks = replace(blocks, mean=blocks.mean + offset)
+    ahead_s = blocks.after / recording.rate_hz
     if engine == "reference" and model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
     if engine == "reference" and model.handling.outlier_sd:
@@ -248,7 +249,7 @@ def identify_axis(
         bank = Bank(tables, fixed=engine == "fixed", offset=offset)
         bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
         for choice in choices:
-            results.append(bank.report(0, mask_of(regressors, choice)))
+            results.append(bank.report(0, mask_of(regressors, choice), ahead_s))
             advance()
     else:
         from selfcal.engines import reference
@@ -268,6 +269,7 @@ def identify_axis(
                     beside,
                     coefficient_sd,
                     tables.block,
+                    ahead_s,
                 )
             )
             advance()

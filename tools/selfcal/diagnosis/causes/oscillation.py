@@ -21,9 +21,9 @@ from selfcal.diagnosis.fit import Fit, Series, best, fit, ln_likelihood, run
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, State, net
-from selfcal.diagnosis.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms, swing
+from selfcal.diagnosis.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
 from selfcal.diagnosis.statistics import swinging
-from selfcal.laws import RATIO_LIMITS
+from selfcal.laws import RATIO_LIMITS, swing
 from selfcal.result import HALF_90
 
 #: Periods in a record at least.
