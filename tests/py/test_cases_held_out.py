@@ -6,6 +6,7 @@ Truth: the dense covariance of a short record, and the numbers that each record 
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from drifts import fitted, of_one
 from scipy.special import logsumexp
 
 from selfcal.diagnosis import loop, score
+from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import step
-from selfcal.diagnosis.finding import HeldOut
+from selfcal.diagnosis.finding import Diagnosed, HeldOut
 from selfcal.diagnosis.fit import passed
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Look, Regressor, State
@@ -132,3 +134,26 @@ def test_what_harms_has_no_name(constant: bool) -> None:
         for one in found.findings:
             assert one.held_out is None or not one.held_out.harms
     assert named == records if constant else named == 0
+
+
+def test_after_a_look_that_harms_the_next_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state is as it was, so no cause is looked at again before a look is taken."""
+    state = fitted(np.random.default_rng(65).normal(size=400))
+    record = record_of(state)
+    looked: list[str] = []
+
+    def looks_of(cause: str, net: float) -> Looks:
+        def looks(one: State, _: Record) -> list[Look]:
+            looked.append(cause)
+            return [Look(cause, net, net, {}, {"level": one.level})] if len(looked) <= 3 else []
+
+        return looks
+
+    known = {"step": True, "pulse": True, "ramp": False}
+    causes = tuple(looks_of(cause, 50.0 - k) for k, cause in enumerate(known))
+    monkeypatch.setattr(score, "gain", lambda look, *_: SimpleNamespace(harms=known[look.cause]))
+    one = Diagnosed(state, state, record)
+    loop._rounds(record, one, lambda _: None, causes)
+    assert [finding.look.cause for finding in one.findings] == ["ramp"]
+    assert [look.cause for look in one.harmful] == ["step", "pulse"]
+    assert looked == [*known, *known]  # a round that takes one, and one that finds no more

@@ -197,24 +197,23 @@ def _rounds(
         advance(f"{one.state.axis}: round {number}")
         waiting = [cause for cause in causes if cause in idle]
         looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least, seen)
-        if waiting and (not looks or looks[0].net < least):
-            more, unworthy = _looked(one, record, waiting, least, seen)
-            looks, idle = _by_worth([*looks, *more]), idle | unworthy
-        else:
-            idle |= set(waiting)
-        if not looks or looks[0].net < least:
-            return
-        if len(one.findings) < BUSY:
-            idle = set()
-        best = looks[0]
+        harms = True
+        while harms:  # the state stays, and so do the other looks at it
+            if waiting and (not looks or looks[0].net < least):
+                more, unworthy = _looked(one, record, waiting, least, seen)
+                looks, idle, waiting = _by_worth([*looks, *more]), idle | unworthy, []
+            if not looks or looks[0].net < least:
+                return
+            best, before, after = looks[0], one.state, one.state.refit(**looks[0].changes)
+            known = None if provisional else score.gain(best, before, after, record)
+            harms = known is not None and known.harms
+            if harms:
+                one.harmful.append(best)
+                looks = [look for look in looks if not look.repeats(best)]
+        idle = idle | set(waiting) if len(one.findings) >= BUSY else set()
         rivals = tuple(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )
-        before, after = one.state, one.state.refit(**best.changes)
-        known = None if provisional else score.gain(best, before, after, record)
-        if known is not None and known.harms:
-            one.harmful.append(best)
-            continue
         one.state = after
         measured = best if provisional else best.measured()
         one.findings.append(Finding(measured, number, before, after, rivals, held_out=known))
