@@ -265,6 +265,8 @@ def test_the_product_computes_what_identify_computes(tmp_path: Path) -> None:
     axes = ("gx", "gy", "gz", "ax")
     simulate(None, tmp_path / "all.csv", seed=1)
     rows = [line.split(",")[: 1 + len(axes)] for line in (tmp_path / "all.csv").read_text().splitlines()]
+    # The gate leaves 8.5 s out: so the log ends with a whole average, and both have the bias of one instant.
+    rows = rows[:-5]
     log = tmp_path / "log.csv"
     log.write_text("".join(",".join(row) + "\n" for row in rows), encoding="utf-8")
     codegen(None, tmp_path, rate=10.0, axes=axes)
