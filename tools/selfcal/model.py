@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,8 @@ class Prior:
 @dataclass(frozen=True)
 class Group:
     """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and the ratios if a
-    hypothesis has them; units of `units.py`). `laws`: the model's, by the names of its hypotheses."""
+    hypothesis has them; units of `units.py`). `laws`: the model's, by the names of its hypotheses. `own_priors`: by
+    axis, those that take the place of the group's."""
 
     name: str
     axes: tuple[str, ...]
@@ -88,6 +89,7 @@ class Group:
     stuck_limit: int
     priors: Mapping[str, Prior]
     laws: Mapping[str, Law] = field(default_factory=lambda: NAMED)
+    own_priors: Mapping[str, Mapping[str, Prior]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -215,10 +217,11 @@ class Model:
         return tuple(axis for group in self.groups for axis in group.axes)
 
     def group_of(self, axis: str) -> Group:
-        """The group an axis belongs to. Raises UserError for an axis the model does not have."""
+        """The group of an axis, with its own priors. Raises UserError for an axis the model does not have."""
         for group in self.groups:
             if axis in group.axes:
-                return group
+                own = group.own_priors.get(axis)
+                return replace(group, priors={**group.priors, **own}, own_priors={}) if own else group
         raise UserError(f"{self.path}: the model has no axis '{axis}' (it has {', '.join(self.axes)})")
 
     @staticmethod
@@ -394,7 +397,7 @@ class _Reader:
 
     def group(self, name: str, tree: Any, laws: Mapping[str, Law]) -> Group:
         where = f"groups.{name}"
-        fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors"), where)
+        fields = self.only(tree, ("axes", "unit", "range", "lsb", "stuck_limit", "priors", "own_priors"), where)
         axes = self.entry(fields, "axes", where)
         if not isinstance(axes, list) or not axes or not all(isinstance(axis, str) for axis in axes):
             raise self.fail(f"{where}.axes", "must be a list of axis names")
@@ -407,15 +410,9 @@ class _Reader:
             *PARAMETERS,
             *(key for law in laws.values() for key in law.parameters if key not in PARAMETERS),
         )
-        known = ("bias", *PLACES)
-        trees = self.only(self.entry(fields, "priors", where), known, f"{where}.priors")
-        priors = {
-            key: self.prior(self.entry(trees, key, f"{where}.priors"), f"{where}.priors.{key}", bias=key == "bias")
-            for key in names
-        }
-        if not priors["bias"].sd <= WIDEST_BIAS * priors["N"].min:
-            most = f"{WIDEST_BIAS:.0e} times the least N"
-            raise self.fail(f"{where}.priors.bias.sd", f"must be at most {most}, not {priors['bias'].sd:g}")
+        priors = self.priors(self.entry(fields, "priors", where), f"{where}.priors", names)
+        owns = fields.get("own_priors") or {}
+        self.only(owns, tuple(axes), f"{where}.own_priors")
         return Group(
             name=name,
             axes=tuple(axes),
@@ -425,7 +422,24 @@ class _Reader:
             stuck_limit=self.count(fields.get("stuck_limit", 0), f"{where}.stuck_limit", 0),
             priors=priors,
             laws=laws,
+            own_priors={
+                axis: self.priors(own, f"{where}.own_priors.{axis}", names, priors) for axis, own in owns.items()
+            },
         )
+
+    def priors(
+        self, tree: Any, where: str, names: Collection[str], group: Mapping[str, Prior] | None = None
+    ) -> dict[str, Prior]:
+        """Priors of the parameters `names`; those that are not there are the `group`'s, if there is one."""
+        trees = self.only(tree, ("bias", *PLACES), where)
+        priors = dict(group or {})
+        for key in names:
+            if group is None or key in trees:
+                priors[key] = self.prior(self.entry(trees, key, where), f"{where}.{key}", bias=key == "bias")
+        if not priors["bias"].sd <= WIDEST_BIAS * priors["N"].min:
+            most = f"{WIDEST_BIAS:.0e} times the least N"
+            raise self.fail(f"{where}.bias.sd", f"must be at most {most}, not {priors['bias'].sd:g}")
+        return priors
 
     def regressor(self, tree: Any, where: str, groups: tuple[Group, ...]) -> Regressor:
         if not isinstance(tree, dict):

@@ -15,6 +15,7 @@ from selfcal import units
 from selfcal.document import as_typed
 from selfcal.errors import called, printable
 from selfcal.laws import RATIOS
+from selfcal.priors import OF_RECORD
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
 TABLE_WIDTH = 140
@@ -79,7 +80,8 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         if name not in axes:
             without.setdefault(axis["error"], []).append(name)
     failed = [f"no result: {', '.join(names)}: {error}; choose axes with --axis" for error, names in without.items()]
-    kept: list[str] = []
+    outside = [name for name, axis in axes.items() if axis.get("priors") == OF_RECORD]
+    kept = [f"priors: {', '.join(outside)}: from this record, which lies outside the model's"] if outside else []
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]

@@ -21,6 +21,7 @@ from selfcal.errors import UserError, remark
 from selfcal.forms import NUMBER, formed
 from selfcal.laws import averaged
 from selfcal.model import MOST_COLUMNS, SMALLEST, Model
+from selfcal.priors import state_own
 from selfcal.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
@@ -36,6 +37,7 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     it reproduces each axis: its law, parameters, bias and effects."""
     tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
     tree["name"] = f"{model.name}, extended"
+    state_own(tree, model)
     kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]

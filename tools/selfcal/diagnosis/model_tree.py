@@ -22,8 +22,11 @@ def add_law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, 
         own = {"host": NODES, "cortex-m0": SMALL_NODES}.get(target, nodes["gauss_markov"])
         nodes.setdefault(law, list(own))
     for group in tree["groups"].values():
-        own = dict(group["priors"]["sigma_m"]) if parameter == "B" else dict(prior)
-        group["priors"].setdefault(parameter, own)
+        for priors in (group["priors"], *(group.get("own_priors") or {}).values()):
+            if parameter == "B":
+                priors.setdefault(parameter, dict(priors.get("sigma_m", group["priors"]["sigma_m"])))
+            elif priors is group["priors"]:
+                priors.setdefault(parameter, dict(prior))
 
 
 def add_handling(tree: dict[str, Any], what: str, value: float | bool) -> None:

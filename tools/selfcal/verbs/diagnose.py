@@ -26,6 +26,7 @@ from selfcal.fail_on import check
 from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.output import write_text
+from selfcal.priors import add_sources, for_record
 from selfcal.progress import Doing
 from selfcal.recording import Recording, list_of, load
 from selfcal.table import since
@@ -85,6 +86,7 @@ def diagnose(
     recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
+    of_file, loaded = loaded, for_record(loaded, recording, names)
     second = None
     if on is not None:
         second = load(on, **reading)
@@ -121,6 +123,7 @@ def diagnose(
             doing.now("held-out gain")
             tree = extended(loaded, record, found)
             document = to_document(recording, found, errors, tree, first)
+            add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
                 _add_carried(document, loaded, tree, record, found, second)

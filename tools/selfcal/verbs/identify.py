@@ -26,6 +26,7 @@ from selfcal.gate import gated
 from selfcal.loaders import Reading
 from selfcal.model import DEFAULT, Model
 from selfcal.plot import check_picture
+from selfcal.priors import add_sources, for_record
 from selfcal.readings import look
 from selfcal.recording import Recording, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
@@ -94,6 +95,7 @@ def identify(
     recording = load(log, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
+    of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)
     found: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -115,6 +117,7 @@ def identify(
                 found[name] = error
         with_reasons(found, recording, loaded_model)
         document = to_document(recording, found, all_failed=json if fail_on is not None else None)
+        add_sources(document, of_file, loaded_model)
         doubtful = [name for name, axis in found.items() if isinstance(axis, Identified) and not axis.adequate]
         if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import suspicions
@@ -168,6 +171,7 @@ def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequ
         axis = document["axes"][name]
         if "suspicion" not in axis or CAUSES[axis["suspicion"]].slow:
             with suppress(UserError):  # a record too long for these laws
+                more = for_record(more, recording, (name,))
                 tables = make_tables(more, recording.rate_hz, (name,), bank_rate_hz=rate_hz)
                 bank = Bank(tables)
                 samples = as_float(recording.in_unit(name, more.group_of(name).unit))

@@ -33,6 +33,7 @@ from selfcal.live import View, frame_counts
 from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.plot import check_picture, plot_run
+from selfcal.priors import add_sources, for_record
 from selfcal.readings import look
 from selfcal.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
 from selfcal.regressors import (
@@ -154,11 +155,15 @@ def replay(
                 f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
                 f"{axis_unit(name)}, so the model must be in that unit"
             )
+    of_file = loaded_model
+    if known is None:
+        loaded_model = for_record(loaded_model, recording, names)
     if gate:
         gate_of(recording, loaded_model, tuple(names))
     firmware = build(loaded_model, recording.rate_hz, names, target, start=known)
     history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
     document = _document(recording, loaded_model, history, why, gate)
+    add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
     if json is not None:
         write_json(document, json)
