@@ -85,7 +85,7 @@ Log = Annotated[
     ),
 ]
 ModelFile = Annotated[
-    Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file instead of the default one")
+    Path | None, typer.Option("--model", metavar="MODEL", help="Model file, or a part's name (bmi088), instead of the default")
 ]
 From = Annotated[
     Path | None, typer.Option("--from", metavar="DIAGNOSIS.json", help="Priors as `diagnose --json` measured them")
@@ -380,6 +380,45 @@ def convert(
 
 @app.command()
 @_reading_logs
+def part(
+    reading: Reading,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="MODEL.yaml", help="Model file to write", show_default=False)
+    ],
+    log: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[LOG...]", help=f"Recording at rest: {READ}; or --datasheet alone", show_default=False),
+    ] = None,
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Of the part; default: the recording's")] = None,
+    datasheet: Annotated[
+        list[str] | None,
+        typer.Option(metavar="N=0.012deg/sqrt(h)", help="Number of its data sheet, or gx.N=... (repeat for more)"),
+    ] = None,
+    axis: Annotated[
+        list[str] | None,
+        typer.Option("--axis", metavar="NAME", help="Column that is an axis, beside gx to az (repeat for more)"),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """Write the model file of another part, from a recording at rest or its data sheet."""
+    from selfcal.verbs import part as verb
+
+    model = verb.part(
+        log or (),
+        output,
+        name=name,
+        datasheet=datasheet or (),
+        axes=axis or (),
+        start_s=start,
+        end_s=end,
+        **reading,
+    )
+    verb.show(model)
+
+
+@app.command()
+@_reading_logs
 def rivals(
     reading: Reading,
     log: Annotated[
@@ -443,7 +482,7 @@ def rivals(
 
 @app.command()
 def simulate(
-    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file, or a part's name", show_default=False)],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="LOG", help=f"Recording to write: {WRITTEN}", show_default=False)
     ],
@@ -695,7 +734,7 @@ def navigate(
 
 @app.command()
 def codegen(
-    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file, or a part's name", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for them", show_default=False)],
     target: Annotated[str, typer.Option(help="Whose node counts of the model file")] = "host",
     rate: Annotated[
@@ -711,7 +750,7 @@ def codegen(
 
 @app.command()
 def dbc(
-    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file", show_default=False)],
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file, or a part's name", show_default=False)],
     node: Annotated[int, typer.Option(metavar="N", help="The module's number on its bus, 0 to 11")] = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="File to write; default: stdout")

@@ -31,7 +31,12 @@ from selfcal.laws import (
 from selfcal.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 
 SCHEMA = "selfcal.model/1"
+#: Axes of an inertial unit: sensor columns unless a model names others.
+SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
+#: Model files of common parts, one a part; the default model is that of the ADIS16405.
+PARTS = DEFAULT.parent / "parts"
+DEFAULT_PART = "adis16405"
 
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
@@ -216,6 +221,11 @@ class Model:
         """All axes, group by group: the order the library and the telemetry use."""
         return tuple(axis for group in self.groups for axis in group.axes)
 
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Columns of a recording that may be axes: the usual ones, and the model's own."""
+        return tuple(dict.fromkeys((*SENSORS, *self.axes)))
+
     def group_of(self, axis: str) -> Group:
         """The group of an axis, with its own priors. Raises UserError for an axis the model does not have."""
         for group in self.groups:
@@ -226,13 +236,34 @@ class Model:
 
     @staticmethod
     def load(path: Path | str | None = None) -> Model:
-        """Read and check a model file; None is the default model. Raises UserError naming the file and the entry."""
-        return _Reader(DEFAULT if path is None else Path(path)).model()
+        """Read and check a model file, or that of a part by its name; None is the default model. Raises UserError
+        naming the file and the entry."""
+        return _Reader(file_of(path)).model()
 
     @staticmethod
     def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
         """The same of a tree that is read already, from the file `path`."""
         return _Reader(path, tree).model()
+
+
+def parts() -> dict[str, Path]:
+    """Model files of the parts that the package has, by name."""
+    return dict(sorted({DEFAULT_PART: DEFAULT, **{path.stem: path for path in PARTS.glob("*.yaml")}}.items()))
+
+
+def file_of(model: Path | str | None) -> Path:
+    """The file of a model: a path, or the name of a part (without a folder or suffix) unless a file has that name."""
+    if model is None:
+        return DEFAULT
+    path = Path(model)
+    if path.suffix or path.name != str(model) or path.exists():
+        return path
+    known = parts()
+    named = {re.sub(r"[^a-z0-9]", "", name): path for name, path in known.items()}
+    found = named.get(re.sub(r"[^a-z0-9]", "", path.name.lower()))
+    if found is None:
+        raise UserError(f"there is no part '{short(path.name)}' (there are {', '.join(known)}), and no such model file")
+    return found
 
 
 class _Loader(yaml.SafeLoader):

@@ -54,13 +54,14 @@ def plot_run(
     truth: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
     names: Names = BY_PLACE,
+    sent_in: Mapping[str, str] | None = None,
 ) -> None:
     """Save the picture of complete reports by axis; the suffix of `path` chooses the format. `names`: of hypotheses and
     parameters; each parameter has a panel.
 
     Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
     as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
-    `units` of the axes' readings; default: telemetry's. `truth`, of a simulated recording: per axis its `hypothesis`
+    `units` of the axes' readings; default: telemetry's, which `sent_in` has of axes of other names. `truth`, of a simulated recording: per axis its `hypothesis`
     and parameters, drawn dashed. Raises UserError if it cannot be written.
     """
     import matplotlib
@@ -74,7 +75,8 @@ def plot_run(
     names = names if count <= len(names.hypotheses) else BY_PLACE
     hypotheses = names.hypotheses[:count]
     panels = _panels(history, names, count)
-    unit = {axis: (units or {}).get(axis, axis_unit(axis)) for axis in axes}
+    own = {axis: (sent_in or {}).get(axis) or axis_unit(axis) for axis in axes}
+    unit = {axis: (units or {}).get(axis, own[axis]) for axis in axes}
     rows = {name: [axis for axis in axes if unit[axis] == name] for name in unit.values()}
     spans: dict[tuple[str, str], list[float]] = {}  # what a panel's scale has to hold
     figure, grid = pyplot.subplots(
@@ -100,7 +102,7 @@ def plot_run(
         row[0].set_ylabel(axis, rotation=0, fontweight="bold", labelpad=15)
         _write(row[0], *_verdict(last, told, hypotheses))
         for panel, (parameter, candidates) in zip(row[1:], panels.items(), strict=True):
-            scale = factor(axis_unit(axis), unit[axis]) if _scales(parameter) else 1.0
+            scale = factor(own[axis], unit[axis]) if _scales(parameter) else 1.0
             spans[axis, parameter] = []
             best = -1
             for k, place in ((k, place) for k, place in candidates.items() if k in last):

@@ -178,23 +178,28 @@ def _drifts(group: Group, seen: Seen) -> bool:
 def about(group: Group, seen: Seen) -> dict[str, Prior]:
     """Priors about a resting axis: N two decades either way, the drift's in the group's ratio to the middle of N. Where
     the axis drifts faster, these reach as far as it does. The bias' is as wide as its level needs."""
-    priors, N = group.priors, rounded(seen.N)
+    peak = float(seen.deviation.max())
+    reach = {"K": float(seen.deviation[-1] * math.sqrt(3.0 / seen.tau_s[-1])), "sigma_m": peak, "B": peak}
+    return laid(group.priors, seen.N, seen.level, reach)
+
+
+def laid(
+    priors: Mapping[str, Prior], N: float, level: float = 0.0, reach: Mapping[str, float] | None = None
+) -> dict[str, Prior]:
+    """Priors about a white noise `N`, as `about` has them. `level` and `reach`, the sizes of the drift by parameter, in
+    the unit of the priors."""
+    N = rounded(N)
     scale = N / math.sqrt(priors["N"].min * priors["N"].max)
     sd = priors["bias"].sd
-    if abs(seen.level) > BIAS_SD * sd:
-        sd = rounded(LEVEL_SD * abs(seen.level))
+    if abs(level) > BIAS_SD * sd:
+        sd = rounded(LEVEL_SD * abs(level))
     # A bias prior may be so much wider than the least N: first it gives way, then N.
-    sd = max(min(sd, WIDEST_BIAS * N / DECADES), rounded(abs(seen.level) / LEVEL_SD))
+    sd = max(min(sd, WIDEST_BIAS * N / DECADES), rounded(abs(level) / LEVEL_SD))
     least = max(N / DECADES, rounded(1.01 * sd / WIDEST_BIAS))
-    reach = {
-        "K": float(seen.deviation[-1] * math.sqrt(3.0 / seen.tau_s[-1])),
-        "sigma_m": float(seen.deviation.max()),
-        "B": float(seen.deviation.max()),
-    }
     own = {"bias": Prior("normal", sd=sd), "N": _limits(priors["N"].law, least, DECADES * N)}
     for key, prior in priors.items():
         if key not in ("bias", "N", "alpha", *RATIOS):
-            most = max(scale * prior.max, DRIFT_MARGIN * reach[key])
+            most = max(scale * prior.max, DRIFT_MARGIN * (reach or {}).get(key, 0.0))
             own[key] = _limits(prior.law, scale * prior.min, most)
     return {**priors, **own}
 

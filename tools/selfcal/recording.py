@@ -42,6 +42,7 @@ from selfcal.loaders.sources import Part, chosen
 from selfcal.loaders.table import Hints, Member, Table, parse_meta
 from selfcal.loaders.text_table import TextTable, is_clock, is_date
 from selfcal.loaders.texts import Text, texts_in
+from selfcal.model import SENSORS
 from selfcal.output import together, whole
 from selfcal.timebase import Clock, clock_of, clock_of_rows, damaged_stamps, few, has_own_clock, unwrapped
 
@@ -49,12 +50,10 @@ from selfcal.timebase import Clock, clock_of, clock_of_rows, damaged_stamps, few
 _NO_GRID = 0.3
 #: s from power-on to a recording's beginning, at most: a year.
 LONGEST_POWERED_S = 3.2e7
-#: Sensor columns unless a model names others; a recording needs at least one.
-SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 #: Columns that are no axis but may explain one, by cause: name and unit.
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
-#: Unit of a scaled LSB column where the scale states none, by the column's first letter.
-_LSB_UNITS = {"g": "deg/s", "a": "m/s^2"}
+#: Unit of a scaled LSB column where the scale states none.
+_LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
 #: Where a sensor's axes stand at rest, 1 g is so long in these units; the share that it may be off, the share of the
 #: record that rests, and the seconds of a mean.
 _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
@@ -748,8 +747,7 @@ class _Header:
                 self.notes.append(f"column '{name}' {what} and is left out: write {name}[{example}]")
             return []
         if unit is None:
-            usual = {"t": "s", **dict(SIDE_CHANNELS.values()), **{key: _LSB_UNITS[key[0]] for key in SENSORS}}
-            example = usual.get(name, _LSB_UNITS.get(name[0])) or "UNIT"
+            example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
             raise UserError(
                 f"{column} has no unit: write {name}[{example}] in the header or give --unit {name}={example}"
             )
@@ -761,7 +759,7 @@ class _Header:
             given = self.scale.get(name, self.scale.get(""))
             if given is None:
                 raise UserError(f"{column} is in LSB: give the size of one with --scale {name}=SIZE[unit]")
-            size, unit = given[0], units.plain(given[1]) if given[1] else _LSB_UNITS.get(name[0])
+            size, unit = given[0], units.plain(given[1]) if given[1] else _LSB_UNITS.get(name)
             if unit is None or not units.known(unit) or unit == units.LSB:
                 raise UserError(f"{column} is in LSB: --scale needs a unit, --scale {name}={size:g}[unit]")
         elif name in self.scale:

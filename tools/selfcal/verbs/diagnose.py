@@ -82,14 +82,14 @@ def diagnose(
     if write_model is not None:
         check_not_by_hand(write_model)
     loaded = Model.load(model)
-    recording = load(log, **reading)
+    recording = load(log, sensors=loaded.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     of_file, loaded = loaded, for_record(loaded, recording, names)
     second = None
     if on is not None:
-        second = load(on, **reading)
+        second = load(on, sensors=loaded.sensors, **reading)
     first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)

@@ -92,7 +92,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    recording = load(log, **reading)
+    recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)

@@ -32,6 +32,7 @@ from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
 from selfcal.loaders import Reading
 from selfcal.model import Model
+from selfcal.on_wire import places, sent
 from selfcal.plot import check_picture, plot_run
 from selfcal.priors import add_sources, for_record
 from selfcal.readings import look
@@ -56,7 +57,7 @@ from selfcal.verbs.codegen import write_tables
 from selfcal.verbs.identify import chosen_axes, with_reasons
 from selfcal.warm import Start, warmed
 from selfcal.warm import load as load_start
-from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, axis_unit, names_of, open_bus, reasons
+from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, names_of, open_bus, reasons
 
 MAGIC = b"SELFCAL2"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
@@ -142,26 +143,27 @@ def replay(
             f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
             f"{len(loaded_model.hypotheses)}; take `identify`"
         )
-    recording = load(log, **reading)
+    recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))
     recording = replace(recording, start_s=0.0).later(since_power_on_s + known_s)  # as the firmware has it
     names = chosen_axes(recording, loaded_model, axes)
     recording = recording.along(*names)
-    for name in names:
-        if loaded_model.group_of(name).unit != axis_unit(name):
-            raise UserError(
-                f"{loaded_model.path}: axis {name} is in {loaded_model.group_of(name).unit}; telemetry carries it in "
-                f"{axis_unit(name)}, so the model must be in that unit"
-            )
+    taken = places(loaded_model, names)
+    foreign = [name for name in names if taken[name] != name]
+    if foreign and target != "host":
+        raise UserError(f"--target {target}: its images have no axis {', '.join(foreign)}; take --target host")
     of_file = loaded_model
     if known is None:
         loaded_model = for_record(loaded_model, recording, names)
     if gate:
         gate_of(recording, loaded_model, tuple(names))
-    firmware = build(loaded_model, recording.rate_hz, names, target, start=known)
-    history, why = run(firmware, recording, loaded_model, names, report_every, target, gate, transport, channel)
+    sent_model, rows = sent(loaded_model, recording, taken) if foreign else (loaded_model, recording)
+    firmware = build(sent_model, recording.rate_hz, list(taken.values()), target, start=known)
+    told, said = run(firmware, rows, sent_model, list(taken.values()), report_every, target, gate, transport, channel)
+    history = {name: [replace(one, axis=name) for one in told[at]] for name, at in taken.items() if at in told}
+    why = {name: said[at] for name, at in taken.items() if at in said}
     document = _document(recording, loaded_model, history, why, gate)
     add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
@@ -172,7 +174,9 @@ def replay(
         title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
         truth = recording.meta.get("truth") if simulated else None
         units = {name: recording.columns[name].unit for name in history}
-        plot_run(history, plot, title, truth if isinstance(truth, dict) else None, units, names_of(loaded_model))
+        own = {name: loaded_model.group_of(name).unit for name in history}
+        known_truth = truth if isinstance(truth, dict) else None
+        plot_run(history, plot, title, known_truth, units, names_of(loaded_model), sent_in=own)
         note(f"plot: {plot}")
     return document
 

@@ -74,7 +74,7 @@ def rivals(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded = Model.load(model)
-    recording = load(log, **reading)
+    recording = load(log, sensors=loaded.sensors, **reading)
     names = chosen_axes(recording, loaded, axes)
     found: dict[str, Any] = {}
     console = Console(stderr=True)
