@@ -35,17 +35,6 @@ def test_a_cubic_of_the_temperature_has_its_curvature(tmp_path: Path) -> None:
     assert found.get("temperature", {}).get("form") in ("square", "cube")
 
 
-@later(14, "priors from the record")
-def test_a_tactical_gyro_has_an_answer(tmp_path: Path) -> None:
-    """P94: 0.012 deg/sqrt(h) is N = 2e-4 deg/s/sqrt(Hz), without a model file. 4 sd."""
-    (axis,) = identify(shared_case("P94_tactical.py", tmp_path), json=tmp_path / "out.json")["axes"].values()
-    assert "error" not in axis
-    law = max(axis["hypotheses"], key=axis["hypotheses"].get)
-    N = axis["parameters"][law]["N"]
-    assert abs(N["median"] - 2e-4) < 4.0 * N["sd"]
-    assert not any(one.get("off_grid") for one in axis["parameters"][law].values())
-
-
 @later(15, "quantization noise Q")
 def test_quantization_noise_stands_beside_white_noise(tmp_path: Path) -> None:
     """P23: increments counted in steps of 2e-3 m/s beside N = 8e-4 m/s^2/sqrt(Hz). 4 sd."""

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from selfcal.model import Model
+from selfcal.priors import for_record
+from selfcal.recording import load
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 
-from conftest import case_records
+from conftest import case_records, shared_case
 
 #: deg/s per deg/sqrt(h), and per deg/h: units of data sheets.
 ARW, PER_HOUR = 1.0 / 60.0, 1.0 / 3600.0
@@ -44,7 +46,9 @@ PARTS = {
 }  # fmt: skip
 
 
-def at_rest(seed: int, N: float, K: float, rate_hz: float, duration_s: float, level: float = 0.0) -> NDArray[np.float64]:
+def at_rest(
+    seed: int, N: float, K: float, rate_hz: float, duration_s: float, level: float = 0.0
+) -> NDArray[np.float64]:
     """Readings of white noise and a random walk about a level."""
     random, n = np.random.default_rng(seed), round(rate_hz * duration_s)
     walk = np.cumsum(random.normal(size=n)) * K / math.sqrt(rate_hz)
@@ -88,3 +92,101 @@ def test_a_part_is_identified_by_its_file_alone(part: str, tmp_path: Path) -> No
     assert max(abs(one) for values in far.values() for one in values) < 4.5
     assert min(inside.values()) >= binom.ppf(1e-4, count, 0.9)
     assert doubtful <= max(1.0, 0.1 * count)
+
+
+def test_a_tactical_gyro_has_an_answer(tmp_path: Path) -> None:
+    """P94: 0.012 deg/sqrt(h) is N = 2e-4 deg/s/sqrt(Hz), without a model file; K 0.3 deg/h/sqrt(h). 4 sd."""
+    (axis,) = identify(shared_case("P94_tactical.py", tmp_path), json=tmp_path / "out.json")["axes"].values()
+    walk = axis["parameters"]["random_walk"]
+    assert axis["priors"] == "from this record" and axis["adequate"]
+    assert abs(deviation(walk["N"], 2e-4)) < 4.0 and abs(deviation(walk["K"], 0.3 * ARW * PER_HOUR)) < 4.0
+    assert not any(one["off_grid"] for law in axis["parameters"].values() for one in law.values())
+
+
+# ------------------------------------------------------------------------------- inside, at the limits, and far outside
+
+
+def test_a_record_inside_keeps_the_model_to_the_bit(tmp_path: Path) -> None:
+    """The model itself, for N up to its limits, beside a ramp, a step, motion at an end, and a coarse lattice."""
+    model = Model.load()
+    ramp = np.linspace(0.0, 2.0, 18_000)
+    step = np.where(np.arange(18_000) > 7000, 3.0, 0.0)
+    hands = np.where(np.arange(18_000) < 300, 40.0 * np.random.default_rng(2).normal(size=18_000), 0.0)
+    kinds = {
+        "least": at_rest(1, 1.02e-3, 2e-5, 10.0, 1800.0),
+        "most": at_rest(2, 0.49, 1e-3, 10.0, 1800.0),
+        "ramp": at_rest(3, 0.01, 1e-4, 10.0, 1800.0) + ramp,
+        "step": at_rest(4, 0.01, 1e-4, 10.0, 1800.0) + step,
+        "hands": at_rest(5, 0.01, 1e-4, 10.0, 1800.0) + hands,
+        "lattice": np.round(at_rest(6, 0.01, 1e-4, 10.0, 1800.0) / 0.05) * 0.05,
+        "level": at_rest(7, 0.01, 1e-4, 10.0, 1800.0) + 35.0,
+    }
+    for kind, values in kinds.items():
+        log = load(write(tmp_path / "log.npz", 10.0, gx=("deg/s", values)))
+        assert for_record(model, log, ("gx",)) is model, kind
+
+
+def test_rest_inside_the_priors_is_never_sent_outside(tmp_path: Path) -> None:
+    """Clean twin: N and K drawn from the default priors' inner 95 %, at most 1 of 200 with other priors than these."""
+    count, fired, random = case_records(20, 200), 0, np.random.default_rng(11)
+    model = Model.load()
+    for seed in range(count):
+        N = math.exp(random.uniform(math.log(1.2e-3), math.log(0.42)))
+        K = min(N, math.exp(random.uniform(math.log(2e-5), math.log(2e-2))))
+        rate_hz = (1.0, 10.0, 50.0)[seed % 3]
+        values = at_rest(5000 + seed, N, K, rate_hz, 900.0, 8.0 * random.normal())
+        log = load(write(tmp_path / "log.npz", rate_hz, gx=("deg/s", values)))
+        fired += for_record(model, log, ("gx",)) is not model
+    assert fired <= max(1, count // 200)
+
+
+@pytest.mark.parametrize(
+    ("N", "K", "level"), [(0.3, 0.3, 0.0), (0.02, 1e-3, 90.0), (3e-6, 1e-7, 60.0), (0.2, 0.1, -100.0)]
+)
+def test_a_drift_or_a_level_outside_has_an_answer(N: float, K: float, level: float, tmp_path: Path) -> None:
+    """A drift beyond K and sigma_m, a level beyond the bias' prior. Tolerance: 4 sd."""
+    log = write(tmp_path / "log.npz", 10.0, gx=("deg/s", at_rest(21, N, K, 10.0, HOUR_S, level)))
+    (axis,) = identify(log, suspicion=False)["axes"].values()
+    assert axis["priors"] == "from this record"
+    walk = axis["parameters"]["random_walk"]
+    assert axis["hypotheses"]["random_walk"] > 0.01 and abs(deviation(walk["K"], K)) < 4.0
+    assert abs(deviation(walk["N"], N)) < 4.0
+    assert not walk["K"]["off_grid"]
+
+
+def test_a_part_that_was_held_at_its_ends_has_its_own_noise(tmp_path: Path) -> None:
+    """A tactical gyro of which 25 s at the start are motion: N by the rest, within 4 sd."""
+    values = at_rest(31, 1e-4, 2e-6, 20.0, 1800.0)
+    values[:500] += np.random.default_rng(3).normal(size=500)
+    (axis,) = identify(write(tmp_path / "log.npz", 20.0, gx=("deg/s", values)), suspicion=False)["axes"].values()
+    assert axis["priors"] == "from this record"
+    assert "motion" in axis["checks"]
+    assert abs(deviation(axis["parameters"]["random_walk"]["N"], 1e-4)) < 4.0
+
+
+def test_every_target_has_the_same_limits(tmp_path: Path) -> None:
+    """`diagnose` writes the limits that `identify` has; `codegen` takes the file; `replay` agrees within the contract's
+    tolerance for axes that share their nodes (P to 1e-3, N to 0.1 of its sd). An axis inside keeps the model's."""
+    log = write(
+        tmp_path / "log.npz",
+        10.0,
+        gx=("deg/s", at_rest(41, 3e-4, 1e-5, 10.0, 900.0)),
+        gy=("deg/s", at_rest(42, 0.02, 2e-4, 10.0, 900.0)),
+    )
+    found = identify(log, suspicion=False)["axes"]
+    assert [axis["priors"] for axis in found.values()] == ["from this record", "model"]
+    written = tmp_path / "model.yaml"
+    diagnosed = diagnose(log, decimate=1.0, write_model=written, json=tmp_path / "diagnosis.json")["axes"]
+    assert [axis["priors"] for axis in diagnosed.values()] == ["from this record", "model"]
+    again = identify(log, model=written, suspicion=False)["axes"]
+    for name, axis in found.items():
+        assert again[name]["priors"] == "model"
+        assert again[name]["parameters"] == axis["parameters"]
+    tables = codegen(written, tmp_path / "tables", rate=10.0, start=tmp_path / "diagnosis.json")
+    assert tables.axes[0].ln_max[0] < math.log(0.1) < tables.axes[2].ln_max[0]
+    for name, axis in replay(log)["axes"].items():
+        assert axis["priors"] == found[name]["priors"]
+        for law, probability in axis["hypotheses"].items():
+            assert abs(probability - found[name]["hypotheses"][law]) < 1e-3
+        one, other = (tree["parameters"]["random_walk"]["N"] for tree in (axis, found[name]))
+        assert abs(one["median"] - other["median"]) < 0.1 * other["sd"]

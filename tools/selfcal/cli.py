@@ -85,7 +85,8 @@ Log = Annotated[
     ),
 ]
 ModelFile = Annotated[
-    Path | None, typer.Option("--model", metavar="MODEL", help="Model file, or a part's name (bmi088), instead of the default")
+    Path | None,
+    typer.Option("--model", metavar="MODEL", help="Model file, or a part's name (bmi088), instead of the default"),
 ]
 From = Annotated[
     Path | None, typer.Option("--from", metavar="DIAGNOSIS.json", help="Priors as `diagnose --json` measured them")

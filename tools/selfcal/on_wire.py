@@ -57,6 +57,4 @@ def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[
 
 def _renamed(group: Group, taken: Mapping[str, str]) -> Group:
     own = {taken[name]: priors for name, priors in group.own_priors.items() if name in taken}
-    return replace(
-        group, axes=tuple(taken.values()), unit=AXIS_UNITS[next(iter(taken.values()))], own_priors=own
-    )
+    return replace(group, axes=tuple(taken.values()), unit=AXIS_UNITS[next(iter(taken.values()))], own_priors=own)

@@ -61,8 +61,9 @@ def plot_run(
 
     Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
     as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
-    `units` of the axes' readings; default: telemetry's, which `sent_in` has of axes of other names. `truth`, of a simulated recording: per axis its `hypothesis`
-    and parameters, drawn dashed. Raises UserError if it cannot be written.
+    `units` of the axes' readings; default: telemetry's. `sent_in`: what the reports of axes of other names are in.
+    `truth`, of a simulated recording: per axis its `hypothesis` and parameters, drawn dashed. Raises UserError if it
+    cannot be written.
     """
     import matplotlib
 

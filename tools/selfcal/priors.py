@@ -140,7 +140,9 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     place = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
     level = float(np.median(values[sound]))
     total, size = values[sound] - level, np.ones(place.size)
-    tau, deviations, counts = [], [], []
+    tau: list[float] = []
+    deviations: list[float] = []
+    counts: list[int] = []
     while True:
         first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
         place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)

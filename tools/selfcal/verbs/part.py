@@ -22,7 +22,7 @@ from selfcal.output import write_text
 from selfcal.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.readings import Readings, look
 from selfcal.recording import Recording, list_of, load
-from selfcal.rest import BIAS_SD, rest_of
+from selfcal.rest import rest_of
 from selfcal.units import factor, parameter_unit
 
 #: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
@@ -69,9 +69,9 @@ def part(
     """Write the model file of a part into `output`, and return the model.
 
     `log`: a recording at rest; none: by the data sheet alone. `datasheet`: texts `N=0.012deg/sqrt(h)`, `accel.N=...`,
-    `gx.range=250deg/s`; keys are N, density (one-sided), K, B, bias, range and lsb, and `rate` of the part. They go before the recording's
-    numbers. `axes`: columns that are axes, where they are not gx to az. The other options are `load`'s.
-    Raises UserError for a recording that moved, for a text that is none of these, and for a file that cannot be written.
+    `gx.range=250deg/s`, of the keys in STATED and OF_PART. They go before the recording's numbers. `axes`: columns that
+    are axes, where they are not gx to az. The other options are `load`'s.
+    Raises UserError for a recording that moved, a text that is none of these, and a file that cannot be written.
     """
     if not log and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
@@ -175,18 +175,19 @@ def _of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
         said += lines
         typical = math.exp(float(np.mean([math.log(one.N) for one in seen.values()])))
         level = max(seen.values(), key=lambda one: abs(one.level)).level
+        about_it = group
         if not any(axis in SENSORS for axis in group.axes):
             wide = rounded(max(LEVEL_SD * abs(level), LEAST_BIAS * typical))
-            group = replace(group, priors={**group.priors, "bias": Prior("normal", sd=wide)})
+            about_it = replace(group, priors={**group.priors, "bias": Prior("normal", sd=wide)})
         widest = replace(max(seen.values(), key=lambda one: float(one.deviation.max())), level=level)
-        priors = about(group, _at(widest, typical))
+        priors = about(about_it, _at(widest, typical))
         fields["priors"] = {key: prior_tree(prior) for key, prior in priors.items()}
         listed = ", ".join(f"{axis} {one.N:.3g}" for axis, one in seen.items())
         said.append(f"{group.name}: N about {listed} {parameter_unit('N', group.unit)} (Allan deviation)")
         far = {axis: one for axis, one in seen.items() if not 1.0 / ALIKE < one.N / typical < ALIKE}
         if far:
             fields["own_priors"] = {
-                axis: {key: prior_tree(prior) for key, prior in about(group, one).items() if prior != priors[key]}
+                axis: {key: prior_tree(prior) for key, prior in about(about_it, one).items() if prior != priors[key]}
                 for axis, one in far.items()
             }
     return said

@@ -32,6 +32,7 @@ from selfcal.methods import RIVALS, Rival
 from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.methods.problem import Answer, Problem
 from selfcal.model import DEFAULT, Model
+from selfcal.priors import for_record
 from selfcal.recording import Recording, as_float, load
 from selfcal.spread import record_seeds, spread, workers
 from selfcal.tables import make_tables
@@ -76,6 +77,7 @@ def rivals(
     loaded = Model.load(model)
     recording = load(log, sensors=loaded.sensors, **reading)
     names = chosen_axes(recording, loaded, axes)
+    loaded = for_record(loaded, recording, names)
     found: dict[str, Any] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
