@@ -138,26 +138,30 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     block = max(1, round(recording.rate_hz / model.bank_rate_hz))
     tau_s = block / recording.rate_hz
     place = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
-    level = float(np.median(values[sound]))
-    total, size = values[sound] - level, np.ones(place.size)
+    size = np.ones(place.size)
     tau: list[float] = []
     deviations: list[float] = []
     counts: list[int] = []
-    while True:
-        first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
-        place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
-        whole = size > 0.5 * size.max()
-        step = np.diff(total[whole] / size[whole])[np.diff(place[whole]) == 1]
-        if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
-            break
-        square = step * step
-        typical, mean = float(np.median(square)) / MEDIAN_SQUARE, float(square.mean())
-        # On a coarse lattice the median is of its steps: never more than the mean square.
-        deviations.append(math.sqrt(0.5 * (min(typical, mean) or mean)))
-        tau.append(tau_s)
-        counts.append(step.size)
-        tau_s *= 2.0
-        place = place // 2
+    level = math.nan
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = values[sound]
+        while True:
+            first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
+            place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
+            whole = size > 0.5 * size.max()
+            mean = total[whole] / size[whole]
+            level = level if tau else float(np.median(mean))
+            step = np.diff(mean)[np.diff(place[whole]) == 1]
+            if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
+                break
+            square = step * step
+            typical, all_of_them = float(np.median(square)) / MEDIAN_SQUARE, float(square.mean())
+            # On a coarse lattice the median is of its steps: never more than the mean square.
+            deviations.append(math.sqrt(0.5 * (min(typical, all_of_them) or all_of_them)))
+            tau.append(tau_s)
+            counts.append(step.size)
+            tau_s *= 2.0
+            place = place // 2
     if not tau or not 0.0 < deviations[0] < math.inf:
         return None
     return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
