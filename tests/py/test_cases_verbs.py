@@ -301,7 +301,7 @@ def test_a_shaken_record_gets_the_stretch_to_type(rate_hz: float, first: float, 
 
 @pytest.mark.parametrize("size", [1e-4, 30.0])
 def test_a_record_at_rest_is_identified_outside_the_priors(size: float, tmp_path: Path) -> None:
-    """As many times the noise of a record inside them: N within 4 of its sd (test_priors.py has the parts)."""
+    """As many times the noise of a record inside them: N within 4 of its sd (test_cases_priors.py has the parts)."""
     columns = {name: (unit, size * (y - y.mean())) for name, (unit, y) in quiet(7, 10.0, 300.0, ("gx", "gy")).items()}
     save(tmp_path / "log.npz", columns, 10.0)
     for name, axis in identify(tmp_path / "log.npz", suspicion=False)["axes"].items():

@@ -384,7 +384,7 @@ def test_a_record_shorter_than_a_bank_interval(tmp_path: Path, option: dict[str,
         ({"min": 1e-3, "max": 1.00000001e-3}, r"N: min and max must differ, within 1e-20 to"),
     ],
 )
-def test_priors_that_the_library_cannot_hold(tmp_path: Path, limits: dict[str, float], said: str) -> None:
+def test_cases_priors_that_the_library_cannot_hold(tmp_path: Path, limits: dict[str, float], said: str) -> None:
     path = tmp_path / "model.yaml"
     text = MODEL.path.read_text()
     stated = "N: {law: log_uniform, min: 1.0e-3, max: 0.5}"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_priors import at_rest, deviation, write
+from test_cases_priors import at_rest, deviation, write
 
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Model, file_of, parts

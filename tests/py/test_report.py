@@ -200,7 +200,7 @@ def constant_by_integration(
         pytest.param(20, 3, 1.0, 10.0, 1.0, REPORT_LIMIT, id="three of them, and 20 samples"),
     ],
 )
-def test_priors_that_say_as_much_as_the_record(
+def test_cases_priors_that_say_as_much_as_the_record(
     n: int, columns: int, spread: float, bias_sd: float, bias: float, limit: Floats | tuple[float, ...]
 ) -> None:
     """Against direct integration: sigma_v's mode is that of a fit under the priors of bias and coefficients. Its shape
