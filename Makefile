@@ -28,6 +28,7 @@
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make setup-packages         what packs lib/ for the registries of PlatformIO and ESP-IDF (70 MB)
 #   make docs                   these pages, the header and the Python functions as a site, build/docs/site/index.html
+#   make wheel                  source archive and wheel of the Python package into build/wheel
 #   make lock [UPGRADE=1 | UPGRADE=name]
 #                               versions and hashes of the Python packages, from the names in tools/pyproject.toml
 #   make clean                  removes what was made, but for .venv
@@ -85,8 +86,8 @@ $(VENV)/requirements.stamp: tools/requirements.txt | system
 	@touch $@
 
 # Installed in place: Python sources need no new set-up, C and C++ ones do.
-$(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt $(wildcard tools/bindings/*) \
-            $(wildcard host_sim/*) $(wildcard lib/*.[ch])
+$(PACKAGE): $(VENV)/requirements.stamp tools/pyproject.toml tools/CMakeLists.txt \
+            $(wildcard tools/bindings/*.* tools/bindings/*/* host_sim/* lib/*.[ch] port/*.h port/app/app* port/replay/*)
 	@echo "selfcal into $(VENV): its C and C++ is compiled (a minute)"
 	$(BIN)/python -m pip install --no-build-isolation --no-deps --editable tools
 	@touch $@
@@ -100,6 +101,13 @@ endif
 else
 $(PACKAGE) $(UNITY): setup ;
 endif
+
+# The wheel out of the archive, so that both are whole.
+.PHONY: wheel
+wheel: setup
+	@rm -rf $(BUILD)/wheel && mkdir -p $(BUILD)/wheel
+	cd tools && ../$(BIN)/python -c 'import scikit_build_core.build as build; build.build_sdist("../$(BUILD)/wheel")'
+	$(BIN)/python -m pip wheel --no-build-isolation --no-deps --wheel-dir $(BUILD)/wheel $(BUILD)/wheel/*.tar.gz
 
 # Versions and hashes anew, from the names in tools/pyproject.toml. A package that has a version keeps it: UPGRADE=1
 # takes the newest of all, UPGRADE=numpy of one.

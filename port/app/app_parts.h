@@ -63,7 +63,8 @@ static inline bool app_begin_answer(app_t *app, uint32_t now)
 /* app_reports.c: one axis after the other, in slices */
 
 /* The stage of the report under way: none, its status, the axes, the end. */
-enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2, STAGE_END = STAGE_AXES + SELFCAL_MODEL_AXES };
+enum { STAGE_NONE = 0, STAGE_STATUS = 1, STAGE_AXES = 2 };
+#define STAGE_END (STAGE_AXES + SELFCAL_MODEL_AXES)
 
 /* One slice of the axis's report. */
 void app_compute(app_t *app);

@@ -42,7 +42,7 @@ const char *replay_next(replay_t *replay)
     if (replay->waiting || replay->rows == 0) {
         return NULL;
     }
-    if (!replay->read(replay->context, replay->row, sizeof replay->row)) {
+    if (!replay->read(replay->context, replay->row, 4U + 4U * REPLAY_VALUES)) {
         return "the recording is shorter than it says";
     }
     replay->rows--;

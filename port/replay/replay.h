@@ -14,10 +14,9 @@
 #include "port.h"
 #include "selfcal_model.h"
 
-enum {
-    REPLAY_VALUES = SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + PORT_SIDE,
-    REPLAY_ROW_BYTES = 4 + 4 * REPLAY_VALUES
-};
+/* Values of a row, and bytes of the longest one: a regressor takes a channel at most. */
+#define REPLAY_VALUES (SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + PORT_SIDE)
+enum { REPLAY_ROW_BYTES = 4 + 4 * (SELFCAL_AXES_MAX + SELFCAL_REGRESSORS_MAX + PORT_SIDE) };
 
 typedef struct {
     bool (*read)(void *context, void *bytes, size_t count); /* exactly `count` bytes; false: there are not so many */

@@ -149,6 +149,41 @@ def test_the_shocks_of_run_4_do_not_reach_the_bank() -> None:
             assert noise[0] == pytest.approx(noise[1], rel=0.08), name
 
 
+REGRESSORS = """
+regressors:
+  - {name: warm, kind: column, column: temp, unit: degC, reference: 25, window_s: 10, sd: {gyro: 0.02, accel: 0.05}}
+  - {name: follows, kind: column, column: ay, unit: m/s^2, reference: 0, sd: {gyro: 0.02}, probability: 0.3}
+  - {name: ramp, kind: time, sd: {gyro: 1e-5}}
+  - {name: settling, kind: turn_on, tau_s: 250, sd: {gyro: 1}}
+"""
+HANDLE = "handle: {outlier_sd: 6, steps: true, variance_changes: true}\nhalf_life_s: 4000\n"
+
+
+@pytest.mark.parametrize(("more", "gate", "axes"), [(REGRESSORS, False, ("gz", "ax")), (HANDLE, True, ("gx",))])
+def test_the_application_in_this_process_is_the_program(
+    more: str, gate: bool, axes: tuple[str, ...], tmp_path: Path
+) -> None:
+    """The program that is compiled for a model and speaks SLCAN: the same document to the last digit. The record has a
+    gap, a step, outliers and shaking; its times count from power-on."""
+    (tmp_path / "model.yaml").write_text(Model.load().path.read_text() + more)
+    shipped = load(SHIPPED)
+    columns = {name: (one.unit, one.values[:9000].copy()) for name, one in shipped.columns.items() if name != "t"}
+    columns["gx"][1][5000:] += 0.4
+    columns["gx"][1][::900] += 5.0
+    columns["gx"][1][2000:2100] += 20.0 * np.sin(np.arange(100.0))
+    at = np.arange(9000) + 70 * (np.arange(9000) >= 3000)
+    recording_module.save(tmp_path / "log.npz", columns, shipped.rate_hz, {}, t=at / shipped.rate_hz)
+    here, program = (
+        replay(
+            tmp_path / "log.npz", axes=axes, model=tmp_path / "model.yaml", gate=gate, report_every=100.0,
+            since_power_on_s=30.0, transport=transport,
+        )
+        for transport in (None, "slcan")
+    )  # fmt: skip
+    assert here == program
+    assert all("error" not in here["axes"][name] for name in axes)
+
+
 def test_replay_is_the_library_over_the_wire(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,7 +40,7 @@ COMMAND = (sys.executable, "-m", "selfcal.cli")
 def test_replay_over_can_is_replay_over_slcan(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Frames as python-can's udp_multicast takes them, none lost at the pace of the bus."""
     log = part_of_shipped(tmp_path / "part.npz", 330.0)
-    over_slcan = replay(log, axes=("gx", "az"), report_every=60.0)
+    over_slcan = replay(log, axes=("gx", "az"), report_every=60.0, transport="slcan")
     capfd.readouterr()
     assert replay(log, axes=("gx", "az"), report_every=60.0, transport="can") == over_slcan
     assert f"frames: {6 * (46 + 2 * 52) + 46} received, 0 lost" in capfd.readouterr().err

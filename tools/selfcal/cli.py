@@ -508,7 +508,9 @@ def replay(
     model: ModelFile = None,
     start: From = None,
     target: Annotated[Target, typer.Option(help="Where the firmware runs: here, or in QEMU")] = Target.host,
-    transport: Annotated[Transport, typer.Option(help="How its frames travel")] = Transport.slcan,
+    transport: Annotated[
+        Transport | None, typer.Option(help="Compile a program for this machine, whose frames travel so")
+    ] = None,
     channel: Annotated[
         str, typer.Option(metavar="NAME", help="With --transport can: a CAN device; default: UDP on this machine")
     ] = "",
@@ -532,7 +534,7 @@ def replay(
         model=model,
         start=start,
         target=target.value,
-        transport=transport.value,
+        transport=transport.value if transport else None,
         channel=channel,
         report_every=report_every,
         gate=gate,

@@ -58,7 +58,8 @@ class Source(Protocol):
 
     @property
     def malformed(self) -> int: ...
-    closed: bool
+    @property
+    def closed(self) -> bool: ...
 
 
 class Contact:

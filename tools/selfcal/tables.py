@@ -150,6 +150,12 @@ class Tables:
         taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
         return tuple(one for one in taken if one not in axes)
 
+    def source_of(self, column: RegressorTable) -> tuple[int, int, float, float]:
+        """`selfcal_source_t` of a column: kind, place of its channel (the axes' readings, then `channels`), numbers."""
+        kind, number, second, name, unit = column.source
+        places = [*((axis.name, axis.unit) for axis in self.axes), *self.channels]
+        return kind, places.index((name, unit)) if name else 0, number, second
+
     @property
     def term_nodes(self) -> int:
         """Filters of the laws that are sums."""

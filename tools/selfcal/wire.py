@@ -46,8 +46,9 @@ FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a
 RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
 
 
-#: Root of the source tree: the package is used in place.
-ROOT = Path(__file__).resolve().parents[2]
+#: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
+TREE = Path(__file__).resolve().parent / "tree"
+ROOT = TREE if TREE.is_dir() else TREE.parents[2]
 
 
 @lru_cache(maxsize=1)

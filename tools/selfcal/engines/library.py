@@ -32,6 +32,20 @@ def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] 
     return [column.reference for column in columns], sd, mean
 
 
+def arguments(tables: Tables) -> tuple[Any, ...]:
+    """The model as the bindings take it (bindings/tables.hpp)."""
+    return (
+        tables.dt_s,
+        tables.block,
+        [(list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit) for a in tables.axes],
+        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
+        tables.id,
+        _regressors(tables),
+        tables.half_life_s,
+        tables.handling.as_tuple,
+    )
+
+
 class Bank:
     """A bank over the axes of `tables`.
 
@@ -55,16 +69,7 @@ class Bank:
         build = _dense if dense else _library64 if double else _coarse if coarse else _library32
         if fixed:
             build = _fixed
-        self.raw: Any = build.Bank(
-            tables.dt_s,
-            tables.block,
-            [(list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit) for a in tables.axes],
-            [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
-            tables.id,
-            _regressors(tables),
-            tables.half_life_s,
-            tables.handling.as_tuple,
-        )
+        self.raw: Any = build.Bank(*arguments(tables))
         if offset:
             self.raw.shift(0, -offset)
 

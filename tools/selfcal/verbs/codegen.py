@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from selfcal.errors import UserError, remark
@@ -104,13 +105,7 @@ def assumption(tables: Tables) -> str:
 def write_tables(model: Model, tables: Tables, folder: Path, target: str, start: str = "") -> None:
     """Write the files into `folder`, the sizes as for a core. `start`: where measured priors come from. Raises
     UserError if it cannot be written, or if a regressor has a form that the library does not make."""
-    for one in model.regressors:
-        if not one.on_module:
-            what = f"form: {one.form}" if one.form == "play" else f"input: {one.input}"
-            raise UserError(
-                f"{model.path}: regressor '{one.name}': no module makes `{what}`: leave the regressor out, or take "
-                "`identify`, which does"
-            )
+    check_forms(model)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -122,6 +117,17 @@ def write_tables(model: Model, tables: Tables, folder: Path, target: str, start:
     ):
         with whole(folder / name) as file:
             file.write_text(text, encoding="utf-8")
+
+
+def check_forms(model: Model) -> None:
+    """Raises UserError for a regressor of a form that no module makes."""
+    for one in model.regressors:
+        if not one.on_module:
+            what = f"form: {one.form}" if one.form == "play" else f"input: {one.input}"
+            raise UserError(
+                f"{model.path}: regressor '{one.name}': no module makes `{what}`: leave the regressor out, or take "
+                "`identify`, which does"
+            )
 
 
 def sizes(tables: Tables, target: str) -> dict[str, int]:
@@ -290,8 +296,11 @@ def _source(model: Model, tables: Tables) -> str:
 
 
 def _f(value: float) -> str:
-    """A float32 literal that reads back exactly."""
-    return f"{value:.9g}{'' if any(c in f'{value:.9g}' for c in '.en') else '.0'}F"
+    """A literal that reads back as the float32 nearest to `value`, which the package's builds take."""
+    text = f"{value:.9g}"
+    if np.float32(text) != np.float32(value):  # rounded twice
+        text = f"{np.float32(value):.9g}"
+    return f"{text}{'' if any(c in text for c in '.en') else '.0'}F"
 
 
 def _grid(grid: Grid) -> str:
@@ -343,9 +352,7 @@ def _regressors(tables: Tables) -> list[str]:
 
 
 def _column_source(tables: Tables, column: RegressorTable) -> str:
-    kind, number, second, name, unit = column.source
-    places = [*((axis.name, axis.unit) for axis in tables.axes), *tables.channels]
-    channel = places.index((name, unit)) if name else 0
+    kind, channel, number, second = tables.source_of(column)
     return f"{{SELFCAL_COLUMN_{COLUMN_KINDS[kind]}, {channel}U, {_f(number)}, {_f(second)}}}"
 
 
@@ -382,8 +389,7 @@ def _law(hypothesis: HypothesisTable) -> list[str]:
     terms, coloured = hypothesis.law.as_tuple
     flag = ("false", "true")
     rows = [
-        f"    {{SELFCAL_{KINDS[kind].upper()}, {_f(deviation)}, {_f(bandwidth)}, {flag[stated]}, "
-        f"{flag[by_ratio]}}},"
+        f"    {{SELFCAL_{KINDS[kind].upper()}, {_f(deviation)}, {_f(bandwidth)}, {flag[stated]}, {flag[by_ratio]}}},"
         for kind, deviation, bandwidth, stated, by_ratio in terms
     ]
     head = f"static const selfcal_law_t law_{hypothesis.name} = {{{len(terms)}U, {flag[coloured]}, {{"

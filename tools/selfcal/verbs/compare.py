@@ -19,6 +19,7 @@ from selfcal.errors import UserError, called, printable
 from selfcal.fail_on import CHANGED, check
 from selfcal.loaders import Reading
 from selfcal.result import HALF_90
+from selfcal.results import Comparison
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
@@ -41,7 +42,7 @@ def compare(
     gate: bool = False,
     json: Path | str | None = None,
     **reading: Unpack[Reading],
-) -> dict[str, Any]:
+) -> Comparison:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
@@ -89,7 +90,7 @@ def compare(
     if none:
         told = "; ".join(f"{name}: {', '.join(one.errors)}" for name, one in compared.items())
         raise UserError(f"no axis can be compared ({told})")
-    return document
+    return Comparison(document)
 
 
 @dataclass

@@ -29,6 +29,7 @@ from selfcal.output import write_text
 from selfcal.priors import add_sources, for_record
 from selfcal.progress import Doing
 from selfcal.recording import Recording, list_of, load
+from selfcal.results import Diagnosis
 from selfcal.table import since
 from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
 
@@ -57,7 +58,7 @@ def diagnose(
     since_power_on_s: float = 0.0,
     gate: bool = False,
     **reading: Unpack[Reading],
-) -> dict[str, Any]:
+) -> Diagnosis:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
 
     `axes`: those reported on; every other column may explain them. A long recording is looked at twice: first its means
@@ -139,7 +140,7 @@ def diagnose(
                 write_page(report, document, record, found, given)
     if json is not None:
         write_json(document, json)
-    return document
+    return Diagnosis(document)
 
 
 def _add_carried(

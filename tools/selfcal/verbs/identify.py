@@ -32,6 +32,7 @@ from selfcal.recording import Recording, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
+from selfcal.results import Identification
 from selfcal.tables import make_tables
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
@@ -62,7 +63,7 @@ def identify(
     since_power_on_s: float = 0.0,
     gate: bool = False,
     **reading: Unpack[Reading],
-) -> dict[str, Any]:
+) -> Identification:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
 
     `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU)
@@ -141,7 +142,7 @@ def identify(
 
         plot_allan(document, plot, datasheet=datasheet)
         console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
-    return document
+    return Identification(document)
 
 
 def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s: float | None, gate: bool) -> Recording:

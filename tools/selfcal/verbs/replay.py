@@ -7,13 +7,14 @@ import hashlib
 import math
 import os
 import re
+import shlex
 import shutil
 import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -28,6 +29,7 @@ from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
 from selfcal.ending import held
 from selfcal.errors import OutsidePriors, UserError, called, note
+from selfcal.firmware import Played
 from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
 from selfcal.loaders import Reading
@@ -50,14 +52,15 @@ from selfcal.regressors import (
     offered,
 )
 from selfcal.result import AxisResult, in_unit
-from selfcal.tables import bank_block, make_tables
+from selfcal.results import Identification
+from selfcal.tables import Tables, bank_block, make_tables
 from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
-from selfcal.verbs.codegen import write_tables
+from selfcal.verbs.codegen import check_forms, write_tables
 from selfcal.verbs.identify import chosen_axes, with_reasons
 from selfcal.warm import Start, warmed
 from selfcal.warm import load as load_start
-from selfcal.wire import AXES, ROOT, AxisReport, Decoder, Link, names_of, open_bus, reasons
+from selfcal.wire import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
 
 MAGIC = b"SELFCAL2"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
@@ -69,6 +72,13 @@ LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
 EMULATED_TIMEOUT_S = 600.0
 #: What a firmware is made of, and variables of the environment that its `make` file takes.
 SOURCES = (".c", ".h", ".ld", ".mk")
+#: Debian's packages of the programs that it takes to build and to run it.
+PROGRAMS = {
+    "make": "make",
+    "cc": "gcc libc6-dev",
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
+    "qemu-system-arm": "qemu-system-arm",
+}
 BUILD_SETTINGS = ("CC", "POSIX_CFLAGS", "QEMU_CFLAGS")
 
 
@@ -83,6 +93,16 @@ class Target:
     image: str
     reports: int
     board: tuple[str, ...] = ()
+
+    @property
+    def programs(self) -> tuple[str, ...]:
+        """Of PROGRAMS, those that it takes."""
+        return ("make", "arm-none-eabi-gcc", "qemu-system-arm") if self.board else ("make", "cc")
+
+    @property
+    def patience_s(self) -> float:
+        """s that it may be silent."""
+        return EMULATED_TIMEOUT_S if self.board else TIMEOUT_S
 
 
 TARGETS = {
@@ -100,7 +120,7 @@ def replay(
     model: Path | str | None = None,
     start: Path | str | None = None,
     target: str = "host",
-    transport: str = "slcan",
+    transport: str | None = None,
     channel: str = "",
     report_every: float | None = None,
     gate: bool = False,
@@ -110,22 +130,23 @@ def replay(
     json: Path | str | None = None,
     plot: Path | str | None = None,
     **reading: Unpack[Reading],
-) -> dict[str, Any]:
+) -> Identification:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
-    The firmware is built for the model and the recording's rate if it is not there yet. `start`: the file that
-    `diagnose --json` wrote with the model; its posteriors are the module's priors. `target`: this machine, or a
-    processor emulated by QEMU. `transport`: SLCAN over a pseudo-terminal, or `can`: frames over UDP within this machine
-    at the pace of a bus of 500 kbit/s, or over the CAN device `channel`. `report_every`: seconds of the recording
-    between reports, one bank interval at least (default: a hundredth of it on the host, a tenth on the cortex-m4f, all
-    of it on the cortex-m0). `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves
-    time passes as a gap. `start_s`, `end_s`: the stretch of the recording to play, s; the firmware's clock begins with
-    it. `since_power_on_s`: from power-on to the recording's beginning, s. `plot`: file for the picture of the run.
+    `start`: the file that `diagnose --json` wrote with the model; its posteriors are the module's priors.
+    `target`: this process, or a processor emulated by QEMU; its firmware is compiled if it is not there yet.
+    `transport` compiles a program for this machine too. Its frames leave by `slcan` over a pseudo-terminal, or by
+    `can`: UDP within this machine at the pace of a bus of 500 kbit/s, or the CAN device `channel`.
+    `report_every`: seconds of the recording between reports, one bank interval at least (default: a hundredth of it on
+    the host, a tenth on the cortex-m4f, all of it on the cortex-m0).
+    `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves time passes as a gap.
+    `start_s`, `end_s`: the stretch of the recording to play, s; the firmware's clock begins with it.
+    `since_power_on_s`: from power-on to the recording's beginning, s. `plot`: file for the picture of the run.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
-    if transport not in ("slcan", "can"):
+    if transport not in (None, "slcan", "can"):
         raise UserError(f"--transport {transport}: no such transport (there are slcan, can)")
     if transport == "can" and TARGETS[target].board:
         raise UserError("--transport can: an emulated board has a serial line alone; take --target host")
@@ -160,8 +181,13 @@ def replay(
     if gate:
         gate_of(recording, loaded_model, tuple(names))
     sent_model, rows = sent(loaded_model, recording, taken) if foreign else (loaded_model, recording)
-    firmware = build(sent_model, recording.rate_hz, list(taken.values()), target, start=known)
-    told, said = run(firmware, rows, sent_model, list(taken.values()), report_every, target, gate, transport, channel)
+    on_wire = list(taken.values())
+    if target == "host" and transport is None:
+        told, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
+    else:
+        firmware = build(sent_model, recording.rate_hz, on_wire, target, start=known)
+        how = transport or "slcan"
+        told, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
     history = {name: [replace(one, axis=name) for one in told[at]] for name, at in taken.items() if at in told}
     why = {name: said[at] for name, at in taken.items() if at in said}
     document = _document(recording, loaded_model, history, why, gate)
@@ -178,7 +204,12 @@ def replay(
         known_truth = truth if isinstance(truth, dict) else None
         plot_run(history, plot, title, known_truth, units, names_of(loaded_model), sent_in=own)
         note(f"plot: {plot}")
-    return document
+    return Identification(document)
+
+
+def tables_of(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
+    """Of a firmware, with measured priors from `start`."""
+    return warmed(make_tables(model, rate_hz, tuple(axes), target), start)
 
 
 def build(
@@ -198,10 +229,11 @@ def build(
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         tables = Path(name)
-        made = warmed(make_tables(model, rate_hz, tuple(axes), nodes or target), start)
+        made = tables_of(model, rate_hz, axes, nodes or target, start)
         write_tables(model, made, tables, nodes or target, start.of if start is not None else "")
         key = _content(tables, made_by.make)
-        folder = ROOT / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
+        root = workshop()
+        folder = root / "build" / made_by.make / (key if target == "host" else f"{target}-{key}")
         folder.parent.mkdir(parents=True, exist_ok=True)
         with folder.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -210,7 +242,7 @@ def build(
                 shutil.rmtree(part, ignore_errors=True)  # a build that was killed leaves it
                 try:
                     shutil.copytree(tables, part)
-                    _make(made_by.make, target, part.relative_to(ROOT))
+                    _make(made_by.make, target, root, part.relative_to(root))
                     part.rename(folder)
                 except BaseException:
                     shutil.rmtree(part, ignore_errors=True)
@@ -218,31 +250,72 @@ def build(
     return folder / made_by.image
 
 
+def workshop() -> Path:
+    """The folder that firmware is made in: the source tree, or an installed wheel's copy of it in the user's cache,
+    named by its content. Raises UserError if that cannot be written."""
+    if not TREE.is_dir():
+        return ROOT
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "selfcal"
+    folder = cache / _digest([file for part in ("lib", "port") for file in sorted((TREE / part).rglob("*.*"))])
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        if not folder.is_dir():
+            with tempfile.TemporaryDirectory(dir=cache) as name:
+                for part in ("lib", "port"):
+                    shutil.copytree(TREE / part, Path(name) / "tree" / part)
+                with suppress(FileExistsError):  # another was faster
+                    (Path(name) / "tree").rename(folder)
+    except OSError as error:
+        what = f"cannot make firmware there: {error.strerror} (XDG_CACHE_HOME names another place)"
+        raise UserError(f"{cache}: {what}") from error
+    return folder
+
+
 def _content(tables: Path, name: str) -> str:
     """Names what a firmware is made of: its tables, every source, and settings that its `make` file takes."""
     folders = [ROOT / "lib", ROOT / "port", *(ROOT / "port" / part for part in ("app", "replay", name)), tables]
     files = [file for folder in folders for file in sorted(folder.glob("*.*")) if file.suffix in SOURCES]
-    said = hashlib.sha256(repr([os.environ.get(setting) for setting in BUILD_SETTINGS]).encode())
+    return _digest(files, repr([os.environ.get(setting) for setting in BUILD_SETTINGS]))
+
+
+def _digest(files: Sequence[Path], more: str = "") -> str:
+    """Names the content of `files`."""
+    said = hashlib.sha256(more.encode())
     for file in files:
         said.update(f"\0{file.name}\0".encode())
         said.update(hashlib.sha256(file.read_bytes()).digest())
     return said.hexdigest()[:16]
 
 
-def _make(name: str, target: str, folder: Path) -> None:
-    """Make a firmware in `folder`, which is relative to ROOT: a checkout's own path may hold spaces."""
+def _make(name: str, target: str, root: Path, folder: Path) -> None:
+    """Make a firmware in `folder`, which is relative to `root`: a path to that may hold spaces."""
+    check_programs(target)
     command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
     # Of a `make` around this program nothing is passed on: neither its options nor its variables.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
         command.append(f"CORE={target}")
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
     except OSError as error:
         raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
     if done.returncode != 0:
         complaint = _complaint(done.stderr)
         remedy = ": take fewer axes (--axis), laws or nodes" if "does not fit the RAM" in complaint else ""
         raise UserError(f"cannot build the firmware: {complaint}{remedy}")
+
+
+def check_programs(target: str) -> None:
+    """Raises UserError where a program is missing that the firmware of `target` is built or run by."""
+    chosen = shlex.split(os.environ.get("CC", ""))  # with its options
+    asked = {name: chosen[0] if name == "cc" and chosen else name for name in TARGETS[target].programs}
+    missing = [name for name, program in asked.items() if shutil.which(program) is None]
+    if missing:
+        packages = " ".join(PROGRAMS[name] for name in missing)
+        what = f"firmware for the {target}" if TARGETS[target].board else "a program for this machine"
+        raise UserError(
+            f"{what} is compiled, and there is no {' and no '.join(missing)} here: on Debian `apt install {packages}`; "
+            "plain `replay` compiles nothing"
+        )
 
 
 def _complaint(said: str) -> str:
@@ -292,9 +365,7 @@ def run(
 ) -> tuple[dict[str, list[AxisReport]], dict[str, str]]:
     """Play the recording through the firmware; the complete reports of each axis, and why axes have no calibration to
     rely on at the end. Prints the frame counts, and the gate's."""
-    bank_s = bank_block(recording.rate_hz, model.bank_rate_hz) / recording.rate_hz
-    wanted_s = report_every or min(recording.duration_s / TARGETS[target].reports, LONGEST_PERIOD_S)
-    period_s = max(wanted_s, bank_s)  # between two bank samples nothing changes
+    period_s = period_of(recording, model, report_every, target)
     history: dict[str, list[AxisReport]] = {name: [] for name in axes}
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
@@ -311,13 +382,49 @@ def run(
                 # The firmware is ready at once: python-can's pause after opening is for modules that restart.
                 link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
             if link is not None and wire:
-                _watch(link, decoder, recording, model, history, target, module)
+                _watch(link, decoder, recording, model, history, module, TARGETS[target].patience_s)
                 link.close_channel()  # the emulator forgets what it holds of a line that is closed
             said = before + _ending(module)
         if module.returncode != 0 or not decoder.finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
             raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
     return history, reasons(decoder.status, decoder.corrected)
+
+
+def run_here(
+    recording: Recording,
+    model: Model,
+    axes: Sequence[str],
+    report_every: float | None,
+    gate: bool = False,
+    start: Start | None = None,
+) -> tuple[dict[str, list[AxisReport]], dict[str, str]]:
+    """As `run`, by the application in this process. Nothing is compiled."""
+    check_forms(model)
+    tables = tables_of(model, recording.rate_hz, axes, "host", start)
+    period_s = period_of(recording, model, report_every, "host")
+    history: dict[str, list[AxisReport]] = {name: [] for name in axes}
+    with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
+        rows = Path(name) / "rows.bin"
+        write_rows(recording, model, axes, rows)
+        decoder = Decoder(from_start=True)
+        try:
+            _watch(Played(model, tables, rows, ms(period_s), gate), decoder, recording, model, history)
+        except ValueError as error:  # std::invalid_argument
+            raise UserError(f"{recording.path}: {error}") from error
+    return history, reasons(decoder.status, decoder.corrected)
+
+
+def period_of(recording: Recording, model: Model, report_every: float | None, target: str) -> float:
+    """Seconds between reports."""
+    bank_s = bank_block(recording.rate_hz, model.bank_rate_hz) / recording.rate_hz
+    wanted_s = report_every or min(recording.duration_s / TARGETS[target].reports, LONGEST_PERIOD_S)
+    return max(wanted_s, bank_s)  # between two bank samples nothing changes
+
+
+def ms(period_s: float) -> int:
+    """A period in whole milliseconds, as port/posix/main.c rounds what it is given."""
+    return math.ceil(float(f"{period_s:.6f}") * 1000.0)
 
 
 def can_bus(channel: str, port: int | None = None) -> tuple[str, Link]:
@@ -402,27 +509,25 @@ def running(
 
 def emulator(firmware: Path, rows: str, period_s: float, target: str, uart: str, gate: bool = False) -> list[str]:
     """QEMU's command line for a firmware over the file `rows` of its folder; `uart`: a -chardev with id=uart."""
-    period_ms = math.ceil(float(f"{period_s:.6f}") * 1000.0)  # as port/posix/main.c rounds it
     return [
         *("qemu-system-arm", "-M", *TARGETS[target].board, "-display", "none", "-monitor", "none"),
         *("-chardev", uart, "-serial", "chardev:uart", "-kernel", str(firmware)),
         "-semihosting-config",
-        f"enable=on,target=native,arg=selfcal,arg={rows},arg={period_ms}" + (",arg=gate" if gate else ""),
+        f"enable=on,target=native,arg=selfcal,arg={rows},arg={ms(period_s)}" + (",arg=gate" if gate else ""),
     ]
 
 
 def _watch(
-    link: Link,
+    link: Link | Played,
     decoder: Decoder,
     recording: Recording,
     model: Model,
     history: dict[str, list[AxisReport]],
-    target: str,
-    module: subprocess.Popen[str],
+    module: subprocess.Popen[str] | None = None,
+    patience_s: float = math.inf,
 ) -> None:
     """Follow the telemetry until the module has finished, or fallen silent. Of `history` retired axes without a report
-    are taken out."""
-    patience_s = EMULATED_TIMEOUT_S if TARGETS[target].board else TIMEOUT_S
+    are taken out. `module`: its program, if it has one."""
     whole: dict[str, bool] = {}  # the axis's last report
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s, names=lambda status: names_of(model)) as view:
@@ -431,7 +536,8 @@ def _watch(
             frame = link.recv(1.0)
             if frame is None:
                 silent_s = time.monotonic() - heard
-                if link.closed or silent_s > patience_s or (module.poll() is not None and silent_s > GONE_S):
+                ended = module is not None and module.poll() is not None
+                if link.closed or silent_s > patience_s or (ended and silent_s > GONE_S):
                     break
                 continue
             heard = time.monotonic()

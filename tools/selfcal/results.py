@@ -1,0 +1,197 @@
+"""The results of `identify`, `replay`, `diagnose` and `compare`: their JSON objects, with the keys as attributes.
+
+Each is a dict with the keys that tools/README.md lists under "JSON". `found["axes"]["gx"]["bias_now"]` and
+`found.axes["gx"].bias_now` are the same. An attribute whose annotation has None is None where the key is absent; any
+other absent key raises AttributeError, with the reason of an axis that has no result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+
+class Object(dict[str, Any]):
+    """A JSON object. A value becomes what its annotation in the class says, however deep."""
+
+    def __init__(self, entries: Mapping[str, Any]) -> None:
+        hints = _hints(type(self))
+        super().__init__({key: _typed(value, hints.get(key, Any)) for key, value in entries.items()})
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self:
+            return self[name]
+        hint = _hints(type(self)).get(name)
+        if NoneType in get_args(hint):
+            return None
+        said = f": {self['error']}" if hint is not None and "error" in self else ""
+        raise AttributeError(f"'{type(self).__name__}' has no '{name}'{said}")
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *_hints(type(self)), *self]
+
+
+@lru_cache(maxsize=64)
+def _hints(of: type[Object]) -> dict[str, Any]:
+    return get_type_hints(of)
+
+
+def _typed(value: Any, hint: Any) -> Any:
+    """`value` with the classes of `hint`; as it is where that does not fit it."""
+    if isinstance(hint, UnionType):
+        hint = next((one for one in get_args(hint) if isinstance(value, get_origin(one) or _shape(one))), Any)
+    arguments = get_args(hint)
+    if get_origin(hint) is dict and isinstance(value, Mapping):
+        return {key: _typed(entry, arguments[1]) for key, entry in value.items()}
+    if get_origin(hint) is list and isinstance(value, list):
+        return [_typed(entry, arguments[0]) for entry in value]
+    if isinstance(hint, type) and issubclass(hint, Object) and isinstance(value, Mapping):
+        return hint(value)
+    return value
+
+
+def _shape(one: Any) -> type:
+    """What a value must be to be taken for `one`."""
+    return Mapping if isinstance(one, type) and issubclass(one, Object) else one if isinstance(one, type) else object
+
+
+class Recording(Object):
+    """What was read. `start_s`: where in the recording its first sample is; `notes`: what was found in the file."""
+
+    path: str
+    rate_hz: float
+    samples: int | None
+    duration_s: float
+    start_s: float
+    since_power_on_s: float | None
+    paths: list[str] | None
+    options: list[Any] | None
+    notes: list[str] | None
+
+
+class Posterior(Object):
+    """Of one parameter under one law, in `unit`; q05 and q95 bound the 90 % interval. `identified`: the record says
+    more than the prior. `off_grid`: the truth may lie beyond what the model's grid of nodes can show."""
+
+    mean: float
+    median: float
+    sd: float
+    q05: float
+    q95: float
+    unit: str
+    identified: bool
+    off_grid: bool | None
+
+
+class Bias(Object):
+    """x0 + drift at the last sample, in `unit`."""
+
+    mean: float
+    sd: float
+    unit: str
+
+
+class Check(Object):
+    """One check of the likeliest law."""
+
+    value: float | None
+    limit: float | None
+    passed: bool
+
+
+class IdentifiedAxis(Object):
+    """One axis of `identify` or `replay`, or `error` alone. Probabilities and ln evidence (nats) by law; posteriors by
+    law and parameter. `adequate`: every check passed; None where none was made. `module_says`, `module_reason` and
+    `ahead`: of `replay`."""
+
+    error: str | None
+    hypotheses: dict[str, float]
+    log_evidence: dict[str, float]
+    parameters: dict[str, dict[str, Posterior]]
+    bias_now: Bias
+    samples_kept_out: dict[str, int]
+    rate_hz: float | None
+    adequate: bool | None
+    checks: dict[str, Check]
+    suspicion: str | None
+    more_laws: dict[str, float] | None
+    allan: dict[str, Any] | None
+    regressors: dict[str, Any] | None
+    regressors_in_use: list[str] | None
+    subsets: list[Any] | None
+    module_says: dict[str, Any] | None
+    module_reason: str | None
+    ahead: dict[str, Any] | None
+
+    @property
+    def law(self) -> str:
+        """The most probable one."""
+        return max(self.hypotheses, key=lambda name: self.hypotheses[name])
+
+
+class Identification(Object):
+    """`selfcal.identify/1`."""
+
+    schema: str
+    recording: Recording
+    axes: dict[str, IdentifiedAxis]
+
+
+class Finding(Object):
+    """A cause that explains something of the record: its evidence gain in nats, its size with interval and unit, the
+    time [begin, end] in s where it has one, what it gains on held-out data, and the causes that would explain as
+    much."""
+
+    cause: str
+    words: str
+    evidence_gain_nats: float
+    net_nats: float
+    estimate: dict[str, Any]
+    when: list[float] | None
+    found_in_round: int
+    also_possible: list[str]
+    shared_with: list[str]
+    record_next: str | None
+    gain: dict[str, Any] | None
+    gain_reason: str | None
+    gain_on: dict[str, Any] | None
+    gain_on_reason: str | None
+    inflation: dict[str, float]
+    inflation_words: str
+
+
+class DiagnosedAxis(Object):
+    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model."""
+
+    error: str | None
+    unit: str
+    judged_at_hz: float
+    verdict: str
+    findings: list[Finding]
+    only_in_means: list[Finding] | None
+    not_found: list[dict[str, Any]]
+    not_judged: list[dict[str, Any]]
+    discrepancies: list[dict[str, Any]]
+    posterior: dict[str, Any] | None
+    unfinished: str | None
+
+
+class Diagnosis(Object):
+    """`selfcal.diagnose/1`. `model`: the extended model, as a model file has it."""
+
+    schema: str
+    recording: Recording
+    axes: dict[str, DiagnosedAxis]
+    model: dict[str, Any]
+
+
+class Comparison(Object):
+    """`selfcal.compare/1`. By axis the list of its changes, or {"error": ..., "changes": [...]}; `verdicts` by
+    recording and axis."""
+
+    schema: str
+    recordings: list[str]
+    axes: dict[str, Any]
+    verdicts: dict[str, dict[str, Any]]
