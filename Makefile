@@ -118,13 +118,13 @@ lock:
 	@mkdir -p $(BUILD) && $(PYTHON) -m venv --clear $(BUILD)/lock
 	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: \
 	    --requirement tools/setup/lock.txt
-	cd tools && $(UV_COMPILE) --group dev --output-file requirements.txt pyproject.toml
+	cd tools && $(UV_COMPILE) --group build --output-file requirements.txt pyproject.toml
 	cd tools && for group in $(OPTIONAL); do $(UV_COMPILE) --group $$group \
 	    --python-version 3.11 --constraint requirements.txt --output-file requirements-$$group.txt || exit 1; done
 	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --output-file requirements-all.txt pyproject.toml
 
 # Packages that few need, each group by itself: `make setup-rivals` and so on.
-OPTIONAL := rivals cluster packages docs
+OPTIONAL := dev rivals cluster packages docs
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
 	$(PIP_INSTALL) --requirement tools/requirements-$*.txt

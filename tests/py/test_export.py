@@ -63,6 +63,52 @@ def test_px4_and_vins_per_sample_values_follow_from_the_densities(log: Path, tmp
     assert float(found[2]) == pytest.approx(k / math.sqrt(RATE), rel=1e-5)
 
 
+#: What ov_core::YamlParser and Kalibr's intrinsics are asked for (open_vins, config/rpng_sim/kalibr_imu_chain.yaml).
+OPENVINS = (
+    "T_i_b", "accelerometer_noise_density", "accelerometer_random_walk", "gyroscope_noise_density",
+    "gyroscope_random_walk", "rostopic", "time_offset", "update_rate", "model",
+    "Tw", "R_IMUtoGYRO", "Ta", "R_IMUtoACC", "Tg",
+)  # fmt: skip
+#: What allan_variance_ros, scripts/analysis.py, writes.
+ALLAN_VARIANCE_ROS = (
+    "accelerometer_noise_density", "accelerometer_random_walk", "gyroscope_noise_density", "gyroscope_random_walk",
+    "rostopic", "update_rate",
+)  # fmt: skip
+
+
+def test_openvins_and_allan_variance_ros_have_their_keys_and_si_values(tmp_path: Path) -> None:
+    """Keys in the order of the programs' own files. Values: N = sd / sqrt(rate) within 4 sd of a variance of 2000 block
+    means, K = step sd / sqrt(dt) of a walk within a factor 1.5 (some 60 independent stretches), in rad
+    and m. allan_variance_ros reads K where the slope +1/2 meets 3 s, where K^2 tau / 3 is K^2."""
+    rng = np.random.default_rng(9)
+    rate, n = 8.0, 16_000
+    noise, steps = rng.standard_normal((2, n)), np.cumsum(rng.standard_normal((2, n)), axis=1)
+    gyro, accel = 0.2 * noise[0] + 2e-3 * steps[0], 3.0 * noise[1] + 0.02 * steps[1]
+    log = tmp_path / "log.csv"
+    save(log, {"gx": ("deg/s", gyro), "ax": ("mg", accel)}, rate, {})
+    for form in ("openvins", "allan_variance_ros"):
+        identify(log, export=(form, tmp_path / form))
+    text = (tmp_path / "openvins").read_text()
+    assert text.startswith("%YAML:1.0\n")  # what cv::FileStorage wants, and no other YAML reader takes
+    chain = yaml.safe_load(text.partition("\n")[2])
+    assert list(chain) == ["imu0"] and tuple(chain["imu0"]) == OPENVINS
+    file = yaml.safe_load((tmp_path / "allan_variance_ros").read_text())
+    assert tuple(file) == ALLAN_VARIANCE_ROS
+    truth = {
+        "gyroscope_noise_density": (0.2 * DEG / math.sqrt(rate), 4.0 / math.sqrt(2.0 * 2000)),
+        "accelerometer_noise_density": (3.0 * 9.80665e-3 / math.sqrt(rate), 4.0 / math.sqrt(2.0 * 2000)),
+        "gyroscope_random_walk": (2e-3 * DEG * math.sqrt(rate), 0.5),
+        "accelerometer_random_walk": (0.02 * 9.80665e-3 * math.sqrt(rate), 0.5),
+    }
+    for found in (chain["imu0"], file):
+        for name, (value, tolerance) in truth.items():
+            assert found[name] == pytest.approx(value, rel=tolerance), name
+        assert found["update_rate"] == rate and found["rostopic"].startswith("/")
+    assert np.array_equal(chain["imu0"]["T_i_b"], np.eye(4)) and np.array_equal(chain["imu0"]["Tg"], np.zeros((3, 3)))
+    for name in ("Tw", "R_IMUtoGYRO", "Ta", "R_IMUtoACC"):
+        assert np.array_equal(chain["imu0"][name], np.eye(3))
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_every_number_carries_its_unit(form: str, log: Path, tmp_path: Path) -> None:
     out = tmp_path / form

@@ -20,10 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.special import ndtri
 
 from selfcal.laws import Law, averaged
 from selfcal.model import Group
-from selfcal.result import Estimate
+from selfcal.result import HALF_90, Estimate
 
 _Floats = NDArray[np.float64]
 
@@ -36,8 +37,8 @@ _FORGOTTEN = 14.0
 #: Where the record's Allan variance and the model's are nearly one number, S - V is the small difference of two: at
 #: least this part of S is left.
 _LEAST_LEFT = 0.2
-#: Posterior draws of the band, and standard deviations to a normal's 95 % point.
-_DRAWS, _SD_OF_95 = 200, 1.6449
+#: Posterior draws of the band.
+_DRAWS = 200
 #: Averaging times of a curve.
 _PER_OCTAVE = 4
 #: Stretches without a gap, the longest ones, that the deviation of a recording's samples is made from.
@@ -308,21 +309,33 @@ def _band(
     white: float,
     block: int,
 ) -> tuple[_Floats, _Floats]:
-    """5 % and 95 % limits of the model's deviation over posterior draws: each parameter's own quantiles, and between
-    parameters the correlation that the information has."""
-    chosen = list(estimates.values())
-    sd = np.sqrt(np.diag(fit.covariance))
-    z = np.random.default_rng(1).multivariate_normal(np.zeros(sd.size), fit.covariance / np.outer(sd, sd), _DRAWS)
-    middle = np.log([e.median for e in chosen])
-    up = (np.log([e.q95 for e in chosen]) - middle) / _SD_OF_95
-    down = (middle - np.log([e.q05 for e in chosen])) / _SD_OF_95
-    draws = np.exp(middle + z * np.where(z > 0.0, up, down))
+    """5 % and 95 % limits of the model's deviation over posterior draws."""
+    draws = posterior_draws(estimates, fit.covariance, _DRAWS)
     curves = []
-    for draw in draws.tolist():
-        terms = terms_of(group.laws[law], dict(zip(estimates, draw, strict=True)), dt_s, block)
+    for row in zip(*draws.values(), strict=True):
+        terms = terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block)
         curves.append(replace(terms, variance=terms.variance * white).allan_variance(m))
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
     return low, high
+
+
+def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats, count: int) -> dict[str, _Floats]:
+    """Values [count] of each parameter of a law: its own median and quantiles, and between parameters the correlation
+    of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive recurrence:
+    Roberts 2018), so that quantiles of functions of them are smooth."""
+    chosen = list(estimates.values())
+    sd = np.sqrt(np.diag(covariance))
+    d = len(chosen)
+    root = 2.0  # of x^(d+1) = x + 1
+    for _ in range(50):
+        root = (1.0 + root) ** (1.0 / (d + 1))
+    even = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    z = ndtri(even) @ np.linalg.cholesky(covariance / np.outer(sd, sd)).T
+    middle = np.log([e.median for e in chosen])
+    up = (np.log([e.q95 for e in chosen]) - middle) / HALF_90
+    down = (middle - np.log([e.q05 for e in chosen])) / HALF_90
+    draws = np.exp(middle + z * np.where(z > 0.0, up, down))
+    return dict(zip(estimates, draws.T, strict=True))
 
 
 @dataclass(frozen=True)

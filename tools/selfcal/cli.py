@@ -219,7 +219,10 @@ def identify(
     ] = Units.recording,
     export: Annotated[
         tuple[str, Path] | None,
-        typer.Option(metavar="FORMAT FILE", help="Write noise parameters for kalibr, rotors, px4, orbslam3 or vins"),
+        typer.Option(
+            metavar="FORMAT FILE",
+            help="Write noise parameters for kalibr, rotors, px4, orbslam3, vins, openvins or allan_variance_ros",
+        ),
     ] = None,
     overbound: Annotated[
         float | None,

@@ -7,7 +7,7 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from selfcal.errors import UserError, printable
 from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
 from selfcal.regressors import Scored
-from selfcal.result import AxisResult
+from selfcal.result import AxisResult, Estimate
+from selfcal.summary import Number
 
 SCHEMA = "selfcal.identify/1"
 
@@ -27,7 +28,8 @@ SCHEMA = "selfcal.identify/1"
 class Identified:
     """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
     known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
-    its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`."""
+    its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the
+    `summary`."""
 
     unit: str
     group_unit: str
@@ -36,6 +38,7 @@ class Identified:
     kept_out: Mapping[str, int]
     scored: Scored | None = None
     sampled: Sampled | None = None
+    summary: Mapping[str, Number] = field(default_factory=dict)
 
     @property
     def adequate(self) -> bool:
@@ -110,6 +113,7 @@ def to_document(
             name: {"error": reasons[name]}
             if isinstance(axis, UserError)
             else {
+                **_summary(axis),
                 "hypotheses": dict(axis.result.probability),
                 "log_evidence": dict(axis.result.log_evidence),
                 "parameters": parameters_entry(axis),
@@ -143,11 +147,7 @@ def parameters_entry(axis: Identified) -> dict[str, Any]:
     return {
         law: {
             parameter: {
-                "mean": e.mean,
-                "median": e.median,
-                "sd": e.sd,
-                "q05": e.q05,
-                "q95": e.q95,
+                **_spread(e),
                 "unit": units.parameter_unit(parameter, axis.unit),
                 "identified": e.identified,
                 "off_grid": e.off_grid,
@@ -156,6 +156,23 @@ def parameters_entry(axis: Identified) -> dict[str, Any]:
         }
         for law, estimates in axis.result.parameters.items()
     }
+
+
+def _summary(axis: Identified) -> dict[str, Any]:
+    """The numbers of a data sheet, in the recording's units and in data sheets' own; nothing where there are none."""
+    if not axis.summary:
+        return {}
+    found: dict[str, Any] = {}
+    for key, number in axis.summary.items():
+        unit, sheet = units.parameter_unit(key, axis.unit), units.datasheet_unit(key, axis.unit)
+        own = number.estimate.scaled(units.factor(axis.group_unit, axis.unit))
+        found[key] = {**_spread(own), "unit": unit, "identified": own.identified, "reason": number.reason or None}
+        found[key]["datasheet"] = {**_spread(own.scaled(units.factor(unit, sheet))), "unit": sheet}
+    return {"summary": found}
+
+
+def _spread(e: Estimate) -> dict[str, float]:
+    return {"mean": e.mean, "median": e.median, "sd": e.sd, "q05": e.q05, "q95": e.q95}
 
 
 def _allan(axis: Identified) -> dict[str, Any] | None:

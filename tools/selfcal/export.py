@@ -157,6 +157,55 @@ def _kalibr(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     )
 
 
+def _allan_variance_ros(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
+    """`imu.yaml` of that package's analysis.py: its keys, in its order."""
+
+    def lines(title: str, prefix: str, kind: Kind, unit: str) -> str:
+        return (
+            f"#{title}\n"
+            f"{prefix}_noise_density: {kind.number('N')} # {unit}/sqrt(Hz); {kind.beside('N')}\n"
+            f"{prefix}_random_walk: {kind.number('K')} # {units.per_second(unit)}/sqrt(Hz); {kind.beside('K')}\n\n"
+        )
+
+    return (
+        _head("#", gyro, accel, recording)
+        + lines("Accelerometer", "accelerometer", accel, "m/s^2")
+        + lines("Gyroscope", "gyroscope", gyro, "rad/s")
+        + "rostopic: '/sensors/imu' #Make sure this is correct\n"
+        + f"update_rate: {float(recording['rate_hz']):.10g} # Hz\n"
+    )
+
+
+def _openvins(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
+    """`kalibr_imu_chain.yaml`: the keys that its parser wants of imu0, intrinsics those of a perfect IMU."""
+
+    def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
+        return f"  {name}: {kind.number(parameter)}  # {unit}; {kind.beside(parameter)}\n"
+
+    def matrix(name: str, size: int, diagonal: float) -> str:
+        rows = [[diagonal if row == column else 0.0 for column in range(size)] for row in range(size)]
+        return f"  {name}:\n" + "".join(f"    - {row}\n" for row in rows)
+
+    return (
+        "%YAML:1.0\n"
+        + _head("#", gyro, accel, recording)
+        + "# A floor set by the sensor alone: OpenVINS' own files inflate such numbers for what its model leaves out.\n"
+        + "\nimu0:\n"
+        + matrix("T_i_b", 4, 1.0)
+        + line("accelerometer_noise_density", accel, "N", "m/s^2/sqrt(Hz)")
+        + line("accelerometer_random_walk", accel, "K", "m/s^3/sqrt(Hz)")
+        + line("gyroscope_noise_density", gyro, "N", "rad/s/sqrt(Hz)")
+        + line("gyroscope_random_walk", gyro, "K", "rad/s^2/sqrt(Hz)")
+        + f"  rostopic: /imu0\n  time_offset: 0.0  # s\n  update_rate: {float(recording['rate_hz']):.10g}  # Hz\n"
+        + '  model: "kalibr"\n'
+        + matrix("Tw", 3, 1.0)
+        + matrix("R_IMUtoGYRO", 3, 1.0)
+        + matrix("Ta", 3, 1.0)
+        + matrix("R_IMUtoACC", 3, 1.0)
+        + matrix("Tg", 3, 0.0)
+    )
+
+
 def _rotors(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     def lines(prefix: str, kind: Kind, unit: str) -> str:
         return (
@@ -231,4 +280,6 @@ FORMS: dict[str, Callable[[Kind, Kind, Mapping[str, Any]], str]] = {
     "px4": _px4,
     "orbslam3": _orbslam3,
     "vins": _vins,
+    "allan_variance_ros": _allan_variance_ros,
+    "openvins": _openvins,
 }

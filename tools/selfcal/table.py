@@ -26,26 +26,91 @@ TIMES_MOST = 4
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
-    """The table a person reads: per axis the laws, their probabilities and parameters, and the bias.
+    """The tables a person reads: per axis the numbers of a data sheet; then the laws, their probabilities and
+    parameters, and the bias.
 
-    It goes to stderr where stdout is the JSON's. `datasheet`: each number in the unit of data sheets, and the bias
-    instability beside the bias. In a terminal that is too narrow columns lose their intervals, first that of 1/alpha,
-    then N's, then K's.
+    They go to stderr where stdout is the JSON's. `datasheet`: the laws' numbers in the units of data sheets. In a
+    terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the recording's; of
+    the laws that of 1/alpha, then N's, then K's.
     """
     console = Console(stderr=to_stderr)
-    for left_out in range(4):
-        table, notes = _law_table(document, left_out, datasheet)
-        needed = console.measure(table, options=console.options.update(width=10 * TABLE_WIDTH)).maximum
-        if not console.is_terminal or needed <= console.width:
-            break
+    recording = document["recording"]
+    title = (
+        f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s{since(recording)}"
+    )
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    numbered = {name: axis for name, axis in axes.items() if "summary" in axis}
+    summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
+    choices = [_law_table(document, left_out, datasheet) for left_out in range(4)]
+    laws = _fitting(console, [table for table, _ in choices])
+    notes = choices[0][1]
+    first = summary if numbered else laws
+    first.title, first.title_justify = title, "left"
     if not console.is_terminal:
         console.width = max(console.width, TABLE_WIDTH)
-    console.print(table)
-    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    if numbered:
+        console.print(summary)
+    console.print(laws)
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
     for line in notes:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _fitting(console: Console, tables: Sequence[Table]) -> Table:
+    """The first of `tables` that the terminal is wide enough for, else the last; the first where there is none."""
+    if not console.is_terminal:
+        return tables[0]
+    wide = console.options.update(width=10 * TABLE_WIDTH)
+    fitting = (one for one in tables if console.measure(one, options=wide).maximum <= console.width)
+    return next(fitting, tables[-1])
+
+
+#: Names of the numbers of summary.py, of an angular rate, of an acceleration, and of anything else.
+_NUMBERS = {
+    "arw": ("ARW", "VRW", "white noise"),
+    "rrw": ("RRW", "RRW", "random walk"),
+    "bias_instability": ("bias instability",) * 3,
+}
+
+
+def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
+    """The numbers of a data sheet; without the intervals of the last `left_out` columns."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=left_out == 0, collapse_padding=left_out > 0)
+    for heading in ("axis", "", "in the recording's units", "as in data sheets"):
+        table.add_column(heading, no_wrap=True)
+    for name, axis in axes.items():
+        unit = axis["bias_now"]["unit"]
+        kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
+        for key, number in axis["summary"].items():
+            table.add_row(
+                name if key == "arw" else "",
+                _NUMBERS[key][kind],
+                _number(number, number, brief=left_out > 1),
+                _number(number["datasheet"], number, brief=left_out > 0) if kind < 2 else "-",
+                end_section=key == list(axis["summary"])[-1],
+            )
+    return table
+
+
+def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool) -> str:
+    """Median and interval, or the upper limit of a number that is not identified."""
+    unit = units.typeset(spread["unit"])
+    if not number["identified"]:
+        return f"< {spread['q95']:.3g} {unit}, not identified"
+    interval = "" if brief else f" \\[{spread['q05']:.3g}, {spread['q95']:.3g}]"
+    return f"{spread['median']:.3g}{interval} {unit}"
+
+
+def _unidentified(axes: Mapping[str, Any]) -> list[str]:
+    """Why numbers of the summary are not identified, a line a reason."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name, axis in axes.items():
+        for key, number in axis.get("summary", {}).items():
+            if not number["identified"]:
+                found.setdefault((_NUMBERS[key][0], number["reason"]), []).append(name)
+    return [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]
 
 
 def since(recording: Mapping[str, Any]) -> str:
@@ -62,9 +127,6 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         box=box.SIMPLE_HEAD,
         collapse_padding=left_out > 0,
         pad_edge=left_out == 0,
-        title=f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}",
-        title_justify="left",
         caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
         "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
         caption_justify="left",
@@ -86,14 +148,14 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
         level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
-        heading, floor = f"{name} \\[{bias['unit']}]", ""
+        heading = f"{name} \\[{bias['unit']}]"
         if datasheet:
             unit = units.datasheet_unit("bias", bias["unit"])
             factor = units.factor(bias["unit"], unit)
             level = f"bias {bias['mean'] * factor:.6g} ± {bias['sd'] * factor:.2g} {units.typeset(unit)}"
-            heading, floor = name, _instability(axis, unit)
+            heading = name
         level, _, spread = level.partition(" ±") if brief["N"] else (level, "", "")
-        table.add_row(heading, "", level, floor or (f"±{spread}" if spread else ""), "", style="cyan")
+        table.add_row(heading, "", level, f"±{spread}" if spread else "", "", style="cyan")
         for law, probability in axis["hypotheses"].items():
             parameters = axis["parameters"][law]
             table.add_row(
@@ -158,7 +220,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
         failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
-    return table, [*kept, *_ahead(axes), *failed]
+    return table, [*kept, *_unidentified(axes), *_ahead(axes), *failed]
 
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:
@@ -193,17 +255,6 @@ def _regressor_table(axes: Mapping[str, Any]) -> Table:
                     end_section=regressor == entries[-1][0] and column == list(entry["coefficients"])[-1],
                 )
     return table
-
-
-def _instability(axis: Mapping[str, Any], unit: str) -> str:
-    """Bias instability at the floor of the recording's Allan deviation; an upper limit if it still falls at the end."""
-    allan = axis.get("allan")
-    if not allan or not allan["recording"]:
-        return ""
-    place = min(range(len(allan["recording"])), key=lambda k: allan["recording"][k])
-    value = allan["recording"][place] * units.factor(allan["unit"], unit) / units.FLICKER_FLOOR
-    below = "< " if place == len(allan["recording"]) - 1 else ""
-    return f"bias instability {below}{value:.3g} {units.typeset(unit)} at {allan['tau_s'][place]:g} s"
 
 
 def _interval(

@@ -208,13 +208,14 @@ def power(unit: str, exponent: int) -> str:
 
 
 def parameter_unit(parameter: str, unit: str) -> str:
-    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios) of an axis that reads in `unit`."""
+    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios), or of a number of summary.py, of an
+    axis that reads in `unit`."""
     match parameter:
-        case "bias" | "sigma_m" | "B":
+        case "bias" | "sigma_m" | "B" | "bias_instability":
             return unit
-        case "N":
+        case "N" | "arw":
             return f"{unit}/sqrt(Hz)"
-        case "K":
+        case "K" | "rrw":
             return f"{per_second(unit)}/sqrt(Hz)"
         case "alpha":
             return "1/s"
@@ -225,13 +226,16 @@ def parameter_unit(parameter: str, unit: str) -> str:
     raise ValueError(f"no such parameter: {parameter}")
 
 
-#: Units of data sheets, of a parameter of an angular rate and of an acceleration.
+#: Units of data sheets, of a parameter of an angular rate and of an acceleration; below, of the numbers of summary.py.
 _DATASHEET = {
     "bias": ("deg/h", "ug"),
     "sigma_m": ("deg/h", "ug"),
     "B": ("deg/h", "ug"),
     "N": ("deg/sqrt(h)", "ug/sqrt(Hz)"),
     "K": ("deg/h/sqrt(h)", "ug/sqrt(h)"),
+    "arw": ("deg/sqrt(h)", "m/s/sqrt(h)"),
+    "rrw": ("deg/h/sqrt(h)", "mg/sqrt(h)"),
+    "bias_instability": ("deg/h", "mg"),
 }
 
 

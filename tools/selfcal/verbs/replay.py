@@ -53,6 +53,7 @@ from selfcal.regressors import (
 )
 from selfcal.result import AxisResult, in_unit
 from selfcal.results import Identification
+from selfcal.summary import summarize
 from selfcal.tables import Tables, bank_block, make_tables
 from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
@@ -623,7 +624,9 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
         readings = look(recording, name, group)
         judged = with_readings(judge(blocks, tables, group, result, used), readings, group, unit, as_fed=True)
     told = in_unit(result, group.unit, unit)
-    return Identified(unit, group.unit, told, judged, blocks.kept_out, replace(scored, result=told) if scored else None)
+    scored = replace(scored, result=told) if scored else None
+    numbers = summarize(result, group, tables.dt_s, blocks.mean.size, tables.block)
+    return Identified(unit, group.unit, told, judged, blocks.kept_out, scored, summary=numbers)
 
 
 def _with_coefficients(

@@ -1,0 +1,182 @@
+"""The numbers of a data sheet, against closed forms and records of known truth.
+
+Truths: N and K as put in; the Allan deviation's first minimum from the closed forms of the literature (IEEE Std 952,
+annex C): sqrt(2 N K / sqrt(3)) at sqrt(3) N / K of a walk, and a fine search of the Gauss-Markov form.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from selfcal import table
+from selfcal.engines.library import Bank
+from selfcal.laws import PLAIN
+from selfcal.model import Model
+from selfcal.recording import save
+from selfcal.result import AxisResult, Estimate
+from selfcal.summary import Number, summarize
+from selfcal.tables import make_tables
+from selfcal.verbs.identify import identify
+from selfcal.verbs.montecarlo import simulate_bank_samples
+
+from conftest import case_records
+
+MODEL = Model.load()
+GROUP = MODEL.group_of("gx")
+FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
+
+
+def sharp(value: float) -> Estimate:
+    return Estimate(value, value, 1e-6 * value, value * (1.0 - 1e-6), value * (1.0 + 1e-6), identified=True)
+
+
+def known(law: str, truth: Mapping[str, float], n: int = 20_000) -> dict[str, Number]:
+    """The numbers of a posterior that knows its law and parameters."""
+    parameters = {name: {key: sharp(value) for key, value in truth.items()} if name == law else {} for name in PLAIN}
+    probability = {name: float(name == law) for name in PLAIN}
+    return summarize(AxisResult(n, probability, probability, parameters, 0.0, 1.0), GROUP, 1.0, n, 100)
+
+
+def markov_floor(truth: Mapping[str, float], longest_s: float) -> float | None:
+    """First minimum of white noise and a Gauss-Markov drift, over 0.664; None where there is none."""
+    tau = np.geomspace(1.0, longest_s, 20_000)
+    q = truth["alpha"] * tau
+    drift = 4.0 * truth["sigma_m"] ** 2 / q * (1.0 - (3.0 - 4.0 * np.exp(-q) + np.exp(-2.0 * q)) / (2.0 * q)) / 2.0
+    variance = truth["N"] ** 2 / tau + drift
+    inside = np.flatnonzero((variance[1:-1] < variance[:-2]) & (variance[1:-1] <= variance[2:]))
+    return math.sqrt(variance[inside[0] + 1]) / FLOOR if inside.size else None
+
+
+@pytest.mark.parametrize(("n", "k"), [(0.04, 1e-3), (0.3, 2e-2), (0.007, 5e-5)])
+def test_a_walk_has_the_closed_form(n: float, k: float) -> None:
+    """The search meets the minimum to 1e-4; averages of 100 samples are the continuous form to 1e-4 (allan.py)."""
+    found = known("random_walk", {"N": n, "K": k})
+    assert found["arw"].estimate.median == pytest.approx(n, rel=1e-5)
+    assert found["rrw"].estimate.median == pytest.approx(k, rel=1e-5)
+    assert found["bias_instability"].estimate.median == pytest.approx(
+        math.sqrt(2.0 * n * k / math.sqrt(3.0)) / FLOOR, rel=1e-3
+    )
+    assert all(number.estimate.identified and not number.reason for number in found.values())
+
+
+def test_a_gauss_markov_drift_is_a_walk_over_short_times() -> None:
+    truth = {"N": 0.01, "sigma_m": 0.03, "alpha": 0.004}
+    found = known("gauss_markov", truth)
+    assert found["rrw"].estimate.median == pytest.approx(0.03 * math.sqrt(0.008), rel=1e-5)
+    floor = markov_floor(truth, 10_000.0)
+    assert floor is not None
+    assert found["bias_instability"].estimate.median == pytest.approx(floor, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("law", "truth", "n", "reason"),
+    [
+        ("constant", {"N": 0.04}, 20_000, "no minimum"),
+        ("random_walk", {"N": 0.04, "K": 1e-5}, 5000, "no minimum"),  # it is at 6900 s
+        ("gauss_markov", {"N": 0.04, "sigma_m": 1e-4, "alpha": 0.01}, 20_000, "no minimum"),  # white noise is above
+        ("random_walk", {"N": 0.01, "K": 1.0}, 5000, "rises from the shortest"),
+    ],
+)
+def test_a_minimum_outside_the_record_is_stated(law: str, truth: dict[str, float], n: int, reason: str) -> None:
+    number = known(law, truth, n)["bias_instability"]
+    assert not number.estimate.identified
+    assert reason in number.reason
+
+
+def test_a_law_counts_by_its_probability() -> None:
+    """Two walks of one N: a tenth of the posterior has none, so no walk is sure, and its limit is the walk's K."""
+    parameters = {"constant": {"N": sharp(0.04)}, "random_walk": {"N": sharp(0.04), "K": sharp(1e-3)}}
+    for share, sure in ((0.1, False), (0.04, True)):
+        probability = {"constant": share, "random_walk": 1.0 - share}
+        found = summarize(AxisResult(9000, probability, probability, parameters, 0.0, 1.0), GROUP, 1.0, 9000, 10)
+        assert found["rrw"].estimate.identified is sure
+        assert found["bias_instability"].estimate.identified is sure
+        assert found["rrw"].estimate.q95 == pytest.approx(1e-3, rel=1e-4)
+        assert found["rrw"].estimate.mean == pytest.approx((1.0 - share) * 1e-3, rel=1e-4)
+
+
+TRUTHS = {
+    "random_walk": {"N": 0.04, "K": 2e-3},
+    "gauss_markov": {"N": 0.02, "sigma_m": 0.03, "alpha": 0.005},
+}
+
+
+@pytest.mark.parametrize("law", TRUTHS)
+def test_intervals_hold_as_often_as_stated(law: str) -> None:
+    """Records of an hour at 1 Hz: the truth lies within 90 %, to 4 sd of so many records, and a limit above it."""
+    records = case_records(30, 300)
+    tables = make_tables(MODEL, 1.0, ("gx",))
+    truth = TRUTHS[law]
+    floor = (
+        math.sqrt(2.0 * truth["N"] * truth["K"] / math.sqrt(3.0)) / FLOOR
+        if law == "random_walk"
+        else markov_floor(truth, 1800.0)
+    )
+    walk = truth.get("K") or truth["sigma_m"] * math.sqrt(2.0 * truth["alpha"])
+    held = {"arw": 0, "rrw": 0, "bias_instability": 0}
+    for seed in range(records):
+        y, _ = simulate_bank_samples(law, {**truth, "bias": 0.1}, 1.0, 3600, 40_000 + seed)
+        bank = Bank(tables)
+        bank.push(y[:, None])
+        for key, number in summarize(bank.report(0), GROUP, 1.0, y.size, 1).items():
+            value = {"arw": truth["N"], "rrw": walk, "bias_instability": floor}[key]
+            assert value is not None
+            low = number.estimate.q05 if number.estimate.identified else 0.0
+            held[key] += low <= value <= number.estimate.q95
+    print(f"\n{law}: of {records} hold {held}")
+    for key, count in held.items():
+        assert count >= 0.9 * records - 4.0 * math.sqrt(0.09 * records), key
+
+
+def test_both_systems_of_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """1 deg/s/sqrt(Hz) is 60 deg/sqrt(h); 1 g/sqrt(Hz) is 9.80665 * 60 m/s/sqrt(h); 1 deg/s is 3600 deg/h; 1 g 1000 mg;
+    K is per second, and its root of Hz is 60 roots of h: 3600 * 60 of 1 deg/s^2/sqrt(Hz), 1000 * 60 of 1 g/s/sqrt(Hz).
+    The numbers stand before the laws."""
+    rng = np.random.default_rng(6)
+    drift = 0.002 * np.cumsum(rng.standard_normal((2, 4000)), axis=1)
+    noise = 0.04 * rng.standard_normal((2, 4000))
+    log = tmp_path / "log.csv"
+    save(log, {"gx": ("deg/s", drift[0] + noise[0]), "ax": ("g", 0.02 * (drift[1] + noise[1]))}, 1.0, {})
+    document = identify(log)
+    for axis, factors in (("gx", (60.0, 216_000.0, 3600.0)), ("ax", (588.399, 60_000.0, 1000.0))):
+        for number, factor in zip(document["axes"][axis]["summary"].values(), factors, strict=True):
+            assert number["identified"]
+            assert number["datasheet"]["median"] == pytest.approx(factor * number["median"], rel=1e-9)
+    table.show(document)
+    said = capsys.readouterr().out
+    assert said.index("bias instability") < said.index("random_walk")
+    for words in ("ARW", "VRW", "RRW", "°/√h", "m/s/√h", "°/h", "mg"):
+        assert words in said
+    arw = document["axes"]["gx"]["summary"]["arw"]["datasheet"]
+    assert f"{arw['median']:.3g} [{arw['q05']:.3g}, {arw['q95']:.3g}] °/√h" in said
+
+
+def test_a_table_that_lacks_a_number_states_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "log.csv"
+    save(log, {"gx": ("deg/s", 0.04 * np.random.default_rng(8).standard_normal(3000))}, 1.0, {})
+    numbers = identify(log)["axes"]["gx"]["summary"]
+    assert numbers["arw"]["identified"] and not numbers["rrw"]["identified"]
+    table.show(identify(log))
+    said = capsys.readouterr().out
+    assert f"< {numbers['rrw']['q95']:.3g} °/s²/√Hz, not identified" in said
+    assert "bias instability not identified: gx: the Allan deviation has no minimum up to half the record" in said
+
+
+def test_a_narrow_terminal_loses_intervals_and_no_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tmp_path / "log.csv"
+    y = 0.002 * np.cumsum(np.random.default_rng(1).standard_normal(3000))
+    save(log, {"gx": ("deg/s", y + 0.04 * np.random.default_rng(2).standard_normal(3000))}, 1.0, {})
+    document = identify(log)
+    for width, intervals in ((160, 2), (80, 1), (60, 0)):
+        console = Console(width=width, force_terminal=True, record=True, color_system=None)
+        monkeypatch.setattr(table, "Console", lambda console=console, **_: console)
+        table.show(document)
+        line = next(line for line in console.export_text().splitlines() if "ARW" in line)
+        assert line.count("[") == intervals
+        assert "°/s/√Hz" in line and line.rstrip().endswith("°/√h")

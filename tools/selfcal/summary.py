@@ -1,0 +1,123 @@
+"""The three numbers of a data sheet, of the posterior of all laws: white noise, random walk, bias instability.
+
+The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
+Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
+has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
+Each law counts by its probability.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal import units
+from selfcal.allan import LONGEST, Terms, fit_of, posterior_draws, terms_of
+from selfcal.model import Group
+from selfcal.result import HALF_90, AxisResult, Estimate
+
+_Floats = NDArray[np.float64]
+
+#: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
+_DRAWS, _PER_OCTAVE = 256, 16
+#: Laws of smaller probability do not count.
+_LEAST = 1e-3
+#: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
+_SURE = 0.95
+#: Why a number is not identified: words of the table and the JSON.
+NO_WALK = "no walk is sure"
+WIDE = "the record leaves it open"
+NO_MINIMUM = "the Allan deviation has no minimum up to half the record"
+BELOW = "the Allan deviation rises from the shortest averaging time on"
+
+
+@dataclass(frozen=True)
+class Number:
+    """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
+
+    estimate: Estimate
+    reason: str = ""
+
+
+def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, Number]:
+    """The numbers of an axis by their keys (arw, rrw, bias_instability), in the group's unit: of `n` readings every
+    `dt_s`, gaps among them, each the mean of `block` samples. Empty where the record is too short for an Allan
+    deviation."""
+    if n < 2 * LONGEST:
+        return {}
+    m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
+    white, walk, floor, reached, weight = [], [], [], [], []
+    for law, probability in result.probability.items():
+        estimates = result.parameters[law]
+        medians = {name: estimate.median for name, estimate in estimates.items()}
+        if not probability >= _LEAST or not all(math.isfinite(value) for value in medians.values()):
+            continue
+        fit = fit_of(law, medians, group, dt_s, n, m, block=block)
+        draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+        white.append(draws["N"])
+        walk.append(_walk(draws))
+        lowest = [
+            _minimum(terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block), m)
+            for row in zip(*draws.values(), strict=True)
+        ]
+        floor.append(np.array([value for value, _ in lowest]))
+        reached.append(np.array([place for _, place in lowest]))
+        weight.append(np.full(_DRAWS, probability / _DRAWS))
+    if not weight:
+        return {}
+    w = np.concatenate(weight) / np.concatenate(weight).sum()
+    k, place = np.concatenate(walk), np.concatenate(reached)
+    has_walk, has_floor = float(w[k > 0.0].sum()), float(w[place == 0].sum())
+    found = {
+        "arw": _number(np.concatenate(white), w),
+        "rrw": _number(np.where(np.isnan(k), 0.0, k), w),
+        "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
+    }
+    prior = group.priors["K"]
+    widest = HALF_90 * math.log(prior.max / prior.min) / math.sqrt(12.0)  # of ln(q95 / q05): half the prior's sd
+    if has_walk < _SURE:
+        found["rrw"] = _without(found["rrw"], NO_WALK)
+    elif math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
+        found["rrw"] = _without(found["rrw"], WIDE)
+    if has_floor < _SURE:
+        found["bias_instability"] = _without(
+            found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
+        )
+    return found
+
+
+def _walk(draws: Mapping[str, _Floats]) -> _Floats:
+    """K of each draw; 0 of a law that has no walk and is like none."""
+    if "K" in draws:
+        return draws["K"]
+    if "sigma_m" in draws and "alpha" in draws:
+        return np.asarray(draws["sigma_m"] * np.sqrt(2.0 * draws["alpha"]))
+    return np.zeros(draws["N"].size)
+
+
+def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
+    """The first minimum of the Allan deviation at `m` readings, and 0; where there is none inside, the lowest value
+    with -1 (it rises from the first on) or 1 (it falls to the last)."""
+    variance = terms.allan_variance(m)
+    inside = np.flatnonzero((variance[1:-1] < variance[:-2]) & (variance[1:-1] <= variance[2:]))
+    at = int(inside[0]) + 1 if inside.size else int(np.argmin(variance))
+    return math.sqrt(max(0.0, float(variance[at]))), 0 if inside.size else (-1 if at == 0 else 1)
+
+
+def _number(values: _Floats, weight: _Floats) -> Number:
+    """Mean, sd and quantiles of weighted draws."""
+    order = np.argsort(values, kind="stable")
+    values, weight = values[order], weight[order]
+    share = np.cumsum(weight) - 0.5 * weight
+    mean = float(weight @ values)
+    sd = math.sqrt(max(0.0, float(weight @ (values - mean) ** 2)))
+    low, middle, high = np.interp((0.05, 0.5, 0.95), share, values).tolist()
+    return Number(Estimate(mean, middle, sd, low, high, identified=True))
+
+
+def _without(number: Number, reason: str) -> Number:
+    return Number(replace(number.estimate, identified=False), reason)
