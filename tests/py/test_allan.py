@@ -13,12 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import allantools
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
 from selfcal.allan import (
     deviations,
+    freedom_of,
     lengths,
     overlapping,
     ratio_at,
@@ -151,7 +153,7 @@ def test_a_drift_that_no_law_has_is_outside(tmp_path: Path) -> None:
 
 
 def test_gaps_part_the_curve_of_the_samples() -> None:
-    """allantools over the stretches between gaps, pooled, is the sum over all whole windows."""
+    """The stretches between gaps, pooled, are the sum over all whole windows."""
     rng = np.random.default_rng(4)
     y = np.cumsum(0.01 * rng.standard_normal(4000)) + rng.standard_normal(4000)
     y[1234] = np.nan
@@ -167,6 +169,24 @@ def test_gaps_part_the_curve_of_the_samples() -> None:
     assert curve.deviation == pytest.approx(expected, rel=1e-9)
     assert (curve.q05 < curve.deviation).all()
     assert (curve.deviation < curve.q95).all()
+
+
+def test_allantools_is_the_oracle() -> None:
+    """The deviation of samples is one definition; degrees of freedom are those of Greenhall & Riley, by tables there
+    and by exact sums here: 11 % apart at 8 readings, 4 % from 60 on. The interval is chi-square's."""
+    rng = np.random.default_rng(12)
+    y = 7.0 + 0.02 * np.cumsum(rng.standard_normal(3000)) + rng.standard_normal(3000)
+    m = np.array([1, 2, 8, 60, 300])
+    curve = sampled(y, np.zeros(y.size, np.int64), 50.0, m)
+    _, expected, _, _ = allantools.oadev(y, 50.0, "freq", m / 50.0)
+    assert curve.deviation == pytest.approx(expected, rel=1e-9)
+    for length in (8, 60, 300, 600):
+        for power, alpha in ((-1.0, 0), (0.0, -1), (1.0, -2)):
+            theirs = allantools.edf_greenhall(alpha, 2, length, 3001, overlapping=True)
+            assert freedom_of(power, length, 3000) == pytest.approx(theirs, rel=0.11 if length == 8 else 0.04)
+    freedom = freedom_of(-1.0, 8, 3000)
+    low, high = allantools.confidence_interval(expected[2], freedom, 0.9)
+    assert (curve.q05[2], curve.q95[2]) == pytest.approx((low, high), rel=1e-6)
 
 
 def test_averaging_times_are_octaves_of_the_bank() -> None:

@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.special import ndtri
+from scipy.special import gammaincinv, ndtri
 
-from selfcal.laws import Law, averaged
+from selfcal.laws import Law, averaged, named
 from selfcal.model import Group
 from selfcal.result import HALF_90, Estimate
 
@@ -355,15 +355,12 @@ def sample_lengths(n: int, block: int) -> NDArray[np.int64]:
 
 
 def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, m: NDArray[np.int64]) -> Sampled:
-    """By allantools, at `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
+    """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
     ones each.
 
     A gap parts the record: each stretch without one has its deviation, and theirs are pooled by their number of terms.
-    The interval is that of chi-square with the degrees of freedom (Greenhall & Riley 2003) of the power law that has
-    the curve's slope.
+    The interval is that of chi-square with the degrees of freedom of the power law that has the curve's slope.
     """
-    import allantools  # loads slowly
-
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     broken = np.isnan(values)
     ends = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
@@ -375,18 +372,27 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     n = int((stops - starts)[longest].sum())
     total, terms = np.zeros(m.size), np.zeros(m.size)
     for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
-        fits = m[2 * m < stop - start]
-        if fits.size:
-            tau, deviation, _, count = allantools.oadev(values[start:stop], rate_hz, "freq", fits / rate_hz)
-            at = np.searchsorted(m, np.rint(tau * rate_hz))
-            total[at] += count * deviation**2
-            terms[at] += count
+        stretch = values[start:stop] - values[start:stop].mean()
+        for at in np.flatnonzero(2 * m < stretch.size).tolist():
+            variance, windows = overlapping(stretch, int(m[at]))
+            total[at] += windows.size * variance
+            terms[at] += windows.size
     known = np.flatnonzero((terms >= m) & (total > 0.0))
     m, deviation = m[known], np.sqrt(total[known] / terms[known])
     slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
-    limits = []
-    for length, value, power in zip(m.tolist(), deviation.tolist(), np.rint(-2.0 * slope - 1.0).tolist(), strict=True):
-        freedom = allantools.edf_greenhall(int(np.clip(power, -2, 0)), 2, length, n + 1, overlapping=True)
-        limits.append(allantools.confidence_interval(value, freedom, 0.9))
-    q05, q95 = np.array(limits).reshape(-1, 2).T
+    powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
+    half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])
+    q05, q95 = (deviation * np.sqrt(half / gammaincinv(half, p)) for p in (0.95, 0.05))
     return Sampled(m / rate_hz, deviation, q05, q95)
+
+
+def freedom_of(power: float, m: int, n: int) -> float:
+    """Equivalent degrees of freedom of the overlapping Allan variance at `m` of `n` readings, as Greenhall & Riley
+    (2003) define them, of noise whose variance goes as tau^`power`: -1 white, 0 flicker, 1 a walk."""
+    flicker = named("flicker")
+    terms = {
+        -1.0: Terms(1.0),
+        0.0: terms_of(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
+        1.0: Terms(0.0, step=1.0),
+    }
+    return 2.0 / relative_variance(terms[power], m, np.ones(n - 2 * m + 1, np.bool_))

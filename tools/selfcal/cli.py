@@ -95,6 +95,7 @@ Axis = Annotated[
     list[str] | None, typer.Option("--axis", metavar="NAME", help="Axis to report (repeat for more); default: all")
 ]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON (- for stdout)")]
+Report = Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")]
 Rate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Sampling rate, for recordings without a t column")
 ]
@@ -281,9 +282,7 @@ def diagnose(
         bool, typer.Option("--full-rate", help="Look at every sample at once, not at means of 1 s first")
     ] = False,
     json: Json = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with pictures and tables")
-    ] = None,
+    report: Report = None,
     write_model: Annotated[
         Path | None, typer.Option(metavar="MODEL.yaml", help="Write the model file with what was found in it")
     ] = None,
@@ -342,6 +341,7 @@ def compare(
     end: End = None,
     gate: Gate = False,
     json: Json = None,
+    report: Report = None,
 ) -> None:
     """What changed between recordings of one part, beyond what each leaves open."""
     from selfcal.verbs import compare as verb
@@ -356,6 +356,7 @@ def compare(
         end_s=end,
         gate=gate,
         json=json,
+        report=report,
         **reading,
     )
     verb.show(result, to_stderr=str(json) == "-")
@@ -564,7 +565,14 @@ def monitor(
     ] = None,
     start: From = None,
     log: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc)")
+        Path | None,
+        typer.Option(metavar="FILE", help="Keep the raw frames (.asc .blf .csv .log .trc), with the reports (.mcap)"),
+    ] = None,
+    stream: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND[:HOST:PORT]", help="Reports for other programs: udp-json, jsonl, foxglove (repeat for more)"
+        ),
     ] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this long; default: Ctrl-C")] = None,
     bitrate: Annotated[int | None, typer.Option(metavar="BIT/S", help="Of the CAN bus, if it needs one")] = None,
@@ -585,6 +593,7 @@ def monitor(
         model=model,
         start=start,
         log=log,
+        stream=stream or (),
         duration=duration,
         bitrate=bitrate,
         once=once,

@@ -113,7 +113,7 @@ def to_document(
             name: {"error": reasons[name]}
             if isinstance(axis, UserError)
             else {
-                **_summary(axis),
+                "summary": _summary(axis),
                 "hypotheses": dict(axis.result.probability),
                 "log_evidence": dict(axis.result.log_evidence),
                 "parameters": parameters_entry(axis),
@@ -158,17 +158,15 @@ def parameters_entry(axis: Identified) -> dict[str, Any]:
     }
 
 
-def _summary(axis: Identified) -> dict[str, Any]:
-    """The numbers of a data sheet, in the recording's units and in data sheets' own; nothing where there are none."""
-    if not axis.summary:
-        return {}
+def _summary(axis: Identified) -> dict[str, Any] | None:
+    """The numbers of a data sheet, in the recording's units and in data sheets' own; None where they are not known."""
     found: dict[str, Any] = {}
     for key, number in axis.summary.items():
         unit, sheet = units.parameter_unit(key, axis.unit), units.datasheet_unit(key, axis.unit)
         own = number.estimate.scaled(units.factor(axis.group_unit, axis.unit))
         found[key] = {**_spread(own), "unit": unit, "identified": own.identified, "reason": number.reason or None}
         found[key]["datasheet"] = {**_spread(own.scaled(units.factor(unit, sheet))), "unit": sheet}
-    return {"summary": found}
+    return found or None
 
 
 def _spread(e: Estimate) -> dict[str, float]:
@@ -240,16 +238,17 @@ def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None
 
 def write_json(document: Mapping[str, Any], path: Path | str) -> None:
     """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
-    text = json.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
         return
     write_text(path, text)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """`value` with None in place of every number that JSON does not have."""
     if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

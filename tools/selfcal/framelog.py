@@ -8,17 +8,20 @@ import re
 import struct
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from selfcal.errors import UserError
+from selfcal.streams import McapFrames, McapLog
 
 if TYPE_CHECKING:
     import can
 
 #: What `monitor --log` writes, and what --read reads.
-WRITTEN = (".asc", ".blf", ".csv", ".log", ".trc")
+WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
+#: Those that are no text.
+BINARY = (".blf", ".mcap")
 
 #: Of Vector's BLF: size of the file's header, then an object's signature, size and kind; a container's own header.
 BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL"), struct.Struct("<4s4xLL")
@@ -58,7 +61,8 @@ class _NoFrame(ValueError):
 
 
 class FrameWriter:
-    """A new log of frames; its name's suffix chooses python-can's format. An older log is never written over.
+    """A new log of frames; its name's suffix chooses python-can's format, or MCAP, which takes the reports too. An
+    older log is never written over.
 
     What a kill leaves is a log up to FLUSH_S before.
     """
@@ -71,7 +75,8 @@ class FrameWriter:
         try:
             if self.path.is_file() and self.path.stat().st_size:
                 raise UserError(f"{path}: this log exists, and is not written over: delete it or give another name")
-            self._writer = cast(Any, can.Logger(str(path)))
+            mcap = self.path.suffix.lower() == ".mcap"
+            self._writer = cast(Any, McapLog(self.path.open("wb")) if mcap else can.Logger(str(path)))
             self._writer.file.flush()
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
@@ -82,6 +87,12 @@ class FrameWriter:
         """Add a frame. Raises UserError where the disk is full."""
         self._do(lambda: self._writer(frame))
         self._due = True
+
+    def report(self, report: Mapping[str, Any], at_s: float) -> None:
+        """Add what streams.content() made of a report that came at `at_s`, where the format has a place for it."""
+        if isinstance(self._writer, McapLog):
+            self._do(lambda: self._writer.send(report, at_s))
+            self._due = True
 
     def keep(self) -> None:
         """Bring the frames to the file once FLUSH_S has passed. To be called from time to time."""
@@ -140,8 +151,13 @@ class FrameLog:
         if self.path.suffix.lower() == ".blf":
             _check_blf(self.path)
         try:
-            self._lines = None if self.path.suffix.lower() == ".blf" else _Lines(self.path)
-            self._reader: Any = can.LogReader(self.path) if self._lines is None else _reader_of(self._lines)
+            suffix = self.path.suffix.lower()
+            self._lines = None if suffix in BINARY else _Lines(self.path)
+            self._reader: Any = (
+                _reader_of(self._lines)
+                if self._lines is not None
+                else McapFrames(self.path) if suffix == ".mcap" else can.LogReader(self.path)
+            )
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = self._next()
         except Exception as error:  # python-can's readers raise what they stumble over
@@ -226,7 +242,7 @@ class FrameLog:
 def _is_cut(path: Path) -> bool:
     """Whether a log of lines ends amid one: python-can may take the half of a frame for one, or pass it by."""
     with path.open("rb") as file:
-        if path.suffix.lower() == ".blf" or not file.seek(0, 2):
+        if path.suffix.lower() in BINARY or not file.seek(0, 2):
             return False
         file.seek(-1, 2)
         return file.read(1) not in b"\r\n"

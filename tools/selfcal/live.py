@@ -36,6 +36,8 @@ UNTOLD |= {f"reason_{axis}" for axis in AXES}
 #: degC that a temperature must move before its coefficient is worth having: ArduPilot's rule (TCAL).
 TEMPERATURE_NEEDED = 10.0
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
+#: Reasons that need somebody, the most urgent first; the others pass by themselves.
+URGENT = ("retired", "stuck", "bad_sample", "outside_priors", "inadequate", "moving")
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 #: Cells of a probability bar and of the bias's sparkline, at least and at most. Many hypotheses leave no room for bars.
 BAR, SPARK = (4, 30), (8, 40)
@@ -200,7 +202,7 @@ class View:
         first = next(iter(modules.values()), None)
         numbered = not set(modules) <= {0}  # a bus of which node 0 is not the only one
         title = Text(self._title, "bold") if numbered else self._title_of(self._title, first)
-        parts: list[RenderableType] = [_line(title)]
+        parts: list[RenderableType] = [_line(self._verdict(modules)), _line(title)]
         if self._total_s is not None and not whole:
             done = round(min(1.0, (first.now() if first else 0.0) / self._total_s) * (width // 2))
             parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
@@ -215,6 +217,45 @@ class View:
             said = frame_counts(self._streams, self._source)
             parts.append(_line(Text(f"all {said}" if modules else said, "dim")))
         return Group(*parts)
+
+    def _verdict(self, modules: Mapping[int, Module]) -> Text:
+        """How many axes are calibrated, the age of the oldest report, and the next thing to do."""
+        axes, ready, oldest_s, step = 0, 0, 0.0, ""
+        for node, module in modules.items():
+            contact, why, last = self._contact_of(module), module.reasons, dict(module.last)
+            shown = [axis for axis in AXES if (axis in last or axis in why) and axis in (self._axes or AXES)]
+            axes += len(shown)
+            ready += sum(axis in last and axis not in why and last[axis][0].complete for axis in shown)
+            silent_s = contact.silent_s if contact is not None else 0.0
+            ages = [max(0.0, module.time_s - last[axis][0].time_s) + silent_s for axis in shown if axis in last]
+            oldest_s = max([oldest_s, *ages])
+            todo = self._next_step(module, shown)
+            if todo and not step:
+                step = f"node {node}: {todo}" if len(modules) > 1 else todo
+        contact = self._contact
+        if contact is not None and self._source.closed:
+            step = "plug the port in again"
+        elif not modules:
+            step = "no module heard: check channel, cable and power" if contact is not None else "no module heard"
+        said = f"calibrated {ready} of {axes}" + (f", oldest report {oldest_s:.0f} s" if ready else "")
+        done = axes > 0 and ready == axes and not step
+        step = step or ("nothing to do" if done else "wait for reports")
+        return Text(f"{said}, {step}", "green" if done else "yellow")
+
+    def _next_step(self, module: Module, shown: Sequence[str]) -> str:
+        """What to do about a module; "" where there is nothing."""
+        contact, status = self._contact_of(module), module.decoder.status
+        if module.decoder.foreign:
+            return str(module.decoder.foreign)
+        if contact is not None and contact.lost and not module.decoder.finished:
+            return "contact lost: check cable and power"
+        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
+        if trouble:
+            return f"{trouble}: see port/README.md"
+        why = {axis: word for axis, word in module.reasons.items() if axis in shown}
+        word = next((word for word in URGENT if word in why.values()), next(iter(why.values()), ""))
+        names = ", ".join(axis for axis, one in why.items() if one == word)
+        return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
         """What is to be seen of one module, below its title; `height` lines at most."""
@@ -334,6 +375,10 @@ class View:
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks
+
+
+def _told(status: Mapping[str, float], name: str) -> str:
+    return status_text(name, status[name]) if name in status else ""
 
 
 def counted(s: Statistics) -> str:

@@ -40,7 +40,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
         f"{recording['duration_s']:g} s{since(recording)}"
     )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
-    numbered = {name: axis for name, axis in axes.items() if "summary" in axis}
+    numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
     summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     choices = [_law_table(document, left_out, datasheet) for left_out in range(4)]
     laws = _fitting(console, [table for table, _ in choices])
@@ -107,7 +107,7 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     """Why numbers of the summary are not identified, a line a reason."""
     found: dict[tuple[str, str], list[str]] = {}
     for name, axis in axes.items():
-        for key, number in axis.get("summary", {}).items():
+        for key, number in (axis.get("summary") or {}).items():
             if not number["identified"]:
                 found.setdefault((_NUMBERS[key][0], number["reason"]), []).append(name)
     return [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]

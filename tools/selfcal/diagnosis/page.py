@@ -121,14 +121,20 @@ def page(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagno
     The same arguments give the same page: the simulated records of the bands have a fixed seed."""
     name = Path(str(document["recording"]["path"])).name
     body = _body(document, record, found, options)
+    head = "".join(_head(document, record, name))
+    return frame(f"Diagnosis of {name}", "findings", "Skip to the findings", head, body)
+
+
+def frame(title: str, first: str, skip: str, head: str, body: Sequence[str]) -> str:
+    """A page around `head` and `body`, HTML. `skip`: the link to the part whose id is `first`."""
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width,initial-scale=1'>",
         # No request is made whatever a file's text holds.
         "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline'\">",
-        f"<title>Diagnosis of {escape(name)}</title><style>{STYLE}</style></head><body>",
-        "<a class=skip href='#findings'>Skip to the findings</a>",
-        *_head(document, record, name),
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
+        f"<a class=skip href='#{first}'>{skip}</a>",
+        head,
         "<main>",
         *body,
         "</main>",
@@ -195,7 +201,7 @@ def _decimated(document: Mapping[str, Any], record: Record) -> bool:
     return record.rate_hz < 0.999 * float(document["recording"]["rate_hz"])
 
 
-def _verdict(entry: Mapping[str, Any]) -> str:
+def verdict_of(entry: Mapping[str, Any]) -> str:
     """With a sign beside the colour."""
     verdict = escape(words.verdict(entry))
     if entry["verdict"] != "adequate":
@@ -203,7 +209,8 @@ def _verdict(entry: Mapping[str, Any]) -> str:
     return f"<strong>{verdict}</strong>" if entry.get("unfinished") else f"<span class=good>✓ {verdict}</span>"
 
 
-def _cause(cause: str) -> str:
+def cause_name(cause: str) -> str:
+    """As the page has it."""
     return escape(cause.replace("_", " "))
 
 
@@ -291,7 +298,7 @@ def _matrix(
 
     heads = "".join(f"<th scope=col>{escape(axis)}</th>" for axis in axes)
     body = "".join(
-        f"<tr><th scope=row>{_cause(cause)}</th>{''.join(cell(row, axis) for axis in axes)}</tr>"
+        f"<tr><th scope=row>{cause_name(cause)}</th>{''.join(cell(row, axis) for axis in axes)}</tr>"
         for cause, row in cells.items()
     )
     table = f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody>"
@@ -314,11 +321,11 @@ def _noise(
             probability = "fit"
         cells = f"<th scope=row>{escape(axis)}</th><td>{escape(law.replace('_', ' '))}</td><td>{probability}</td>"
         for name in ("N", "K", "sigma_m"):
-            cells += f"<td>{_interval(estimates.pop(name, None))}</td>"
+            cells += f"<td>{interval(estimates.pop(name, None))}</td>"
         outside, total = allan[axis]
         sign = "<span class=bad>✗ leaves its band</span>: " if _leaves(allan[axis]) else ""
         cells += f"<td>{sign}{outside} of {total} points outside</td>" if total else "<td>–</td>"
-        cells += f"<td>{'; '.join(f'{escape(name)} {_interval(one)}' for name, one in estimates.items()) or '–'}</td>"
+        cells += f"<td>{'; '.join(f'{escape(name)} {interval(one)}' for name, one in estimates.items()) or '–'}</td>"
         rows.append(f"<tr>{cells}</tr>")
     heads = "".join(
         f"<th scope=col>{head}</th>"
@@ -340,7 +347,7 @@ def _fitted(one: Diagnosed, unit: str) -> tuple[str, dict[str, dict[str, Any]]]:
     }
 
 
-def _interval(one: Mapping[str, Any] | None) -> str:
+def interval(one: Mapping[str, Any] | None) -> str:
     """A parameter with its 90 % interval, if it has one."""
     if not one or one.get("median") is None:
         return "–"
@@ -381,7 +388,7 @@ def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
         told += "."
     nats = sorted(_nats(finding) for finding in findings)
     evidence = _evidence(first) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
-    text = f"<strong>{_cause(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
+    text = f"<strong>{cause_name(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
     if len(members) == 1 and first.get("inflation_words"):
         text += f" {escape(str(first['inflation_words']))}"
     if first.get("record_next"):
@@ -429,7 +436,7 @@ def _quantity(key: str) -> str:
 def _contents(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "<nav aria-label='On this page'><ul>"
     for k, (axis, entry) in enumerate(axes.items()):
-        yield f"<li><a href='#axis-{k}'>{escape(axis)}</a> {_verdict(entry)}</li>"
+        yield f"<li><a href='#axis-{k}'>{escape(axis)}</a> {verdict_of(entry)}</li>"
     for key, title in (("gain", "Gain"), ("not-found", "Not found"), ("again", "Reproduce"), ("read", "How to read")):
         yield f"<li><a href='#{key}'>{title}</a></li>"
     yield "</ul></nav>"
@@ -444,7 +451,7 @@ def _axis(
     own: Sequence[Sequence[Figure]],
     allan: tuple[int, int],
 ) -> Iterator[_Part]:
-    yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {_verdict(entry)}</h2>")
+    yield _Part(f"<section aria-labelledby=axis-{place}><h2 id=axis-{place}>{escape(axis)}: {verdict_of(entry)}</h2>")
     if entry.get("unfinished"):
         rate = number(entry["judged_at_hz"])
         yield _Part(f"<p><strong>Not finished.</strong> Judged at {rate} Hz; {escape(str(entry['unfinished']))}.</p>")
@@ -477,7 +484,7 @@ def _match(finding: Mapping[str, Any], candidates: Sequence[Finding]) -> int | N
 def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure], *, folded: bool) -> Iterator[_Part]:
     words = f"<p>{escape(str(finding['words']))}</p>" if finding.get("words") else ""
     facts = "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in _facts(finding))
-    heading = f"<h3 id={key}>{_cause(finding['cause'])}</h3>"
+    heading = f"<h3 id={key}>{cause_name(finding['cause'])}</h3>"
     begin = f"<details class=finding><summary>{heading}</summary>" if folded else f"<div class=finding>{heading}"
     yield _Part(f"{begin}{words}<dl>{facts}</dl>")
     for figure in shown:
@@ -495,7 +502,7 @@ def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if finding.get("shared_with"):
         yield "Also on", escape(", ".join(finding["shared_with"]))
     if finding.get("also_possible"):
-        yield "It may also be", ", ".join(_cause(cause) for cause in finding["also_possible"])
+        yield "It may also be", ", ".join(cause_name(cause) for cause in finding["also_possible"])
     if finding.get("record_next"):
         yield "To make sure", escape(str(finding["record_next"]))
     gain = finding.get("gain")
@@ -572,7 +579,7 @@ def _gains(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     heads = "".join(f"<th scope=col>bias error {escape(h)} s ahead, before → after</th>" for h in ahead)
     body = []
     for axis, finding in rows:
-        cells = f"<th scope=row>{escape(axis)}: {_cause(finding['cause'])}</th>"
+        cells = f"<th scope=row>{escape(axis)}: {cause_name(finding['cause'])}</th>"
         gain = finding.get("gain")
         if not gain:
             reason = escape(str(finding.get("gain_reason") or "not measured"))
@@ -618,7 +625,7 @@ def _inflation(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Iterator[str]:
     yield "<h3>How far plain white noise and random walk numbers are off without the cause</h3>"
     heads = "".join(f"<th scope=col>{escape(key)} without / with</th>" for key in keys)
     body = "".join(
-        f"<tr><th scope=row>{escape(axis)}: {_cause(finding['cause'])}</th>"
+        f"<tr><th scope=row>{escape(axis)}: {cause_name(finding['cause'])}</th>"
         + "".join(f"<td>{_factor(factors.get(key))}</td>" for key in keys)
         + "</tr>"
         for axis, finding, factors in told
@@ -645,7 +652,7 @@ def _not_found(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     yield "<p>A cause of this size or more would have been found here in about half of such records.</p>"
     heads = "".join(f"<th scope=col>{escape(axis)}</th>" for axis in axes)
     body = "".join(
-        f"<tr><th scope=row>{_cause(cause)}</th>"
+        f"<tr><th scope=row>{cause_name(cause)}</th>"
         + "".join(f"<td>{escape(found.get(axis, 'found: see above'))}</td>" for axis in axes)
         + "</tr>"
         for cause, found in sizes.items()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import allantools
 import numpy as np
 
+from selfcal.allan import overlapping
 from selfcal.laws import NAMED
 from selfcal.methods.problem import Answer, Floats, Peak, Problem, Value, maximum, weights
 
@@ -21,9 +21,8 @@ def curve(problem: Problem) -> tuple[Floats, Floats, Floats]:
     Riley's approximation N (1/m) 4m^2/(4m^2+5) of NIST SP 1065)."""
     n = problem.y.size
     m = 2.0 ** np.arange(max(1, math.floor(math.log2(max(2, n // WINDOWS))) + 1))
-    rate = 1.0 / problem.dt_s
-    tau, deviation, _, _ = allantools.oadev(problem.y - problem.y.mean(), rate=rate, data_type="freq", taus=m / rate)
-    m = np.rint(np.asarray(tau, dtype=np.float64) * rate).astype(np.float64)
+    y = problem.y - problem.y.mean()
+    deviation = np.sqrt([overlapping(y, int(length))[0] for length in m])
     freedom = (1.5 * (n - 1) / m - 2.0 * (n - 2) / n) * 4.0 * m**2 / (4.0 * m**2 + 5.0)
     floats = [np.asarray(values, dtype=np.float64) for values in (m, deviation, np.maximum(freedom, 1.0))]
     return floats[0], floats[1], floats[2]

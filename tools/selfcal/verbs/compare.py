@@ -41,23 +41,26 @@ def compare(
     end_s: float | None = None,
     gate: bool = False,
     json: Path | str | None = None,
+    report: Path | str | None = None,
     **reading: Unpack[Reading],
 ) -> Comparison:
     """Identify and diagnose each of `logs`, and set every one beside the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
-    distance in standard deviations; and the `verdicts` by recording and axis. An axis that two successive recordings do
+    distance in standard deviations; the `verdicts` by recording and axis; and the `quantities` that were set beside
+    each other, by recording, axis and name. An axis that two successive recordings do
     not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
     `decimate`, `start_s`, `end_s`, `gate`, `reading`: as `diagnose` has them, of each recording. `fail_on`: see
-    fail_on.py; it is only checked here.
+    fail_on.py; it is only checked here. `report`: file for a page with tables and pictures.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
-    check_writable(json, inputs=(*logs, model))
+    check_writable(json, report, inputs=(*logs, model))
     seen = []
     verdicts: dict[str, dict[str, Any]] = {}
+    curves: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
     for log in logs:
@@ -67,6 +70,9 @@ def compare(
         verdicts[str(log)] = {
             name: _verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
+        for name, axis in identified.items():
+            if axis.get("allan"):
+                curves.setdefault(name, {})[str(log)] = axis["allan"]
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
     compared = {name: _Compared() for name in sorted({name for one in verdicts.values() for name in one})}
     for (first, before), (second, after) in pairwise(zip(map(str, logs), seen, strict=True)):
@@ -83,10 +89,16 @@ def compare(
         "recordings": [str(log) for log in logs],
         "axes": {name: one.entry() for name, one in compared.items()},
         "verdicts": verdicts,
+        "quantities": dict(zip(map(str, logs), seen, strict=True)),
+        "limit_sd": LIMIT,
     }
     none = not any(one.pairs for one in compared.values())
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
+    if report is not None and not none:
+        from selfcal.diagnosis.compare_page import write_page
+
+        write_page(report, document, curves)
     if none:
         told = "; ".join(f"{name}: {', '.join(one.errors)}" for name, one in compared.items())
         raise UserError(f"no axis can be compared ({told})")

@@ -21,6 +21,8 @@ from selfcal.framelog import FrameLog, FrameWriter, check_suffix
 from selfcal.known_models import KnownModels
 from selfcal.live import SILENT_S, Contact, View
 from selfcal.plot import check_picture, plot_run
+from selfcal.streams import check as check_stream
+from selfcal.streams import content, open_streams
 from selfcal.wire import (
     AXES,
     REASONS,
@@ -71,6 +73,7 @@ def monitor(
     model: Path | str | None = None,
     start: Path | str | None = None,
     log: Path | str | None = None,
+    stream: Sequence[str] = (),
     duration: float | None = None,
     bitrate: int | None = None,
     once: bool = False,
@@ -84,9 +87,11 @@ def monitor(
     the default one, for the names of what a module sends; `start`: the diagnosis that its priors are from. A port
     that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played; default:
     as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
-    python-can's format, and an older one is not written over. `bitrate` of the CAN bus, bit/s, where the interface
-    needs one. `json`: the last complete reports as a document `selfcal.identify/1` in telemetry's units, without
-    checks, with the `node`; of several modules a document `selfcal.modules/1` that holds one for each. `plot`: the
+    python-can's format, or MCAP, which takes the reports too; an older one is not written over. `stream`: where each
+    report goes as it comes, `udp-json` or `foxglove` with `:HOST:PORT` or without, or `jsonl` on stdout. `bitrate` of
+    the CAN bus, bit/s, where the interface needs one. `json`: the last complete reports as a document
+    `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules a document
+    `selfcal.modules/1` that holds one for each. `plot`: the
     picture of the run; of several modules one each, whose name ends in the node. Raises UserError for what the user
     can put right.
     """
@@ -106,6 +111,10 @@ def monitor(
         raise UserError(f"--duration must be above 0 s, not {duration:g}")
     if plot is not None:
         check_picture(plot)
+    for one in stream:
+        check_stream(one)
+    if "jsonl" in stream and str(json) == "-":
+        raise UserError("--stream jsonl and --json - are both for stdout: give --json a file")
     check_writable(json, plot)
     name = str(read if channel is None else channel)
     models = KnownModels(model, start)
@@ -123,7 +132,17 @@ def monitor(
             contact, title = Contact(), f"{interface} {channel}"
         end = math.inf if duration is None else time.monotonic() + duration
         writer = None if log is None else stack.enter_context(FrameWriter(log))
-        opened = time.monotonic()
+        sinks = open_streams(stream, stack)
+
+        def pass_on(reports: Sequence[AxisReport], at_s: float) -> None:
+            for report in (one for one in reports if one.axis in (axes or AXES)):
+                told = content(report, models.names(streams.decoders[report.node].status))
+                for sink in sinks:
+                    sink.send(told, at_s)
+                if writer is not None:
+                    writer.report(told, at_s)
+
+        opened, came_s = time.monotonic(), time.time()
         view = View(
             streams,
             source,
@@ -161,13 +180,17 @@ def monitor(
                     if streams.known and all(one.surely_foreign for one in streams.known.values()):
                         break
                     view.show(reports)
+                    came_s = time.time() if contact is not None else frame.timestamp
+                    pass_on(reports, came_s)
                     for report in reports:
                         if report.axis in (axes or AXES):
                             _keep(histories.setdefault(report.node, {}), [report])
             wanted = ending.asked
         except KeyboardInterrupt:
             wanted = True
-        view.show(streams.flush())
+        left_over = streams.flush()
+        view.show(left_over)
+        pass_on(left_over, came_s)
         view.print_last()
         outcome = Outcome(**vars(streams.statistics))
         console = Console(stderr=True)
