@@ -23,8 +23,9 @@
 #                               With another sensor than the ADIS16405: build/TARGET-SENSOR
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
-#   make setup                  the set-up alone
-#   make setup-all              every reader of other programs' logs too (400 MB); `make test` runs it
+#   make setup                  the set-up alone: what `make run` takes
+#   make setup-dev              what checks and tests take as well; they run it
+#   make setup-all              every extra too: readers of other programs' logs (400 MB); `make test` runs it
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make setup-packages         what packs lib/ for the registries of PlatformIO and ESP-IDF (70 MB)
 #   make docs                   these pages, the header and the Python functions as a site, build/docs/site/index.html
@@ -119,23 +120,19 @@ lock:
 	$(BUILD)/lock/bin/python -m pip install --quiet --require-hashes --only-binary :all: \
 	    --requirement tools/setup/lock.txt
 	cd tools && $(UV_COMPILE) --group build --output-file requirements.txt pyproject.toml
-	cd tools && for group in $(OPTIONAL); do $(UV_COMPILE) --group $$group \
+	cd tools && for group in $(filter-out all,$(OPTIONAL)); do $(UV_COMPILE) --group $$group \
 	    --python-version 3.11 --constraint requirements.txt --output-file requirements-$$group.txt || exit 1; done
-	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --output-file requirements-all.txt pyproject.toml
+	cd tools && $(UV_COMPILE) --all-extras --constraint requirements.txt --constraint requirements-dev.txt \
+	    --output-file requirements-all.txt pyproject.toml
 
-# Packages that few need, each group by itself: `make setup-rivals` and so on.
-OPTIONAL := dev rivals cluster packages docs
+# What not everybody needs, each by itself: tools of checks and tests, all extras, and groups of tools/pyproject.toml.
+OPTIONAL := dev all rivals cluster packages docs
 .PHONY: $(OPTIONAL:%=setup-%)
 $(OPTIONAL:%=setup-%): setup-%: setup
-	$(PIP_INSTALL) --requirement tools/requirements-$*.txt
-
-# The readers of every form of log: all extras of tools/pyproject.toml.
-.PHONY: setup-all
-setup-all: setup
-	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 $(VENV)/all.stamp
-$(VENV)/all.stamp: tools/requirements-all.txt $(VENV)/requirements.stamp
-	@echo "readers of logs into $(VENV) (a minute)"
-	$(PIP_INSTALL) --requirement tools/requirements-all.txt
+	@flock $(BUILD)/setup.lock $(MAKE) --no-print-directory --silent SETTING_UP=1 $(VENV)/$*.stamp
+$(OPTIONAL:%=$(VENV)/%.stamp): $(VENV)/%.stamp: tools/requirements-%.txt $(VENV)/requirements.stamp
+	@echo "Python packages of setup-$* into $(VENV) (a minute)"
+	$(PIP_INSTALL) --requirement $<
 	@touch $@
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
@@ -173,10 +170,10 @@ TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
 TESTS_FIXED := $(foreach test,fixed block bank snapshot check intake,$(BUILD)/c/fixed/test_$(test))
 
-test: setup-all
+test: setup-dev setup-all
 	@$(BIN)/python tests/run.py
 
-quick: setup
+quick: setup-dev
 	@$(BIN)/python tests/run.py --quick
 
 # The matrices are small: a BLAS with threads burns a core and is no faster.
@@ -187,41 +184,41 @@ LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
 PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=.
 
 # Seeds from the date unless SEED is given.
-hidden: setup
+hidden: setup-dev
 	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) \
 	    $(SEED:%=--seed %) $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
 
 # Goes on where an earlier run of this commit ended.
-hidden-physics: setup
+hidden-physics: setup-dev
 	nice $(BIN)/python tests/hidden/physics_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
 	    $(if $(SIZES),--sizes $(SIZES)) $(SEED:%=--seed %) $(if $(RATE),--rate $(RATE)) $(SECONDS:%=--seconds %) \
 	    $(if $(OUT),--out $(OUT))
 
-false-alarms: setup
+false-alarms: setup-dev
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
 
-soak: setup
+soak: setup-dev
 	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
 
 # SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
-tolerances: setup
+tolerances: setup-dev
 	@$(LONG) $(BIN)/python tests/py/tolerances.py \
 	    $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
-emulate: setup
+emulate: setup-dev
 	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
 
 # Records of each law and length; the fast subset of `make test` has 60.
-calibration: setup
+calibration: setup-dev
 	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
 	    $(PYTEST) -s tests/py/test_calibration.py
 
 # Records of each kind of disturbed log; `make test` looks at a few.
-cases: setup-all
+cases: setup-dev setup-all
 	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
 	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py tests/py/test_docs.py
 
-campaigns: setup
+campaigns: setup-dev
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
 	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py \
@@ -297,7 +294,7 @@ OTHER_SENSOR := $(filter-out adis16405,$(SENSOR))
 IMAGES = $(BUILD)/$(1)$(OTHER_SENSOR:%=-%)
 SENSOR_MODEL := tools/selfcal/models/$(or $(OTHER_SENSOR),default).yaml
 
-firmware: setup firmware-images $(if $(ACCEPT),bench-images)
+firmware: setup-dev firmware-images $(if $(ACCEPT),bench-images)
 	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py \
 	    --sensor $(SENSOR) $(WANTED)
 	@$(if $(ACCEPT),$(if $(TARGET)$(OTHER_SENSOR)$(CFLAGS),$(error $(NOT_ALL))))
@@ -328,7 +325,7 @@ MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
 # 4 KB more than the part has: the measuring and its records take some of it.
 MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
 
-bench: setup bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
+bench: setup-dev bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
 
 # What is exact, alone.
@@ -387,7 +384,7 @@ $(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/ben
 
 CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-house check-ruff check-mypy
 .PHONY: $(CHECKS)
-check: setup
+check: setup-dev
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
 
 C_ALL := $(wildcard lib/*.c port/app/*.c port/sensors/*.c port/replay/*.c port/posix/*.c) $(MODEL)/selfcal_model.c
@@ -447,13 +444,13 @@ check-tokens:
 	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
 
 # Lines, conditionals, circles, lengths of functions, names.
-check-house: $(PACKAGE)
+check-house: setup-dev
 	@$(BIN)/python tests/count_house.py
 
-check-ruff: $(PACKAGE)
+check-ruff: setup-dev
 	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests host_sim
 
-check-mypy: $(PACKAGE)
+check-mypy: setup-dev
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@MYPYPATH=host_sim $(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py

@@ -25,7 +25,7 @@ from selfcal.wire import AxisReport, Decoder
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "host_sim"), str(ROOT / "tests" / "bench")]
 
-parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup")
+parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup-dev")
 Board = parts.Board
 NrfBoard = parts.NrfBoard
 import image_sizes  # noqa: E402  of tests/bench

@@ -112,14 +112,25 @@ def test_every_package_is_locked() -> None:
     """Each name in tools/pyproject.toml has one version in the lock, and each version a hash: `make lock` was run."""
     project = tomllib.loads((ROOT / "tools" / "pyproject.toml").read_text())
     named = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
-    named += project["dependency-groups"]["dev"]
-    text = (ROOT / "tools" / "requirements.txt").read_text()
+    groups = project["dependency-groups"]
+    extras = [name for extra in project["project"]["optional-dependencies"].values() for name in extra]
+    for file, names in (
+        ("requirements.txt", [*named, *groups["build"]]),
+        ("requirements-dev.txt", groups["dev"]),
+        ("requirements-all.txt", [*named, *extras]),
+    ):
+        locked_in(ROOT / "tools" / file, names)
+
+
+def locked_in(file: Path, named: list[str]) -> None:
+    """Each of the names in a file of the lock."""
+    text = file.read_text()
     locked = re.findall(r"^([a-z0-9-]+)==(\S+)(?: ;.*)? \\\n    --hash=sha256:[0-9a-f]{64}\b", text, re.MULTILINE)
     names = [name for name, _ in locked]
     assert len(locked) == text.count("==") - text.count(" == ")
     assert len(names) == len(set(names))
     assert {re.sub(r"[-_.]+", "-", name).lower() for name in named} <= set(names)
-    for name in ("pip", "setuptools", "numpy"):
+    for name in {"pip", "setuptools", "numpy"} & set(names):
         assert metadata.version(name) == dict(locked)[name]
 
 

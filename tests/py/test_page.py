@@ -504,7 +504,7 @@ def browser() -> Iterator[Any]:
     program = shutil.which("chromium")
     if program is None:
         pytest.skip("NO BROWSER: the page is not looked at in one (apt-get install chromium)")
-    api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER: playwright is missing (make setup)")
+    api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER: playwright is missing (make setup-dev)")
     with api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=program)
         yield chromium
@@ -581,7 +581,7 @@ def test_the_keyboard_reaches_everything(browser: Any, address: str) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_fault(browser: Any, address: str, scheme: str) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="NO AXE-CORE (make setup)")
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="NO AXE-CORE (make setup-dev)")
     # The page's own policy lets no script in, axe-core's neither.
     view = browser.new_page(viewport={"width": 390, "height": 900}, color_scheme=scheme, bypass_csp=True)
     view.goto(address)

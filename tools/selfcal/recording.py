@@ -387,7 +387,7 @@ def _load(
             parts = _text_parts(path, rate, header, skip_bad)
         else:
             check_library(path, form)
-            if form.library:
+            if form.library and not form.here:
                 tables = tables_of(path, form, hints)
             else:
                 tables = import_module(f"selfcal.loaders.{form.module}").read(path, hints)

@@ -29,8 +29,9 @@ ZIP = ".zip"
 class Format:
     """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
 
-    `module` reads it. `library` is its import name, and `extra` the group of `pip install` that brings it; both are
-    empty where the light installation reads it, in this process.
+    `module` reads it. `library` is the import name of what it takes beside numpy and scipy, and `extra` the group of
+    `pip install` that brings the library, "" where every installation has it. A library works in a process of its own,
+    unless its module bounds it and it works `here`.
     """
 
     name: str
@@ -39,23 +40,24 @@ class Format:
     magic: tuple[tuple[int, bytes], ...] = ()
     library: str = ""
     extra: str = ""
+    here: bool = False
 
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
     Format("an npz file", (".npz",), "npz"),
     Format("a MATLAB file", (".mat",), "matlab"),
-    Format("an R file", (".rda", ".rdata", ".rds"), "r_data"),
-    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags", "ros"),
-    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap", "ros"),
-    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog", "px4"),
+    Format("an R file", (".rda", ".rdata", ".rds"), "r_data", library="rdata", extra="r", here=True),
+    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags"),
+    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap"),
+    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog"),
     Format("a DataFlash log", (".bin", ".tlog"), "dataflash", ((0, b"\xa3\x95\x80"),), "pymavlink", "ardupilot"),
     Format("a Betaflight log", (".bbl", ".bfl"), "blackbox", ((0, b"H Product:Blackbox"),)),
-    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py", "lab"),
+    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py"),
     Format("a Parquet file", (".parquet",), "parquet", ((0, b"PAR1"),), "pyarrow", "lab"),
-    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms", "lab"),
+    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms"),
     Format("an MDF file", (".mf4", ".mdf"), "mf4", ((0, b"MDF     "), (0, b"UnFinMF ")), "asammdf", "automotive"),
-    Format("a log of CAN frames", (".blf", ".asc", ".trc"), "can_log", ((0, b"LOGG"),), "can", "automotive"),
+    Format("a log of CAN frames", (".blf", ".asc", ".trc"), "can_log", ((0, b"LOGG"),), "can"),
 )
 
 #: How a message lists what is read, and what is written.
@@ -118,5 +120,5 @@ def format_of(path: Path, *, frames: bool = False) -> Format | None:
 def check_library(path: Path, one: Format) -> None:
     """Raise UserError, with the line to type, where the library of a format is not installed."""
     if one.library and importlib.util.find_spec(one.library) is None:
-        typed = f"{sys.executable} -m pip install 'selfcal[{one.extra}]'"
+        typed = f"{sys.executable} -m pip install 'selfcal{f'[{one.extra}]' if one.extra else ''}'"
         raise UserError(f"{path}: is {one.name}, and {one.library} is not installed: {typed}")
