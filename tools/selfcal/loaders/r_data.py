@@ -72,7 +72,8 @@ def _r_parse(path: Path, data: memoryview, room: int) -> Any:
         def _parse_array_values(self, dtype: Any, length: int) -> NDArray[Any]:
             if not 0 <= length <= (len(data) - self.file.tell()) // np.dtype(dtype).itemsize:
                 raise EOFError("it is cut off")
-            return super()._parse_array_values(dtype, length)
+            values: NDArray[Any] = super()._parse_array_values(dtype, length)
+            return values
 
         def _parse_bytecode(self, *_: Any, **__: Any) -> NoReturn:
             raise UserError(f"{path}: it holds R functions: save the data alone")
