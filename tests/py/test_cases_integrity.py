@@ -264,10 +264,10 @@ def test_lost_words_within_the_noise_are_left_out(
 
 @pytest.mark.parametrize(
     ("share", "q", "off", "K"),
-    [(0.37, 0.0, 0.4, 0.0), (0.42, 0.015, 1.2, 4e-3), (0.55, 0.03, 0.8, 0.0), (0.62, 0.0, 2.5, 4e-3),
-     (0.4, 0.02, 12.0, 0.0), (0.13, -0.03, 0.3, 0.0), (0.5, -0.03, 1.0, 4e-3)],
+    [(0.37, 0.0, 0.4, 0.0), (0.42, 0.015, 1.2, 4e-3), (0.46, 0.03, 0.8, 0.0), (0.47, 0.0, 2.5, 4e-3),
+     (0.4, 0.02, 12.0, 0.0), (0.13, -0.03, 0.3, 0.0), (0.45, -0.03, 1.0, 4e-3)],
 )  # fmt: skip
-def test_lost_words_of_up_to_two_thirds_are_left_out(share: float, q: float, off: float, K: float) -> None:
+def test_lost_words_of_up_to_half_are_left_out(share: float, q: float, off: float, K: float) -> None:
     """One value, `off` times the noise from the bias, on the lattice `q` of the others or, where it is negative, beside
     it: N, K and the bias are those of the others."""
     held = Held()
@@ -288,12 +288,12 @@ def test_lost_words_of_up_to_two_thirds_are_left_out(share: float, q: float, off
     held.check()
 
 
-@pytest.mark.parametrize("share", [0.72, 0.88])
-def test_lost_words_of_more_than_two_thirds_are_flagged(share: float) -> None:
+@pytest.mark.parametrize("share", [0.55, 0.62, 0.72, 0.88])
+def test_lost_words_of_more_than_half_are_flagged(share: float) -> None:
     """Either the value or the others may be the noise: none is left out, and the check `outliers` fails."""
     for seed in range(case_records(2, 60)):
         random = np.random.default_rng([42, seed])
-        y, bias = noise(random, 9000, 20.0)
+        y, bias = noise(random, 9000, 20.0, random.choice([0.0, 4e-3]))
         y[random.uniform(size=y.size) < share] = bias[0] + 0.1
         found = identify_axis(a_recording(y, 20.0), "gx", MODEL, "library", None)
         assert not found.judged.checks["outliers"]["passed"]

@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: Readings that are one value: how many at least, the evidence, nats, and the share up to which they are left out.
-#: Of a value with more, either the value or the others may be the noise.
-LEAST, NATS, MOST = 5, 16.0, 2.0 / 3.0
+#: Of a value with more, either the value or the others may be the noise. Then most averages have too few readings too,
+#: and a bias that walks is lost between the others.
+LEAST, NATS, MOST = 5, 16.0, 0.5
 #: Share of the readings from which on the commonest value has no part in the steps that show the noise, and ln of its
 #: count over the expected one then, at least: on a lattice near the noise unequal codes have less.
 COMMON, COMMON_EXCESS = 0.2, 0.7
@@ -36,7 +37,7 @@ LOOKED, AROUND, FAR, NEAR, SHOWN = 6, 8, 5.0, 3.0, 500
 STEPS = 50_000
 #: Within the noise: steps of the lattice in the noise from which on single codes are compared; else distinct values so
 #: near, in the noise; ln of the count over the expected one, and over the largest of any other value, at least.
-COARSE, BESIDE, EXCESS, OVER_OTHERS = 0.1, 0.25, 0.15, 2.0
+COARSE, BESIDE, EXCESS, OVER_OTHERS = 0.1, 0.25, 0.15, 2.5
 #: On a lattice of more steps in the noise of a reading ln of the counts is not smooth.
 COARSEST = 1.0
 #: Of the readings that are too many, the share that the levels about them must not explain, at least.
@@ -139,7 +140,7 @@ def _far(y: Array, sigma: float, rate_hz: float) -> tuple[float, float] | None:
             continue
         others = y[~own]
         lattice = lattice_of(others, rate_hz)
-        if _has_gaps(others, value, sigma, lattice):
+        if _has_gaps(others, value, sigma, _spacing(others, lattice)):
             continue
         width = max(2.0 * sigma, 4.0 * lattice.step if lattice is not None else 0.0)
         cells = 2.0 * width / lattice.step if lattice is not None else 20.0
@@ -171,7 +172,7 @@ def _is_off(
     cells = round(float(np.ptp(others)) / own.step) + 1
     if own.distinct < max(CODES, cells // 2):
         return False
-    return not _has_gaps(others, value, sigma, own) and not _is_limit(others, value, count)
+    return not _has_gaps(others, value, sigma, own.step) and not _is_limit(others, value, count)
 
 
 def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, float, float] | None:
@@ -195,6 +196,7 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
         count = np.bincount(place, counts).astype(np.float64)
         value = unique[0] + lattice.step * np.arange(count.size)
         value[place] = unique
+    spacing = _spacing(unique, lattice)
     expected, sd = _beside_codes(count) if codes else _beside_values(value, count, BESIDE * sigma)
     excess = np.log((count + 0.5) / expected)
     most = expected * np.exp(2.0 * sd)
@@ -219,22 +221,22 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
             for inside in ((offset < BESIDE) & (offset > 0.0), (offset >= BESIDE) & (offset < 2.0 * BESIDE))
         )
     sd = np.sqrt(sd**2 + 1.0 / (count + 0.5))
-    others = np.delete(np.abs(np.log((count + 0.5) / expected)) - 2.0 * sd, top)
-    if excess[top] < OVER_OTHERS * max(0.0, float(others.max(initial=0.0))):
+    chance = math.sqrt(2.0 * math.log(2.0 * count.size)) * sd  # the largest of as many
+    others = np.delete(np.abs(np.log((count + 0.5) / expected)) - chance, top)
+    if excess[top] - chance[top] < OVER_OTHERS * max(0.0, float(others.max(initial=0.0))):
         return None
     if not codes and 0 < top < value.size - 1:
-        gap = min(value[top] - value[top - 1], value[top + 1] - value[top])
-        gap -= lattice.step if lattice is not None else 0.0
+        gap = min(value[top] - value[top - 1], value[top + 1] - value[top]) - spacing
         if gap * n2.min() > GAP * BESIDE * sigma:
             return None
     if (n1 + 3.0 * np.sqrt(n2) + 3.0 < BAND * n2).all():
         return None
-    if _has_gaps(y[~own], float(value[top]), sigma, lattice):
+    if _has_gaps(y[~own], float(value[top]), sigma, spacing):
         return None
     if _is_limit(y[~own], float(value[top]), size):
         return None
     level, rests = _about(y, own, sigma, SAMPLED)
-    share = -math.expm1(-excess[top])
+    share = 1.0 - smooth / (float(count[top]) + 0.5)
     noise = lattice.step / lattice.coarseness if lattice is not None else sigma
     here = _explained(float(value[top]), level, noise, lattice)
     lost = share * size
@@ -245,14 +247,19 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
     return float(value[top]), nats, share
 
 
-def _has_gaps(others: Array, value: float, sigma: float, lattice: Lattice | None) -> bool:
-    """Whether the `others` [n] leave a gap on either side of a value and begin at once beyond it: a dead band."""
+def _spacing(values: Array, lattice: Lattice | None) -> float:
+    """The step of a lattice, or else the usual distance of values [n]: that of a lattice too fine to be one."""
+    return lattice.step if lattice is not None else float(np.median(np.diff(np.unique(values))))
+
+
+def _has_gaps(others: Array, value: float, sigma: float, step: float) -> bool:
+    """Whether the `others` [n], a `step` apart, leave a gap on either side of a value and begin at once beyond it: a
+    dead band."""
     offset = others - value
     above, below = offset[offset > 0.0], -offset[offset < 0.0]
     if not (above.size and below.size):
         return False
     gap = min(float(above.min()), float(below.min()))
-    step = lattice.step if lattice is not None else 0.0
     edge = gap + 0.5 * min(gap - step, sigma)
     most = max(np.count_nonzero(above < edge), np.count_nonzero(below < edge))
     return gap > 1.5 * step and int(most) > GAP_FULL
