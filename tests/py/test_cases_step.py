@@ -89,6 +89,25 @@ def test_a_step_beside_a_gap(place: str) -> None:
     assert binom.cdf(sum(times), len(times), 0.9) > 1e-3
 
 
+@pytest.mark.parametrize(("samples", "gap"), [(2400, 0), (1200, 40), (1800, 90)])
+def test_the_size_of_a_step_beside_a_weak_walk(samples: int, gap: int) -> None:
+    """A walk of about 0.01 of the noise a sample, which the record hardly tells from none. Truth: the step's size."""
+    random = np.random.default_rng([398, gap])
+    sizes: list[bool] = []
+    n = samples + gap
+    for _ in range(case_records(6, 150)):
+        walk = 0.01 * math.exp(random.uniform(-0.4, 0.4))
+        y = random.standard_normal(n) + walk * random.standard_normal(n).cumsum()
+        begin = round(random.uniform(0.3, 0.7) * samples)
+        size = float(random.choice([-4.0, 4.0])) * math.exp(random.uniform(0.0, 1.0)) * math.sqrt(walk * (2 + walk * gap))
+        y[begin + gap :] += size
+        y[begin : begin + gap] = np.nan
+        look = looked(y, 1.0, step.looks)
+        if look is not None:  # the smallest do not stand out
+            sizes.append(holds(look.estimate["amplitude"], size))
+    judge(f"amplitude beside a weak walk, gap {gap}", sizes)
+
+
 @pytest.mark.parametrize("place", ["in the gap", "before", "after"])
 def test_a_change_of_the_noise_beside_a_gap(place: str) -> None:
     random = np.random.default_rng(396 + len(place))

@@ -6,8 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from selfcal import _likelihood
 from selfcal.diagnosis import work
@@ -222,6 +225,15 @@ def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     return Shifts(Sums(G, float(D), float(series.n), np.empty(0)), A, B, impulse)
 
 
+def ln_det(covariance: NDArray[np.floating[Any]]) -> float:
+    """ln of the determinant of a covariance [p, p] of coefficients, over those that the record knows."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = sd > 0.0
+    sd = sd[known]
+    values = np.linalg.eigvalsh(covariance[np.ix_(known, known)] / np.outer(sd, sd))
+    return 2.0 * float(np.log(sd).sum()) + float(np.log(values[values > 1e-10]).sum())
+
+
 def ln_likelihood(sums: Sums) -> float:
     """At the best sigma and coefficients."""
     rss = sums.coefficients()[2]
@@ -410,7 +422,10 @@ def _spread(information: Array) -> Array:
 
 
 def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
-    """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for."""
+    """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for.
+
+    Within a drift, the prior of its size is Jeffreys' for a weak walk: the information of ln rho is n rho / 2. A flat
+    one counts sizes that no record tells from nothing, and intervals beside a weak walk are too short."""
     if not found.terms.names or series.n > NODES_MOST or series.ftol > FTOL:
         return [(found.theta, 0.0)]
     spread = found.spread
@@ -426,7 +441,11 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     volume = float(np.log(length * apart).sum() - np.log(limits[:, 1] - limits[:, 0]).sum())
     places = [found.theta + spread @ np.array(z) for z in product(*steps)]
     inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
-    return [(theta, volume) for theta in inside or [found.theta]]
+    inside = inside or [found.theta]
+    sizes = [name in DRIFT_SIZES for name in found.terms.names]
+    ln_prior = 0.5 * np.array([theta[sizes].sum() for theta in inside])
+    ln_prior -= logsumexp(ln_prior) - math.log(len(inside))
+    return list(zip(inside, (volume + ln_prior).tolist(), strict=True))
 
 
 def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, raised, scan
-from selfcal.diagnosis.fit import Fit, Series, shifts
+from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
@@ -43,7 +43,7 @@ MOST_TIMES = 40
 @dataclass(frozen=True)
 class Pulses:
     """Pulses between a held place and each sample [n]: score `B`, information `A`, 0 where none is looked for; `none`:
-    ln likelihood without, less a constant."""
+    ln likelihood without, the columns' coefficients integrated out, less a constant."""
 
     B: Array
     A: Array
@@ -204,7 +204,7 @@ def _other(state: State, fit: Fit, place: int, after: bool) -> Pulses:
     where = np.arange(n)
     out = (where < place + SHORTEST) | (where > n - EDGE) if after else (where > place - SHORTEST) | (where < EDGE)
     A = np.where(out | (1e-6 * held > A), 0.0, A)
-    none = -0.5 * ((G[0, 0] - y @ inverse @ y) / fit.sigma**2 + found.sums.D)
+    none = -0.5 * ((G[0, 0] - y @ inverse @ y) / fit.sigma**2 + found.sums.D - ln_det(inverse))
     return Pulses(score / fit.sigma**2 * (1.0 if after else -1.0), A / fit.sigma**2, none)
 
 

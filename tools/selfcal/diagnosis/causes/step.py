@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.fit import Fit, Series, shifts
+from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
@@ -34,7 +34,7 @@ ONE_EVENT_S = 30.0
 class Scan:
     """A step at each sample: its score `B` [n] and information `A` [n], 0 where no step is looked for. `bend` [n]:
     1 - correlation of the score at each place with the next one's. `turns`: times that the drift forgets. `none`: ln
-    likelihood without a step, less a constant."""
+    likelihood without a step, the columns' coefficients integrated out, less a constant."""
 
     B: Array
     A: Array
@@ -65,7 +65,7 @@ def scan(series: Series, fit: Fit) -> Scan:
     A[: present[0] + 4] = A[min(present[-1] - 2, enough[-1] + 1) :] = 0.0
     A = np.where(A < INFORMATION_LEAST * found.A, 0.0, A)
     turns = 0.5 * present.size * float(np.median(found.impulse[present] / found.A[present]))
-    none = -0.5 * (rss / fit.sigma**2 + found.sums.D)
+    none = -0.5 * (rss / fit.sigma**2 + found.sums.D - ln_det(inverse))
     return Scan(B / fit.sigma**2, A / fit.sigma**2, _bend(A, found.impulse), turns, none)
 
 
