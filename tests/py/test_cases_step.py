@@ -99,7 +99,8 @@ def test_the_size_of_a_step_beside_a_weak_walk(samples: int, gap: int) -> None:
         walk = 0.01 * math.exp(random.uniform(-0.4, 0.4))
         y = random.standard_normal(n) + walk * random.standard_normal(n).cumsum()
         begin = round(random.uniform(0.3, 0.7) * samples)
-        size = float(random.choice([-4.0, 4.0])) * math.exp(random.uniform(0.0, 1.0)) * math.sqrt(walk * (2 + walk * gap))
+        spread = math.sqrt(walk * (2.0 + walk * gap))
+        size = float(random.choice([-4.0, 4.0])) * math.exp(random.uniform(0.0, 1.0)) * spread
         y[begin + gap :] += size
         y[begin : begin + gap] = np.nan
         look = looked(y, 1.0, step.looks)
