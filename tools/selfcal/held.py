@@ -34,6 +34,9 @@ ONE_EACH = 0.75
 SMEARED, LEFT = 0.25, 0.35
 #: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
 CHANCE, RUN_MOST = 0.01, 5
+#: Rows to a reading in a stretch at most, net evidence of a stretch, nats, and stretches at most. The chance that a row
+#: of it does not repeat, and equal readings that are supposed among those of a stretch.
+RATIO_MOST, STRETCH_NATS, STRETCHES, MISSED, SUPPOSED = 5, 12.0, 8, 0.02, 2.0
 #: Rows in a bin of the phase, and bins at most.
 IN_BIN, BINS = 50, 100
 
@@ -66,6 +69,60 @@ def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
         return None
     same, again = equal(1), equal(2)
     return _in_runs(same, at) or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
+
+
+@dataclass(frozen=True)
+class Slower:
+    """A stretch in which each reading is held for `ratio` rows: `rows` [k] are those that repeat; `nats` net."""
+
+    ratio: int
+    rows: Rows
+    nats: float
+
+
+def slower(values: Array) -> list[Slower]:
+    """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
+
+    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings that
+    equal one two to four rows before, or of the stretch's own where more of these are equal.
+    """
+    n = values.size
+    if n < 4 * RATIO_MOST:
+        return []
+    same = np.zeros(n, bool)
+    same[1:] = values[1:] == values[:-1]
+    later = sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4))
+    chance = max(later / 3.0, 1.0) / n
+    found: list[Slower] = []
+    while len(found) < STRETCHES:
+        best = max((_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)), key=lambda one: one.nats)
+        if best.nats < STRETCH_NATS:
+            break
+        found.append(best)
+        same[best.rows] = False
+    return found
+
+
+def _slower(same: Mask, ratio: int, chance: float) -> Slower:
+    """The likeliest stretch of rows [n] that repeat the one before, but for every `ratio`th row."""
+    n, best = same.size, Slower(ratio, np.zeros(0, np.int64), 0.0)
+    for phase in range(ratio):
+        holds = np.arange(n) % ratio != phase
+        worth = np.where(same, math.log((1.0 - MISSED) / chance), math.log(MISSED / (1.0 - chance)))
+        total = np.concatenate([[0.0], np.cumsum(np.where(holds, worth, 0.0))])
+        gain = total - np.minimum.accumulate(total)
+        end = int(np.argmax(gain))
+        begin = int(np.argmin(total[: end + 1]))
+        rows = begin + np.flatnonzero((holds & same)[begin:end])
+        # Readings that rest, or are narrower in this stretch, repeat at every place.
+        new = same[begin:end][~holds[begin:end]]
+        own = max(chance, (float(new.sum()) - SUPPOSED) / max(new.size, 1))
+        held = int(np.count_nonzero(holds[begin:end]))
+        nats = rows.size * math.log((1.0 - MISSED) / own) + (held - rows.size) * math.log(MISSED / (1.0 - own))
+        nats -= 2.0 * math.log(n) + math.log(RATIO_MOST**2)
+        if nats > best.nats:
+            best = Slower(ratio, rows, nats)
+    return best
 
 
 def _in_runs(same: Mask, at: Rows) -> Held | None:

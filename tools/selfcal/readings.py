@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
-from selfcal.held import Held, held
+from selfcal.codes import Uneven, uneven_of
+from selfcal.held import Held, Slower, held, slower
 from selfcal.lattice import Lattice, lattice_of
 from selfcal.lost_words import Recurring, recurring_of
 from selfcal.model import Group
@@ -85,7 +87,7 @@ class Readings:
     """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
     `working` [n] are those to average: NaN where the sensor is `moving` [n], and clipped ones give their information to
     others (see `_unclipped`). In `drawn` [n] a clipped one is drawn by chance beyond its limit. `kept_out` counts the
-    stuck, the recurring and the clipped ones.
+    stuck, the recurring and the clipped ones; repeats in stretches that are `slower` are stuck.
 
     `recording`: of the part's own readings, [n] rows, where the logger `held` each.
     """
@@ -104,6 +106,12 @@ class Readings:
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
     changes: tuple[RateChange, ...] = ()
+    slower: tuple[Slower, ...] = ()
+
+    @cached_property
+    def uneven(self) -> Uneven | None:
+        """How the codes of the readings are unequal."""
+        return uneven_of(self.values, self.lattice)
 
     @property
     def held_hz(self) -> float | None:
@@ -129,6 +137,12 @@ class Readings:
         """Start and end of every stuck stretch, s."""
         return [list(interval) for interval in _intervals(self.recording, self.stuck)]
 
+    @property
+    def slower_intervals(self) -> list[list[float]]:
+        """Start and end of every stretch of a slower rate, s."""
+        time, step = self.recording.time_s, 1.0 / self.recording.rate_hz
+        return sorted([float(time[one.rows[0] - 1]), float(time[one.rows[-1]]) + step] for one in self.slower)
+
 
 def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
@@ -146,13 +160,22 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none, none)
     sound = values if inside.all() else np.where(inside, values, np.nan)
+    lattice = lattice_of(_known(sound), recording.rate_hz)
     recurring = recurring_of(sound, recording.rate_hz)
+    if recurring is not None and uneven_of(sound, lattice) is not None:
+        recurring = None  # a dead band takes its counts from its neighbours
     if recurring is not None:
         values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
-    lattice = lattice_of(_known(sound), recording.rate_hz)
+        lattice = lattice_of(_known(sound), recording.rate_hz)
     stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
         values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+    stretches = tuple(slower(sound))
+    repeats = np.zeros(values.size, bool)
+    for one in stretches:
+        repeats[one.rows] = True
+    if stretches:
+        values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
     clipped = _clipped(sound, lattice)
     whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
     moving, moved = _moving(recording, whole, lattice)
@@ -165,10 +188,11 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
-    counts = {"saturated": lost, "stuck": int(stuck.sum())}
+    counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
         counts["outliers"] = int(recurring.mask.sum())
-    return Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
+    found = Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
+    return replace(found, slower=stretches)
 
 
 def _known(values: Array) -> Array:

@@ -99,8 +99,9 @@ def _of_axis(
 def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> _Term | str:
     """The finding as a part of the model, or why it is none that another recording can have."""
     cause = CAUSES[finding.look.cause]
-    if cause.once:
-        return cause.once
+    why_not = cause.no_carry(finding.look) or cause.once
+    if why_not:
+        return why_not
     known = {column.name for column in finding.before.regressors}
     names = [column.name for column in finding.after.regressors if column.name not in known]
     if names:

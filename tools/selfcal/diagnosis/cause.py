@@ -53,7 +53,7 @@ class Key:
     limits: str = "finite"
 
 
-def counted(default: Callable[[Setting], float], field: str = "") -> Key:
+def counted(default: Callable[[Setting], float] | None, field: str = "") -> Key:
     """A key whose value counts something."""
     return Key(default, field, is_count, "a whole number of at least 1")
 
@@ -114,7 +114,8 @@ class Cause:
     settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
     pictures     names of pictures.py for a look.
     no_gain      why a gain on held-out time is not defined.
-    once         why another recording has it not: an event of its time, or of its read-out.
+    once         why another recording has it not: an event of its time, or of its read-out. "": it may have it.
+    no_carry     why the bank cannot weigh a look on another recording that has it; "": it can.
     anew         its size belongs to one recording: another one weighs it anew under its prior.
     onset        scored from its on-line detection, `Look.when[0]`.
     trained      look, states before and after, record and split: the state after as the first `split` samples show it.
@@ -145,6 +146,7 @@ class Cause:
     pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
     no_gain: str = ""
     once: str = ""
+    no_carry: Callable[[Look], str] = field(default=lambda look: "")
     anew: bool = False
     onset: bool = False
     trained: Callable[[Look, State, State, Record, int], State] | None = None

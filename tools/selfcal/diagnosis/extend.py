@@ -16,6 +16,7 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.state import Regressor as Column
 from selfcal.ending import Stopped
 from selfcal.errors import UserError, remark
 from selfcal.forms import NUMBER, formed
@@ -86,7 +87,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             if regressor.name in stated:
                 continue
             key = regressor_key(regressor.name)
-            own = CAUSES[regressor.cause].entry(regressor.entry, record)
+            own = CAUSES[regressor.cause].entry(_settled(one, regressor), record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
             if (
                 CAUSES[regressor.cause].smoothed
@@ -108,6 +109,21 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             kept.append(entry)
             used += columns
     return kept
+
+
+def _settled(one: Diagnosed, column: Column) -> Mapping[str, Any]:
+    """The entry of a column with the median of the posterior for the lag or the play that the search's grid gave it."""
+    key = NUMBER.get(str(column.entry.get("form", "")), "")
+    for finding in one.findings:
+        number = finding.look.estimate.get(key)
+        before = {known.name for known in finding.before.regressors}
+        if (
+            isinstance(number, Mapping)
+            and column.name not in before
+            and any(added is column for added in finding.after.regressors)
+        ):
+            return {**column.entry, key: digits(number["median"])}
+    return column.entry
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
@@ -230,7 +246,7 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
         )
         cause = CAUSES.get(column.cause)
         if cause is not None and cause.of_column is not None:
-            pairs = cause.of_column(column, c)
+            pairs = cause.of_column(replace(column, entry=_settled(one, column)), c)
             if "column" not in column.entry:
                 yield cause, strength, pairs
                 continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -16,6 +17,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
 from selfcal.diagnosis.statemodel import Array, Mask
 from selfcal.motion import Moved
+from selfcal.readings import Readings
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
@@ -118,13 +120,25 @@ def rate_changes(record: Record) -> list[Look]:
 
 
 def held_samples(record: Record, axis: str) -> Look | None:
-    """The logger asks oftener than the part measures."""
+    """The logger asks oftener than the part measures, always or in stretches."""
     readings = record.readings.get(axis)
-    if readings is None or readings.held_hz is None:
+    if readings is None:
         return None
+    if readings.held_hz is None:
+        return _slower(readings) if readings.slower else None
     # Each reading that is asked for again repeats; by chance one in 100 would at most.
     nats = min(1e6, readings.values.size * math.log(100.0))
     return Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+
+
+def _slower(readings: Readings) -> Look:
+    """Stretches in which each reading is held; the rate is that of the surest."""
+    surest = max(readings.slower, key=lambda one: one.nats)
+    nats = min(1e6, sum(one.nats for one in readings.slower))
+    intervals = readings.slower_intervals
+    rate_hz = readings.recording.rate_hz / surest.ratio
+    estimate = {"rate_hz": interval(rate_hz, 0.0, "Hz"), "intervals": intervals}
+    return Look("held_samples", nats, nats, estimate, {}, when=(intervals[0][0], intervals[-1][1]))
 
 
 def recurring(record: Record, axis: str) -> Look | None:
@@ -192,6 +206,26 @@ def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
         return look, state
     y = np.where(np.isfinite(state.y), record.unclipped[axis], np.nan)
     return look, state.refit(y=y, redrawn=True)
+
+
+def uneven(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Codes that are not alike. In a record at the recording's own rate each reading is drawn anew among the codes that
+    it may come from."""
+    state, readings = record.axes[axis], record.readings.get(axis)
+    found = None if readings is None else readings.uneven
+    if readings is None or found is None:
+        return None
+    step = 0.0 if readings.lattice is None else readings.lattice.step
+    lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
+    estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
+    if found.value is not None and found.width is not None:
+        estimate["value"] = interval(found.value, 0.0, state.unit)
+        estimate["width"] = interval(found.width, 0.0, state.unit)
+    look = Look("quantization", found.nats, found.nats, estimate, {"stated_lsb": step} if lsb else {})
+    if axis not in record.alike:
+        return look, state
+    y = np.where(np.isfinite(state.y), record.alike[axis], np.nan)
+    return look, state.refit(y=y, redrawn=True, **look.changes)
 
 
 def motion(record: Record, wild: Mapping[str, float]) -> tuple[dict[str, Moved], Mask]:

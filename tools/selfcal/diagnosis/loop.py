@@ -171,8 +171,14 @@ def _integrity(
             if name in found:
                 found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
             states[name] = clipped[1]
+        spoilt_codes = clipped is None and not states[name].below_lattice
+        uneven = integrity.uneven(replace(record, axes=states), name) if spoilt_codes else None
+        if uneven is not None:
+            if name in found:
+                found[name].findings.append(Finding(uneven[0], 0, states[name], uneven[1]))
+            states[name] = uneven[1]
         lattice = integrity.quantization(states[name])
-        if lattice is not None:
+        if lattice is not None and uneven is None:
             before = states[name]
             states[name] = replace(before, stated_lsb=before.lsb)
             if name in found:

@@ -59,6 +59,7 @@ class Record:
     readings: Mapping[str, Readings] = field(default_factory=dict)
     changes: tuple[RateChange, ...] = ()
     unclipped: Mapping[str, Array] = field(default_factory=dict)
+    alike: Mapping[str, Array] = field(default_factory=dict)
     start_s: float = 0.0
     roughness: Mapping[str, Array] = field(default_factory=dict)
     moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
@@ -169,6 +170,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     gone: dict[str, Missing] = {}
     read: dict[str, Readings] = {}
     unclipped: dict[str, Array] = {}
+    alike: dict[str, Array] = {}
     roughness: dict[str, Array] = {}
     moving = np.zeros(n, bool)
     for name in known:
@@ -215,6 +217,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         roughness[name] = on_grid(replace(alone.clock, start_s=recording.clock_of(name).start_s), rough)[0]
         if each == 1 and one.clipped is not None:
             unclipped[name] = on_grid(clock, spread(one.drawn))[0] - level
+        elif each == 1 and one.uneven is not None:
+            alike[name] = on_grid(clock, spread(one.uneven.drawn))[0] - level
         states[name] = State(
             axis=name,
             unit=group.unit,
@@ -249,6 +253,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         read,
         changes,
         unclipped,
+        alike,
         recording.start_s,
         roughness,
         moving,

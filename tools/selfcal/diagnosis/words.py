@@ -33,6 +33,8 @@ LABELS = {
     "tau_2_s": "time constant",
     "lag_s": "time constant of the lag",
     "width": "width of the play",
+    "misread": "share read as a neighbour",
+    "value": "a dead band about",
 }
 #: What a form adds to the sentence; the static one is what the sentence says by itself.
 FORMS = {

@@ -1,4 +1,7 @@
-"""The logger asks oftener than the sensor measures: each reading repeats. readings.py finds the rate."""
+"""The logger asks oftener than the sensor measures: each reading repeats. readings.py finds the rate.
+
+In `intervals` alone the logger, or the sensor, fell to a part of its rate.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +11,40 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, positive
+from selfcal.diagnosis.cause import Cause, counted, medians, positive
+from selfcal.diagnosis.state import Look
 from selfcal.diagnosis.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
-    """The mean of each reading's time, on the lattice, until the next one."""
+    """The mean of each reading's time, on the lattice, until the next one. In each of so many `intervals`, a tenth of
+    its piece of the record, one reading is held instead."""
+    if "intervals" in keys:
+        ratio, piece = max(2, round(rate_hz / keys["rate_hz"])), row.size // keys["intervals"]
+        for k in range(keys["intervals"]):
+            start = k * piece + int(random.uniform() * 0.8 * piece)
+            held = row[start : start + max(ratio, piece // 10)]
+            held[:] = held[np.arange(held.size) // ratio * ratio]
+        return
     cell = np.floor(np.arange(row.size) * min(keys["rate_hz"] / rate_hz, 1.0)).astype(np.int64)
     mean = np.bincount(cell, row) / np.bincount(cell)
     row[:] = (np.rint(mean / lsb) * lsb if lsb > 0.0 else mean)[cell]
 
 
+def _of_estimate(look: Look) -> dict[str, Any] | None:
+    """Held readings in stretches. Those of a whole record are no part of it: the model is of the part's own rate."""
+    if "intervals" not in look.estimate:
+        return None
+    return {**medians(look, "rate_hz"), "intervals": len(look.estimate["intervals"])}
+
+
 CAUSE = Cause(
     "held_samples",
-    "The logger asks oftener than the sensor measures: each reading repeats.",
+    "The logger asks oftener than the sensor measures: readings repeat.",
     "Log at the sensor's own rate, on its data-ready line.",
     alike=lambda a, b: True,
     no_gain="repeats are left out before and after",
-    keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s)},
+    of_estimate=_of_estimate,
+    keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s), "intervals": counted(None)},
     spoil=_spoil,
 )

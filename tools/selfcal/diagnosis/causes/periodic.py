@@ -19,8 +19,8 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
 from selfcal.diagnosis.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array
 
-#: Fewer turns in a record than this are drift.
-TURNS_LEAST = 3.0
+#: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
+TURNS_LEAST, BAND_TURNS = 1.5, 3.0
 #: Widths of a band in bins of the periodogram.
 BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
 #: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
@@ -50,7 +50,7 @@ def _band(state: State, record: Record) -> list[Look]:
     w = np.nan_to_num(state.whitened)
     count = int(np.isfinite(state.y).sum())
     power = np.abs(rfft(w)) ** 2 / count
-    low = max(4, math.ceil(10.0 * TURNS_LEAST))
+    low = max(4, math.ceil(10.0 * BAND_TURNS))
     if not state.extras.oscillation:  # a slower band is that
         low = max(low, math.ceil(n * state.dt / max(PERIOD_LIMITS[0], SAMPLES_LEAST * state.dt)))
     best: tuple[float, int, int] | None = None

@@ -34,6 +34,9 @@ LINE_LEAST, LINE_HALF = 4.0, 2
 PIECES = 64
 #: ln of the number of forms, white and in a band.
 LN_FORMS = math.log(2.0)
+#: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
+#: narrower one is a disturbance of that frequency.
+BROAD, BROAD_BINS = 0.03, 4.0
 #: Share of a common source's gain that the innovations of two drifts may not show.
 LOST = 0.1
 
@@ -246,8 +249,23 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 findings = found[name].findings
                 last = max((one.round for one in findings if one.look.changes), default=0)
                 state, partner = states[name], states[other]
-                findings.append(Finding(look(pair, both, other), last, state, state, (), (other,), partner))
+                seen = look(pair, both, other)
+                own = [one for one in findings if _of_band(one.look, seen, pair)]
+                seen = replace(seen, gain=seen.gain + sum(one.look.gain for one in own))
+                seen = replace(seen, net=seen.net + sum(one.look.net for one in own))
+                findings.append(Finding(seen, last, state, state, (), (other,), partner))
     return [*changed, *(name for name, one in found.items() if _accounted(name, one, found))]
+
+
+def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
+    """Whether the noise that two axes share is that of a band of one of them. The evidence for the band is then
+    evidence for the source as well: over a model that has neither."""
+    if band.cause != "periodic" or "width_hz" not in band.estimate or "band_hz" not in shared.estimate:
+        return False
+    centre, half = (float(band.estimate[key]["median"]) for key in ("frequency_hz", "width_hz"))
+    low, high = shared.estimate["band_hz"]
+    bins = half * pair.u.size * pair.dt
+    return bool(low < centre < high and half > BROAD * centre and bins > BROAD_BINS)
 
 
 def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> bool:

@@ -16,12 +16,12 @@ import numpy as np
 from scipy.stats import gamma
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
-from selfcal.diagnosis.causes import flicker, variance_change
+from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NONE, SCREEN, Look, State, mixture, net
+from selfcal.diagnosis.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
 
 #: Tried first: amplitudes over the white noise of a block, dwell times in blocks, ln of the drift over the fitted one.
@@ -126,6 +126,8 @@ def looks(state: State, record: Record) -> list[Look]:
     if worth < 1.0:
         return []
     levels = np.where(upper, 0.5, -0.5)[np.minimum(np.arange(state.y.size) // block, upper.size - 1)]
+    if _shaken(state, record, levels):
+        return []
     dt = state.dt * block
     measure = partial(_amplitude, state, levels)
     estimate = {
@@ -136,6 +138,27 @@ def looks(state: State, record: Record) -> list[Look]:
     }
     changes = {"y": state.y - math.exp(theta[0]) * levels, "redrawn": True}
     return [Look("two_level", gain - none, worth, estimate, changes, measure=measure)]
+
+
+def _shaken(state: State, record: Record, levels: Array) -> bool:
+    """Whether another axis vibrates more at one of the levels [n] than at the other, and the bias follows that axis'
+    variance: the levels are then those of a machine that is switched. They fit better than a measured variance, which
+    scatters."""
+    variances = record.variances(state.axis)
+    louder = set()
+    for name, variance in variances.items():
+        level = float(np.median(variance))
+        if not level > 0.0:
+            continue
+        # Neighbouring differences have a sample in common: their squares count half.
+        gain = 0.5 * variance_change.slope_of(np.minimum(variance / level, variance_change.MOST) + 1e-12, levels)[1]
+        if net(gain, 1, math.log(len(variances))) >= NET_LEAST:
+            louder.add(name)
+    if not louder:
+        return False
+    known = {str(one.entry["column"]) for one in state.regressors if one.cause == "vibration"}
+    known |= {str(look.estimate["other"]) for look in vibration.looks(state, record) if look.net >= NET_LEAST}
+    return bool(louder & known)
 
 
 def _without(y: Array, ln_rho: float, ln_sigma: float) -> float:

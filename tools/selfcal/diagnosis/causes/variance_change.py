@@ -141,7 +141,7 @@ def follows(state: State, record: Record) -> list[Look]:
     wide = max(1.0, float(np.var(square / square.mean())) / 2.0) if state.lsb == 0.0 else 1.0
     best: dict[str, tuple[float, Level]] = {}
     for level in levels(state, record):
-        scan = _slope(square, level.values[present])[1] / wide
+        scan = slope_of(square, level.values[present])[1] / wide
         if scan > best.get(level.column, (0.0, level))[0]:
             best[level.column] = scan, level
     found = (_follows(state, level, wide) for scan, level in best.values() if net(scan, 1, level.ln_looks) >= 1.0)
@@ -154,7 +154,7 @@ def _follows(state: State, level: Level, wide: float) -> Look | None:
     changed, slope, sd = state, 0.0, math.inf
     for _ in range(2):
         square = np.minimum(changed.whitened[present] ** 2, MOST) + 1e-12
-        more, _, sd = _slope(square, level.values[present])
+        more, _, sd = slope_of(square, level.values[present])
         slope += more
         changed = state.refit(r=state.r * np.exp(slope * (level.values - level.values.mean())))
     exact = (changed.best.ln_likelihood - state.best.ln_likelihood) / wide
@@ -175,7 +175,7 @@ def _follows(state: State, level: Level, wide: float) -> Look | None:
     return Look("variance_change", exact, worth, estimate, {"r": changed.r})
 
 
-def _slope(square: Array, values: Array) -> tuple[float, float, float]:
+def slope_of(square: Array, values: Array) -> tuple[float, float, float]:
     """Slope of ln variance by `values` [n], its gain of ln likelihood, and its standard deviation, by Newton's steps.
 
     `square` [n]: squared innovations; their mean variance is free."""
@@ -210,7 +210,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     if look.when is None:
         shape = np.log(after.r / before.r)
         there = np.isfinite(square)
-        return replace(after, r=before.r * np.exp(_slope(square[there], shape[:split][there])[0] * shape))
+        return replace(after, r=before.r * np.exp(slope_of(square[there], shape[:split][there])[0] * shape))
     place = round(look.when[0] * record.rate_hz)
     r = before.r.copy()
     r[place:] *= float(np.nanmean(square[place:]) / np.nanmean(square[:place]))
@@ -237,6 +237,7 @@ CAUSE = Cause(
     before_motion=once,
     pictures=shown("marked_level"),
     once="a change of the noise is an event of its recording",
+    no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",
     onset=True,
     trained=_trained,
     least=_least,

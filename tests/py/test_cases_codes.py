@@ -1,0 +1,167 @@
+"""Codes that are not alike, and readings that repeat in a stretch, are named with their size; others name none.
+
+Truth: the numbers that each record was drawn with, sample by sample.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from selfcal.codes import uneven_of
+from selfcal.diagnosis.statemodel import Array
+from selfcal.held import slower
+from selfcal.lattice import lattice_of
+from selfcal.model import Model
+from selfcal.recording import save
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.simulate import simulate
+
+from conftest import case_records
+
+SAMPLES = 3000
+#: Noise of a reading, deg/s.
+SD = 0.03
+
+
+def quiet(random: np.random.Generator, n: int = SAMPLES) -> Array:
+    """[n]: white noise and a random walk, deg/s."""
+    level = random.uniform(-0.3, 0.3)
+    return np.asarray(level + SD * (random.standard_normal(n) + 0.005 * random.standard_normal(n).cumsum()))
+
+
+def rounded(y: Array, q: float) -> Array:
+    return np.asarray(q * np.rint(y / q)) if q > 0.0 else y
+
+
+def banded(y: Array, q: float, width: float) -> tuple[Array, float]:
+    """Readings nearer than `width` to a value near their middle become it, and the share that do so."""
+    value = float(rounded(np.array([np.median(y)]), q)[0])
+    read = rounded(y, q)
+    inside = (np.abs(read - value) < width) & (read != value)
+    return np.where(inside, value, read), float(inside.mean())
+
+
+def log_of(path: Path, y: Array, rate: float) -> Path:
+    save(path, {"gx": ("deg/s", y)}, rate, {}, t=np.arange(y.size) / rate)
+    return path
+
+
+def axis_of(path: Path) -> dict[str, object]:
+    found: dict[str, object] = diagnose(path)["axes"]["gx"]
+    return found
+
+
+@pytest.mark.parametrize(("q", "width"), [(0.15, 0.4), (0.35, 0.8), (0.6, 0.7), (0.0, 0.25), (0.0, 1.3)])
+def test_a_dead_band_is_named_with_its_place_and_share(q: float, width: float) -> None:
+    """On a lattice of q noises or on none, half a band of `width` noises. The share of readings that it moves lies in
+    three of its standard deviations, a tenth more: the counts beside the band say how many are gone."""
+    for seed in range(case_records(2, 60)):
+        random = np.random.default_rng([61, seed, round(100 * q), round(100 * width)])
+        y, share = banded(quiet(random), q * SD, width * SD)
+        found = uneven_of(y, lattice_of(y, 1.0))
+        assert found is not None
+        assert found.value is not None and found.width is not None
+        assert np.count_nonzero(y == found.value) == np.unique(y, return_counts=True)[1].max()
+        assert abs(found.share - share) < 3.0 * found.sd + 0.1 * share
+        # The band swallowed noise, which drawn readings have again: to 4 standard deviations of a spread.
+        assert abs(np.diff(found.drawn).std() / math.sqrt(2.0) / math.hypot(SD, q * SD / 3.46) - 1.0) < 0.06
+
+
+@pytest.mark.parametrize("q", [0.15, 0.4, 0.8])
+def test_narrow_codes_are_named_with_the_share_that_they_lose(q: float) -> None:
+    for seed in range(case_records(2, 60)):
+        random = np.random.default_rng([62, seed, round(100 * q)])
+        read = np.rint(quiet(random) / (q * SD))
+        lost = (read % 2 == seed % 2) & (random.random(read.size) < random.uniform(0.25, 0.8))
+        y = q * SD * (read + np.where(lost, random.choice([-1.0, 1.0], read.size), 0.0))
+        found = uneven_of(y, lattice_of(y, 1.0))
+        assert found is not None
+        assert found.value is None
+        # The odd ones are half of the readings to sqrt(n) / 2.
+        assert abs(found.share - lost.mean()) < 3.0 * found.sd + 2.0 / math.sqrt(read.size)
+
+
+KINDS = ("plain", "tails", "louder", "jump", "lost words", "limit", "outliers")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_codes_that_are_alike_are_not_named(kind: str) -> None:
+    """Nor are heavy tails, a change of the noise, a jump, lost words, a limit or outliers: at most 1 of 200."""
+    count, named = case_records(4, 200), 0
+    for seed in range(count):
+        random = np.random.default_rng([63, seed, KINDS.index(kind)])
+        q = SD * float(np.exp(random.uniform(math.log(0.08), math.log(1.5))))
+        y = quiet(random, int(random.choice([1200, 6000])))
+        if kind == "tails":
+            y += 0.5 * SD * random.standard_t(4.0, y.size)
+        elif kind == "louder":
+            y[y.size // 3 :] += random.uniform(0.5, 2.0) * SD * random.standard_normal(y.size - y.size // 3)
+        elif kind == "jump":
+            y[int(random.uniform(0.2, 0.8) * y.size) :] += random.uniform(-6.0, 6.0) * SD
+        elif kind == "limit":
+            y = np.minimum(y, np.median(y) + random.uniform(0.5, 2.0) * SD)
+        elif kind == "outliers":
+            hit = random.random(y.size) < 0.01
+            y[hit] += 6.0 * SD * random.standard_normal(int(hit.sum()))
+        y = rounded(y, q)
+        if kind == "lost words":
+            y[random.random(y.size) < 0.02] = y[random.integers(y.size)]
+        named += uneven_of(y, lattice_of(y, 1.0)) is not None
+    assert named <= binom.isf(1e-3, count, 1.0 / 200.0)
+
+
+@pytest.mark.parametrize(("ratio", "count", "q"), [(2, 60, 0.2), (2, 40, 0.0), (3, 30, 0.5), (4, 25, 0.3)])
+def test_a_stretch_at_a_part_of_the_rate_is_named(ratio: int, count: int, q: float, tmp_path: Path) -> None:
+    """`count` readings, each `ratio` times. An end may be a reading off: it may equal its neighbour by chance."""
+    for seed in range(case_records(1, 20)):
+        random = np.random.default_rng([64, seed, ratio, count])
+        y = rounded(quiet(random), q * SD)
+        first = int(random.uniform(0.1, 0.9) * (y.size - ratio * count))
+        held = y[first : first + ratio * count]
+        held[:] = held[np.arange(held.size) // ratio * ratio]
+        rate = float(random.choice([1.0, 4.0]))
+        axis = diagnose(log_of(tmp_path / "held.npz", y, rate))["axes"]["gx"]
+        (finding,) = axis["findings"]
+        assert finding["cause"] == "held_samples"
+        assert finding["estimate"]["rate_hz"]["median"] == pytest.approx(rate / ratio)
+        ((begin, end),) = finding["estimate"]["intervals"]
+        assert abs(begin * rate - first) <= 2 * ratio
+        assert abs(end * rate - first - held.size) <= 2 * ratio
+
+
+@pytest.mark.parametrize("kind", ["lattice", "louder", "rest"])
+def test_readings_that_are_equal_by_chance_are_no_stretch(kind: str) -> None:
+    """On a lattice of up to 1.8 noises, beside a louder part, and where a bench comes to rest: at most 1 of 200."""
+    count, named = case_records(20, 400), 0
+    for seed in range(count):
+        random = np.random.default_rng([65, seed, len(kind)])
+        y, q = quiet(random), SD * random.uniform(0.05, 1.8)
+        if kind != "lattice":
+            level = float(np.median(y))
+            part = slice(int(random.uniform(0.1, 0.8) * y.size), None)
+            y[part] = level + (y[part] - level) * (random.uniform(2.0, 5.0) if kind == "louder" else 0.2)
+        named += bool(slower(rounded(y, q)))
+    assert named <= binom.isf(1e-3, count, 1.0 / 200.0)
+
+
+def test_the_diagnosis_names_it_alone_and_the_model_simulates_it(tmp_path: Path) -> None:
+    """A dead band is no outlier, and its drawn readings show nothing more. The model file makes it again."""
+    for seed in range(case_records(1, 12)):
+        random = np.random.default_rng([66, seed])
+        y, _ = banded(quiet(random), 0.4 * SD, random.uniform(0.6, 1.1) * SD)
+        log, model = log_of(tmp_path / "dead.npz", y, 1.0), tmp_path / "found.yaml"
+        axis = diagnose(log, write_model=model)["axes"]["gx"]
+        assert [finding["cause"] for finding in axis["findings"]] == ["quantization"]
+        known = axis["findings"][0]["estimate"]
+        assert "quantization" in " ".join(Model.load(model).simulate["effects"])
+        simulate(model, tmp_path / "again.npz", seed=seed)
+        again = diagnose(tmp_path / "again.npz", axes=["gx"])["axes"]["gx"]["findings"]
+        (found,) = [one["estimate"] for one in again if one["cause"] == "quantization"]
+        # Both know the width by a few hundred counts: to a third of a code.
+        assert abs(found["width"]["median"] - known["width"]["median"]) < 0.4 * 0.4 * SD
+        model.unlink()
