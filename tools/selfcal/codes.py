@@ -30,7 +30,9 @@ COARSEST, COME = 1.0, 0.5
 PIECES, PIECE = 200, 64
 #: Steps of the levels, in codes or in noises if these are more, and factors of the noise that are tried about its best.
 LEVELS, FACTORS = 0.05, (0.88, 0.94, 1.0, 1.06, 1.13, 1.25)
-#: ... where each piece has a noise of its own.
+#: ... then nearer,
+NEAR = (0.97, 0.98, 0.99, 1.01, 1.02, 1.03)
+#: and where each piece has a noise of its own.
 WIDE = tuple(float(2.0**k) for k in np.linspace(-2.0, 1.6, 13))
 #: Shares that are read as a neighbour, and further codes of a dead band on either side.
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
@@ -129,14 +131,14 @@ def _values(count: Array, to: Array, sigma: float) -> tuple[Array, Array]:
 
 def _fit(count: Array, to: Array, sigma: float) -> _Fit:
     """The likeliest level of each piece and the likeliest noise near `sigma`, in codes, for counts [pieces, codes]."""
-    best: _Fit | None = None
-    for own in (factor * sigma for factor in FACTORS):
-        value, true = _values(count, to, own)
-        at = np.argmax(value, axis=1)
-        total = float(value[np.arange(len(count)), at].sum())
-        if best is None or total > best.value:
-            best = _Fit(total, own, true[:, at])
-    assert best is not None
+    best = _Fit(-math.inf, sigma, np.empty((0, 0)))
+    for factors in (FACTORS, NEAR):
+        for own in [factor * best.sigma for factor in factors]:
+            value, true = _values(count, to, own)
+            at = np.argmax(value, axis=1)
+            total = float(value[np.arange(len(count)), at].sum())
+            if total > best.value:
+                best = _Fit(total, own, true[:, at])
     return best
 
 
@@ -178,7 +180,7 @@ def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
     lost = float(expected[read.places].sum()) - float(total[read.places].sum())
     if lost < LACKING * math.sqrt(float(expected[read.places].sum())):
         return None  # readings come from everywhere: a word that the logger shows for lost ones
-    if _of_all(count, alike, total, read) > fit.value:
+    if _of_all(count, alike, total, read) > fit.value - NATS:
         return None
     # Noise that comes and goes piles up as well: where each piece has its own, it must not.
     nats = _of_pieces(count, read.to, fit.sigma) - _of_pieces(count, np.eye(many), fit.sigma)
@@ -260,9 +262,14 @@ def _of_all(count: Array, alike: _Fit, total: Array, read: _Read) -> float:
         gains += (n - total) * np.log1p(-share)
     found = []
     for place in {int(np.argmax(gains)), read.place}:
-        to = (1.0 - share[place]) * np.eye(total.size)
-        to[place] += share[place]
-        found.append(_fit(count, to, alike.sigma).value)
+        own, sigma = float(share[place]), alike.sigma
+        for _ in range(TURNS):
+            to = (1.0 - own) * np.eye(total.size)
+            to[place] += own
+            fit = _fit(count, to, sigma)
+            found.append(fit.value)
+            usual = float((fit.chance @ count.sum(axis=1))[place])
+            own, sigma = min(max((float(total[place]) - usual) / (n - usual), 0.0), 0.9), fit.sigma
     return max(found)
 
 

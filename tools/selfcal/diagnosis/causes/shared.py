@@ -36,7 +36,7 @@ PIECES = 64
 LN_FORMS = math.log(2.0)
 #: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
 #: narrower one is a disturbance of that frequency.
-BROAD, BROAD_BINS = 0.03, 4.0
+BROAD, BROAD_BINS = 0.02, 4.0
 #: Share of a common source's gain that the innovations of two drifts may not show.
 LOST = 0.1
 

@@ -264,7 +264,10 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     kept = tuple(one for one in after.regressors if one.name in known)
     own = next(one for one in after.regressors if one.name not in known)
     added = tuple(replace(own, name=f"turn_on_{k}", values=row) for k, row in enumerate(_decays(t, times)))
-    return replace(after, regressors=(*kept, *added))
+    columns = (*kept, *added)
+    # The first samples may show one time constant where the whole record shows two.
+    same = len(columns) == len(after.regressors)
+    return replace(after, regressors=columns) if same else after.refit(regressors=columns, fits=())
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
