@@ -6,17 +6,15 @@
 
 enum { CONSTANT, RANDOM_WALK, GAUSS_MARKOV, FLICKER, MOVING_AVERAGE, WALK_AND_MARKOV, NAMED_LAWS };
 
-#define FLICKER_DEVIATION 0.85611653F /* sqrt(ln(10)/pi) */
-
 static const selfcal_law_t named_law[NAMED_LAWS] = {
     [CONSTANT] = {0U, false, {{SELFCAL_WALK, 0.0F, 0.0F, false, false}}},
     [RANDOM_WALK] = {1U, false, {{SELFCAL_WALK, 1.0F, 0.0F, false, false}}},
     [GAUSS_MARKOV] = {1U, false, {{SELFCAL_MARKOV, 1.0F, 1.0F, false, false}}},
     [FLICKER] = {3U,
                  false,
-                 {{SELFCAL_MARKOV, FLICKER_DEVIATION, 0.1F, false, false},
-                  {SELFCAL_MARKOV, FLICKER_DEVIATION, 1.0F, false, false},
-                  {SELFCAL_MARKOV, FLICKER_DEVIATION, 10.0F, false, false}}},
+                 {{SELFCAL_MARKOV, 1.0F, 0.05F, false, false},
+                  {SELFCAL_MARKOV, 1.0F, 1.0F, false, false},
+                  {SELFCAL_MARKOV, 1.0F, 20.0F, false, false}}},
     [MOVING_AVERAGE] = {1U, true, {{SELFCAL_WALK, 1.0F, 0.0F, false, false}}},
     /* a correlation time of 100 s */
     [WALK_AND_MARKOV] = {2U, false,

@@ -366,8 +366,8 @@ class Filter:
         if law == "random_walk":
             return Filter(one, rho**2 * one, rho**2 * one)
         assert law in ("gauss_markov", "flicker")
-        rates = alpha * (np.array([0.1, 1.0, 10.0]) if law == "flicker" else one)
-        variance = rho**2 * (math.log(10.0) / math.pi if law == "flicker" else 1.0)
+        rates = alpha * (np.array([0.05, 1.0, 20.0]) if law == "flicker" else one)
+        variance = rho**2
         return Filter(np.exp(-rates), -variance * np.expm1(-2.0 * rates), variance * np.ones(rates.size))
 
 

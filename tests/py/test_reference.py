@@ -172,8 +172,8 @@ def further_covariance(
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     white = np.diag(r) * sigma_v**2
     if law == 3:
-        terms = [np.exp(-second * ratio * DT * lag) for ratio in (0.1, 1.0, 10.0)]
-        return drift**2 * np.log(10.0) / np.pi * sum(terms), white
+        terms = [np.exp(-second * ratio * DT * lag) for ratio in (0.05, 1.0, 20.0)]
+        return drift**2 * sum(terms), white
     if law == 4:
         theta = (second - 1.0) / (second + 1.0)
         mixing = np.eye(n, n + 1, 1) + theta * np.eye(n, n + 1)  # of e_(-1), e_0, ..., e_(n-1)
@@ -215,12 +215,12 @@ def test_further_laws_are_those_of_the_joint_normal_density(law: int, drift: flo
 
 
 def test_flicker_has_the_spectrum_it_states() -> None:
-    """Two-sided spectrum of the three terms, each 2 s^2 a/(a^2 + w^2), against B^2/(2 pi f) = B^2/w: within 12 % over
-    two decades, 2.4 % in the middle (the ripple of one term a decade, and what lies further out is missing)."""
-    w = np.geomspace(0.1, 10.0, 301)
-    ratio = sum(2.0 * np.log(10.0) / np.pi * a / (a**2 + w**2) for a in (0.1, 1.0, 10.0)) * w
-    assert abs(ratio - 1.0).max() < 0.12
-    assert abs(ratio[150] - 1.0) < 0.024
+    """Two-sided spectrum of the three terms, each 2 s^2 a/(a^2 + w^2), against B^2/(2 pi f) = B^2/w: within 20 %
+    between the outer bandwidths (the ripple of terms that far apart), and within 1 % in the mean over ln f."""
+    w = np.geomspace(0.05, 20.0, 301)
+    ratio = sum(2.0 * a / (a**2 + w**2) for a in (0.05, 1.0, 20.0)) * w
+    assert abs(ratio - 1.0).max() < 0.2
+    assert abs(np.log(ratio).mean()) < 0.01
 
 
 def test_bad_arguments_are_refused() -> None:
