@@ -47,6 +47,7 @@ UNTRIED = {
     "replay next.csv": "QEMU; test_warm.py",
     "replay log.csv": "QEMU; test_firmware.py",
     "replay tests/data": "QEMU; test_firmware.py",
+    "fleet ": "recordings of the reader's own; test_fleet.py",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
     "navigate": "minutes; test_navigate.py",

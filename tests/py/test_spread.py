@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -70,9 +71,10 @@ def test_absent_packages_are_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
         spread(partial(squares, None), range(2), settings={}, scheduler="tcp://127.0.0.1:1")
 
 
-@pytest.fixture
-def scheduler() -> Iterator[str]:
-    """A Dask scheduler with a worker, as a user starts them, on ports of their own."""
+@contextmanager
+def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """A Dask scheduler with a worker, as a user starts them, on ports of their own: the address and
+    the processes, the scheduler first."""
     python = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
     started = subprocess.Popen([*python, "--host", "127.0.0.1"], stderr=subprocess.PIPE, text=True)
     assert started.stderr is not None
@@ -85,11 +87,18 @@ def scheduler() -> Iterator[str]:
     assert address is not None
     options = ["--nthreads", "1", "--no-dashboard", "--no-nanny", "--host", "127.0.0.1"]
     command = [sys.executable, "-m", "distributed.cli.dask_worker", address, *options]
-    worker = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    yield address
+    worker = subprocess.Popen(command, stderr=subprocess.DEVNULL, text=True)
+    yield address, [started, worker]
     for process in (worker, started):
         process.terminate()
         process.wait(20)
+
+
+@pytest.fixture
+def scheduler() -> Iterator[str]:
+    """Its address."""
+    with cluster() as (address, _):
+        yield address
 
 
 @needs_cluster

@@ -365,6 +365,71 @@ def compare(
 
 @app.command()
 @_reading_logs
+def fleet(
+    reading: Reading,
+    patterns: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="PATTERN...", help="Recordings: files, or patterns as 'logs/**/*.ulg'", show_default=False
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="FILE", help="Table to write: .csv or .parquet", show_default=False),
+    ],
+    serial_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="name|field",
+            help="Device by the file's name (name:REGEX: by what it finds in the path), or by the metadata",
+        ),
+    ] = None,
+    units_table: Annotated[
+        Path | None, typer.Option(metavar="UNITS.csv", help="Columns file, device, and station, lot, date")
+    ] = None,
+    with_diagnose: Annotated[bool, typer.Option("--diagnose", help="Look for causes too; slower")] = False,
+    fail_on: FailOn = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
+    ] = None,
+    scheduler: Scheduler = None,
+    results: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of finished recordings; default: FILE.parts")
+    ] = None,
+    axis: Axis = None,
+    model: ModelFile = None,
+    start: Start = None,
+    end: End = None,
+    since_power_on: SincePowerOn = 0.0,
+    gate: Gate = False,
+) -> None:
+    """Identify many recordings, and write one table of the units."""
+    from selfcal.verbs import fleet as verb
+
+    result = verb.fleet(
+        patterns,
+        output,
+        serial_from=serial_from,
+        units_table=units_table,
+        diagnose=with_diagnose,
+        fail_on=fail_on,
+        workers=workers,
+        scheduler=scheduler,
+        results=results,
+        axes=axis or (),
+        model=model,
+        start_s=start,
+        end_s=end,
+        since_power_on_s=since_power_on,
+        gate=gate,
+        **reading,
+    )
+    verb.show(result)
+    sys.exit(result["code"])
+
+
+@app.command()
+@_reading_logs
 def convert(
     reading: Reading,
     log: Log,

@@ -8,13 +8,14 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from selfcal import units
 from selfcal.allan import Sampled
 from selfcal.checks import Judged, against, allan_limit
-from selfcal.errors import UserError, printable
+from selfcal.errors import UserError, printable, short
 from selfcal.output import check_place, write_text
 from selfcal.recording import Recording
 from selfcal.regressors import Scored
@@ -22,6 +23,10 @@ from selfcal.result import AxisResult, Estimate
 from selfcal.summary import Number
 
 SCHEMA = "selfcal.identify/1"
+#: Where metadata have the device's serial number and the date.
+SERIALS, DATES = ("serial", "serial_number"), ("recorded_at", "date")
+#: Stamps between 2001 and 2100 count from 1970, s; no device is powered for so long.
+EPOCH_S = (1e9, 4.1e9)
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,21 @@ def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
         **({"options": [list(one) for one in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),
+        **(_origin(recording) if isinstance(recording, Recording) else {}),
     }
+
+
+def _origin(recording: Recording) -> dict[str, str]:
+    """The device's serial number and the date, where the metadata have them; the date also by stamps since 1970."""
+    found = {}
+    for key, names in (("serial", SERIALS), ("recorded_at", DATES)):
+        stated = [recording.meta[name] for name in names if isinstance(recording.meta.get(name), str | int)]
+        if stated and str(stated[0]).strip():
+            found[key] = short(str(stated[0]).strip())
+    began = recording.started_s
+    if "recorded_at" not in found and began is not None and EPOCH_S[0] < began < EPOCH_S[1]:
+        found["recorded_at"] = datetime.fromtimestamp(math.floor(began), UTC).isoformat().replace("+00:00", "Z")
+    return found
 
 
 def as_typed(recording: Mapping[str, Any]) -> str:

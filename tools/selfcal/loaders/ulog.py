@@ -1,7 +1,7 @@
 """PX4's ULog by pyulog: a table a topic and instance.
 
 Stamps are those of the samples (`timestamp_sample`), where a topic has them. `sensor_gyro.0` and `sensor_accel.0` are
-one source, `sensor.0`; a FIFO topic holds several samples a message.
+one source, `sensor.0`; a FIFO topic holds several samples a message. The autopilot's number `sys_uuid` is the serial.
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
     lost = [one.duration for one in log.dropouts]
     notes = (f"the logger dropped out {len(lost)} times, {sum(lost) / 1000:.3g} s together",) if lost else ()
+    serial = log.msg_info_dict.get("sys_uuid", "")
+    meta = {"serial": serial} if isinstance(serial, str) and serial else {}
     tables = []
     for (source, instance), topics in found.items():
         name = source if source == "sensor_combined" else f"{source}.{instance}"
-        tables += [of_arrays(name, _columns(topic, data), notes=notes) for topic, data in topics.items()]
+        tables += [of_arrays(name, _columns(topic, data), meta, notes) for topic, data in topics.items()]
     return tables
 
 

@@ -1,0 +1,276 @@
+"""`selfcal fleet`: a table of many recordings, from which nothing is lost and in which nothing is twice."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal.batch.table import COLUMNS
+from selfcal.errors import UserError
+from selfcal.recording import save
+from selfcal.spread import DEATHS, Row, spread
+from selfcal.verbs.fleet import fleet
+
+from conftest import COMMAND, case_records, run
+
+AXES = ("gx", "gz")
+
+
+def unit(path: Path, seed: int, *, seconds: int = 400, rate_hz: float = 4.0, N: float = 0.03, K: float = 2e-3) -> Path:
+    """A recording of white noise and a walk on two axes."""
+    random, n = np.random.default_rng(seed), int(seconds * rate_hz)
+    walk = np.cumsum(random.standard_normal((2, n)), axis=1) * K / np.sqrt(rate_hz)
+    values = walk + N * np.sqrt(rate_hz) * random.standard_normal((2, n))
+    save(path, {name: ("deg/s", row) for name, row in zip(AXES, values, strict=True)}, rate_hz)
+    return path
+
+
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Five recordings in two folders, the working folder above them."""
+    monkeypatch.chdir(tmp_path)
+    for k in range(5):
+        folder = tmp_path / "logs" / ("a" if k < 3 else "b")
+        folder.mkdir(parents=True, exist_ok=True)
+        unit(folder / f"sn{k:02}.npz", k)
+    return tmp_path
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_row_for_each_unit_axis_and_parameter(logs: Path) -> None:
+    result = fleet(["logs/**/*.npz"], "t.csv", workers=2)
+    rows = table(logs / "t.csv")
+    assert tuple(rows[0]) == COLUMNS
+    assert result["code"] == 0 and result["devices"] == 5
+    keys = [(row["device"], row["axis"], row["parameter"]) for row in rows]
+    assert len(set(keys)) == len(keys)
+    for device in (f"sn{k:02}" for k in range(5)):
+        for axis in AXES:
+            mine = {row["parameter"]: row for row in rows if (row["device"], row["axis"]) == (device, axis)}
+            assert {"N", "bias"} < set(mine)
+            # N of 1600 samples at 4 Hz, in means of 1 s: 400 of them leave 3.5 %; 4 sd
+            assert float(mine["N"]["median"]) == pytest.approx(0.03, rel=0.15)
+            assert mine["N"]["parameter_unit"] == "deg/s/sqrt(Hz)"
+    fine = [row["adequate"] == "true" for row in rows if row["parameter"] == "N"]
+    assert len(fine) == 10 and sum(fine) >= 8  # checks call one clean axis in 60 inadequate
+
+
+def test_what_cannot_be_read_is_a_row(logs: Path) -> None:
+    """Broken in each its own way: text, a cut archive, an empty file, an axis that is stuck."""
+    (logs / "logs/text.csv").write_text("no header\n1,2\n")
+    (logs / "logs/cut.npz").write_bytes((logs / "logs/a/sn00.npz").read_bytes()[:4000])
+    (logs / "logs/empty.ulg").write_bytes(b"")
+    random = np.random.default_rng(1).standard_normal(4000)
+    columns = {"gx": ("deg/s", 0.1 * random), "gy": ("deg/s", np.full(4000, 400.0))}
+    save(logs / "logs/stuck.npz", columns, 10.0)
+    result = fleet(["logs/**/*.*"], "t.csv")
+    rows = {(row["device"], row["axis"]): row for row in table(logs / "t.csv")}
+    for device in ("text", "cut", "empty"):
+        assert rows[device, ""]["error"] and not rows[device, ""]["median"]
+        assert device in result["not_judged"]
+    assert rows["stuck", "gy"]["error"] and not rows["stuck", "gx"]["error"]
+    assert "stuck" in result["not_judged"]
+    assert result["code"] == 2 and result["recordings"] == 9
+
+
+def test_the_command_ends_by_its_code(logs: Path) -> None:
+    """Names the devices without a result; Parquet has the same rows."""
+    (logs / "logs/a/bad.csv").write_text("gx[deg/s]\nx\n")
+    found = run("fleet", "logs/a/*", "-o", "t.csv", cwd=logs)
+    assert found.returncode == 2 and "not judged: bad: " in found.stdout and "Traceback" not in found.stderr
+    assert run("fleet", "logs/b/*", "-o", "t.csv", cwd=logs).returncode == 0
+    assert run("fleet", "logs/b/*", "-o", "t.txt", cwd=logs).returncode == 2
+    missing = run("fleet", "logs/c/*", "-o", "t.csv", cwd=logs)
+    assert missing.returncode == 2 and "no recording matches 'logs/c/*'" in missing.stderr
+    if importlib.util.find_spec("pyarrow") is not None:
+        from pyarrow import parquet
+
+        fleet(["logs/a/*"], "t.csv")
+        fleet(["logs/a/*"], "t.parquet", results="t.csv.parts")
+        kept = parquet.read_table(logs / "t.parquet").to_pylist()
+        rows = table(logs / "t.csv")
+        assert [row["device"] for row in kept] == [row["device"] for row in rows]
+        assert list(kept[0]) == list(COLUMNS)
+        for one, other in zip(kept, rows, strict=True):
+            assert one["median"] is None if not other["median"] else f"{one['median']:.9g}" == other["median"]
+
+
+def test_one_recording_under_two_names_counts_once(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Unless the table of units says that the names are of two devices: then the second has no recording."""
+    shutil.copy("logs/a/sn01.npz", "logs/again.npz")
+    (logs / "logs/link.npz").symlink_to(logs / "logs/a/sn01.npz")
+    assert fleet(["logs/**/*.npz", "logs/a/sn01.npz"], "t.csv")["recordings"] == 5
+    assert "logs/again.npz: the same recording as logs/a/sn01.npz: counted once" in capsys.readouterr().err
+    (logs / "units.csv").write_text("file,device\nlogs/a/sn01.npz,A\nagain.npz,B\n")
+    result = fleet(["logs/a/sn01.npz", "logs/again.npz"], "t.csv", units_table="units.csv")
+    assert result["not_judged"] == {"B": ["is the same recording as logs/a/sn01.npz of device A"]}
+
+
+def test_whose_recording_it_is(logs: Path) -> None:
+    (logs / "units.csv").write_text(
+        "file,device,station,lot,date\nlogs/a/sn00.npz,X7,north,L1,2026-03-01\nsn03.npz,X8,south,L2,2026-03-02\n"
+    )
+    fleet(["logs/**/*.npz"], "t.csv", units_table="units.csv")
+    rows = {row["recording"]: row for row in table(logs / "t.csv")}
+    first = rows["logs/a/sn00.npz"]
+    assert [first[key] for key in ("device", "station", "lot", "recorded_at")] == ["X7", "north", "L1", "2026-03-01"]
+    assert rows["logs/b/sn03.npz"]["device"] == "X8" and rows["logs/a/sn01.npz"]["device"] == "sn01"
+    fleet(["logs/**/*.npz"], "t.csv", serial_from=r"name:sn(\d+)")
+    assert {row["device"] for row in table(logs / "t.csv")} == {"00", "01", "02", "03", "04"}
+    values = 0.1 * np.random.default_rng(5).standard_normal(2000)
+    save("logs/a/meta.npz", {"gx": ("deg/s", values)}, 5.0, {"serial": "Q-9", "date": "2026-05-05"})
+    fleet(["logs/a/*.npz"], "t.csv", serial_from="field")
+    found = {row["recording"]: row for row in table(logs / "t.csv")}
+    assert found["logs/a/meta.npz"]["device"] == "Q-9" and found["logs/a/meta.npz"]["recorded_at"] == "2026-05-05"
+    shutil.copy("logs/a/sn00.npz", "logs/b/sn01.npz")  # another unit's, by the name of one that is there
+    fleet(["logs/**/sn0[13].npz"], "t.csv")
+    assert {row["device"] for row in table(logs / "t.csv")} == {"logs/a/sn01.npz", "logs/b/sn01.npz", "sn03"}
+    for text, words in (
+        ("file,station\n", "its first line must name each of"),
+        ("file,device\nsn00.npz\n", "line 2: 1 fields where the first line has 2"),
+        ("file,device\nlogs/a/sn00.npz,A\nsn00.npz,B\n", "line 3: 'sn00.npz' is there twice"),
+    ):
+        (logs / "units.csv").write_text(text)
+        with pytest.raises(UserError, match=words):
+            fleet(["logs/a/*.npz"], "t.csv", units_table="units.csv")
+
+
+def test_finished_recordings_are_kept(logs: Path) -> None:
+    """A changed file alone is done anew; one that failed is looked at again; other settings are another work."""
+    (logs / "logs/a/bad.csv").write_text("gx[deg/s]\nx\n")
+    fleet(["logs/**/*.*"], "t.csv")
+    first = (logs / "t.csv").read_bytes()
+    parts = logs / "t.csv.parts"
+    stamps = {path: path.stat().st_mtime_ns for path in parts.iterdir()}
+    assert len(stamps) == 5
+    fleet(["logs/**/*.*"], "t.csv")
+    assert (logs / "t.csv").read_bytes() == first
+    assert {path: path.stat().st_mtime_ns for path in parts.iterdir()} == stamps
+    unit(logs / "logs/a/sn02.npz", 77)
+    unit(logs / "logs/a/bad.csv", 78)
+    assert fleet(["logs/**/*.*"], "t.csv")["code"] == 0
+    assert len(list(parts.iterdir())) == 7 and (logs / "t.csv").read_bytes() != first
+    fleet(["logs/**/*.*"], "t.csv", axes=["gz"])
+    assert len(list(parts.iterdir())) == 13
+    assert {row["axis"] for row in table(logs / "t.csv")} == {"gz"}
+    next(iter(parts.iterdir())).write_text("{")  # cut
+    fleet(["logs/**/*.*"], "t.csv", axes=["gz"])
+
+
+def children(pid: int) -> list[int]:
+    """The processes that a process started."""
+    try:
+        tasks = Path(f"/proc/{pid}/task").iterdir()
+        return [int(number) for task in tasks for number in (task / "children").read_text().split()]
+    except OSError:
+        return []
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="NO /proc")
+def test_killed_workers_and_a_killed_run_lose_nothing(tmp_path: Path) -> None:
+    """Three workers are killed by their ids, then the command itself: the end is that of an undisturbed run."""
+    (tmp_path / "logs").mkdir()
+    for k in range(12):
+        unit(tmp_path / f"logs/u{k}.npz", k, seconds=4000, rate_hz=10.0)
+    undisturbed = [*COMMAND, "fleet", "logs/*", "-o", "whole.csv", "--workers", "2"]
+    subprocess.run(undisturbed, cwd=tmp_path, check=True, capture_output=True)
+    command = [*COMMAND, "fleet", "logs/*", "-o", "t.csv", "--workers", "2"]
+    running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    killed: set[int] = set()
+    while running.poll() is None:
+        if len(killed) < 3:
+            for worker in set(children(running.pid)) - killed:
+                os.kill(worker, signal.SIGKILL)
+                killed.add(worker)
+                break
+        elif len(list((tmp_path / "t.csv.parts").glob("*.json"))) >= 2:
+            running.kill()
+        time.sleep(0.1)
+    assert len(killed) == 3 and running.returncode == -signal.SIGKILL
+    assert not (tmp_path / "t.csv").exists()
+    assert subprocess.run(command, cwd=tmp_path, check=True, capture_output=True).returncode == 0
+    assert (tmp_path / "t.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+
+
+def deadly(log: Path, job: int) -> list[Row]:
+    """Job 3 kills whoever does it."""
+    if job == 3:
+        with log.open("a") as stream:
+            stream.write("x")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return [{"job": job}]
+
+
+def test_what_kills_its_worker_is_a_row(tmp_path: Path) -> None:
+    from functools import partial
+
+    log = tmp_path / "log"
+    rows = spread(partial(deadly, log), range(8), settings={}, piece=1, count=2, lost=lambda job: [{"lost": job}])
+    assert rows == [{"lost": job} if job == 3 else {"job": job} for job in range(8)]
+    assert len(log.read_text()) == DEATHS
+
+
+def test_causes_and_their_exit_code(logs: Path) -> None:
+    """A step of 20 sd on one axis of one unit; the others have none."""
+    with np.load(logs / "logs/a/sn01.npz") as archive:
+        values = np.array(archive["gx[deg/s]"])
+        other = np.array(archive["gz[deg/s]"])
+    values[900:] += 1.0
+    save(logs / "logs/a/sn01.npz", {"gx": ("deg/s", values), "gz": ("deg/s", other)}, 4.0)
+    result = fleet(["logs/a/sn0[12].npz"], "t.csv", diagnose=True, fail_on="step")
+    assert result["failed"] == {"sn01": ["step: gx"]} and result["code"] == 1
+    causes = {(row["device"], row["axis"]): row["causes"] for row in table(logs / "t.csv")}
+    assert causes.pop(("sn01", "gx")) == "step"
+    assert "step" not in " ".join(causes.values())
+    with pytest.raises(UserError, match="--fail-on step: give --diagnose too"):
+        fleet(["logs/a/*.npz"], "t.csv", fail_on="step")
+
+
+def test_a_number_of_workers_changes_nothing(logs: Path) -> None:
+    fleet(["logs/b/*.npz"], "one.csv", workers=1)
+    fleet(["logs/b/*.npz"], "three.csv", workers=3)
+    assert (logs / "one.csv").read_bytes() == (logs / "three.csv").read_bytes()
+    kept = next(iter((logs / "one.csv.parts").glob("*.json")))
+    assert set(json.loads(kept.read_text())) == {"recording", "axes"}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="DASK ABSENT: make setup-cluster")
+def test_a_scheduler_that_is_killed_loses_nothing(tmp_path: Path) -> None:
+    """By a cluster the bytes are those of this machine. The scheduler is killed on the way, the command says so in a
+    line, and with another scheduler it goes on."""
+    from test_spread import cluster
+
+    if not case_records(0, 1):
+        pytest.skip("SLOW: make cases")
+    (tmp_path / "logs").mkdir()
+    for k in range(16):
+        unit(tmp_path / f"logs/u{k}.npz", k, seconds=4000, rate_hz=10.0)
+    subprocess.run([*COMMAND, "fleet", "logs/*", "-o", "here.csv"], cwd=tmp_path, check=True, capture_output=True)
+    kept = tmp_path / "t.csv.parts"
+    with cluster() as (address, processes):
+        command = [*COMMAND, "fleet", "logs/*", "-o", "t.csv", "--scheduler", address]
+        running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        while running.poll() is None and len(list(kept.glob("*.json"))) < 3:
+            time.sleep(0.02)
+        processes[0].kill()
+        said = running.communicate(timeout=120)[1]
+    assert running.returncode == 2 and "the Dask scheduler has gone" in said and "Traceback" not in said
+    assert 3 <= len(list(kept.glob("*.json"))) < 16
+    with cluster() as (address, _):
+        command[-1] = address
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    assert (tmp_path / "t.csv").read_bytes() == (tmp_path / "here.csv").read_bytes()

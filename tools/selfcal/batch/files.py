@@ -1,0 +1,207 @@
+"""The recordings of a batch: files by patterns, their hashes, and the unit that each is of."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+from selfcal.errors import UserError, short
+from selfcal.limits import read_text
+from selfcal.recording import meta_place
+
+#: A table of units: 10 000 lines of 100 letters are 1 MB.
+MOST_TABLE_BYTES = 1 << 26
+#: Columns of a table of units; the first two must be there.
+TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
+#: Where a serial number comes from.
+FROM_NAME, FROM_FIELD = "name", "field"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording of the batch.
+
+    `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata beside it. `device`: ""
+    until the recording is read, if its metadata have the serial number. `copy_of`: the recording of another device with
+    the same content.
+    """
+
+    path: str
+    sha256: str = ""
+    content: str = ""
+    size: int = 0
+    device: str = ""
+    station: str = ""
+    lot: str = ""
+    recorded_at: str = ""
+    copy_of: str = ""
+
+
+def matching(patterns: Iterable[str]) -> list[str]:
+    """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
+
+    Raises UserError for a pattern that matches none.
+    """
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        names = [pattern] if Path(pattern).exists() else glob(pattern, recursive=True)  # noqa: PTH207
+        kept = [name for name in names if _is_recording(Path(name))]
+        if not kept:
+            raise UserError(
+                f"no recording matches '{short(pattern)}': give files, or a pattern in quotes as 'logs/**/*.csv'"
+            )
+        found.update(dict.fromkeys(kept))
+    return sorted(found)
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.is_file() and not path.name.endswith(".meta.json")
+
+
+def digest(path: Path) -> str:
+    """sha256 of a file; of a folder that of its files' names and hashes. Raises OSError."""
+    if path.is_dir():
+        named = [f"{one.name} {digest(one)}\n" for one in sorted(path.iterdir()) if one.is_file()]
+        return hashlib.sha256("".join(named).encode("utf-8", "surrogateescape")).hexdigest()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashed(path: str) -> Source:
+    """A recording with its hashes. One that cannot be read has none; its reading says why."""
+    place = Path(path)
+    try:
+        of_file = digest(place)
+        beside = meta_place(place)
+        content = of_file if not beside.is_file() else hashlib.sha256((of_file + digest(beside)).encode()).hexdigest()
+        size = sum(one.stat().st_size for one in (place.iterdir() if place.is_dir() else [place]))
+    except OSError:
+        return Source(path, content=f"unread {path}")
+    return Source(path, of_file, content, size)
+
+
+@dataclass(frozen=True)
+class Named:
+    """The sources, and the names that were left out because another name has the same content."""
+
+    sources: list[Source]
+    copies: dict[str, str]
+
+
+def sources_of(patterns: Sequence[str], table: Path | str | None, serial_from: str | None) -> Named:
+    """The recordings of the patterns, with device, station, lot and date by the table of units, else by `serial_from`.
+
+    A recording under two names of one device is one source. Under the names of two devices the second is a source
+    with `copy_of`: that device has no recording of its own.
+    Raises UserError for a pattern without files, and for a table or a `serial_from` that is none.
+    """
+    named = _serials(matching(patterns), serial_from)
+    units = {} if table is None else _table(Path(table), list(named))
+    sources: list[Source] = []
+    first: dict[str, Source] = {}
+    copies: dict[str, str] = {}
+    for path, device in named.items():
+        known: dict[str, Any] = {"device": device, **units.get(path, {})}
+        one = replace(hashed(path), **known)
+        other = first.setdefault(one.content, one)
+        if other is one:
+            sources.append(one)
+        elif other.device == one.device or path not in units:
+            copies[path] = other.path
+        else:
+            sources.append(replace(one, copy_of=f"{other.path} of device {other.device}"))
+    return Named(sources, copies)
+
+
+def stem(path: str) -> str:
+    """A file's name without its suffixes of a recording: `a.12.csv.gz` is `a.12`."""
+    name = Path(path).name.removesuffix(".gz")
+    return name[: name.rindex(".")] if "." in name[1:] else name
+
+
+def _serials(paths: Sequence[str], serial_from: str | None) -> dict[str, str]:
+    """The device of each path. Nothing stated: the file's name, or its path where two files have the same name."""
+    kind, _, pattern = (serial_from or "").partition(":")
+    if kind == FROM_FIELD and not pattern:
+        return dict.fromkeys(paths, "")
+    if kind == FROM_NAME:
+        return {path: _within(pattern, path) if pattern else stem(path) for path in paths}
+    if kind:
+        raise UserError(f"--serial-from takes name, name:PATTERN or field, not '{short(serial_from or '')}'")
+    return _told_apart({path: stem(path) for path in paths})
+
+
+def _told_apart(named: Mapping[str, str]) -> dict[str, str]:
+    """Names that several files have become their paths."""
+    counted: dict[str, int] = {}
+    for name in named.values():
+        counted[name] = counted.get(name, 0) + 1
+    return {path: name if counted[name] == 1 else path for path, name in named.items()}
+
+
+def _within(pattern: str, path: str) -> str:
+    try:
+        found = re.search(pattern, path)
+    except re.error as error:
+        raise UserError(f"--serial-from name:{short(pattern)}: is no regular expression ({error})") from error
+    if found is None:
+        return stem(path)
+    return found[1] if found.re.groups and found[1] else found[0]
+
+
+def _table(place: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Device, station, lot and date by path. A file is named as the pattern names it, from the table's folder on, or by
+    its bare name."""
+    try:
+        text = read_text(place, MOST_TABLE_BYTES, "not a table of units")
+    except FileNotFoundError as error:
+        raise UserError(f"{place}: there is no such file") from error
+    try:
+        rows = list(csv.reader(io.StringIO(text.removeprefix("\ufeff")), strict=True))
+    except csv.Error as error:
+        raise UserError(f"{place}: not a table of units: {error}") from error
+    header = [cell.strip().lower() for cell in rows[0]] if rows else []
+    if not set(TABLE_COLUMNS[:2]) <= set(header) or len(set(header)) < len(header):
+        raise UserError(
+            f"{place}: its first line must name each of {', '.join(TABLE_COLUMNS)} once; the last three may be left out"
+        )
+    by_place: dict[Path, list[str]] = {}
+    by_name: dict[str, list[str]] = {}
+    for path in paths:
+        by_place.setdefault(Path(path).resolve(), []).append(path)
+        by_name.setdefault(Path(path).name, []).append(path)
+    found: dict[str, dict[str, str]] = {}
+    for number, cells in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in cells):
+            continue
+        if len(cells) != len(header):
+            raise UserError(f"{place}: line {number}: {len(cells)} fields where the first line has {len(header)}")
+        row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+        if not row["file"] or not row["device"]:
+            raise UserError(f"{place}: line {number}: file or device is empty")
+        file = Path(row["file"])
+        meant = [path for one in (file, place.parent / file) for path in by_place.get(one.resolve(), [])]
+        if not meant and file.name == row["file"]:
+            meant = by_name.get(file.name, [])
+            if len(meant) > 1:
+                raise UserError(
+                    f"{place}: line {number}: '{short(file.name)}' is {short(meant[0])} and {short(meant[1])}: "
+                    "give its folder"
+                )
+        entry = {"device": row["device"], "station": row.get("station", ""), "lot": row.get("lot", "")}
+        entry["recorded_at"] = row.get("date", "")
+        for path in dict.fromkeys(meant):
+            if found.setdefault(path, entry) != entry:
+                raise UserError(
+                    f"{place}: line {number}: '{short(row['file'])}' is there twice, with different entries"
+                )
+    return found

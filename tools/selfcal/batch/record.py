@@ -1,0 +1,121 @@
+"""One recording of a batch: what `identify` and `diagnose` find, kept by the recording's content."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from selfcal.errors import UserError, first_line, printable
+from selfcal.output import whole
+from selfcal.spread import Job, Row
+
+#: What is kept of an axis of `identify`, and of one of `diagnose`.
+IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "bias_now", "adequate", "error")
+DIAGNOSED = ("verdict", "not_judged", "unfinished", "error")
+#: Why a recording whose workers die has no result.
+KILLED = "its worker process was killed each time, maybe for want of memory"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How each recording is looked at. `reading` and `stretch`: keywords of `identify` and `diagnose` alike."""
+
+    model: str | None = None
+    axes: tuple[str, ...] = ()
+    diagnose: bool = False
+    reading: Mapping[str, Any] = field(default_factory=dict)
+    stretch: Mapping[str, Any] = field(default_factory=dict)
+
+
+def examined(options: Options, job: Job) -> list[Row]:
+    """One row: the record, or {"error": reason}. `job`: absolute path, content. A broken file never raises."""
+    path = str(job[0])
+    with contextlib.redirect_stderr(io.StringIO()):
+        try:
+            return [_record(options, path)]
+        except UserError as error:
+            return [{"error": str(error).removeprefix(f"{path}: ")}]
+        except MemoryError:
+            return [{"error": "too large for this machine's memory"}]
+        except Exception as error:  # a file that finds a fault of ours is a row like any other
+            return [{"error": f"{type(error).__name__}: {first_line(error)}"}]
+
+
+def killed(_: Job) -> list[Row]:
+    """The row of a recording that no worker survives."""
+    return [{"error": KILLED}]
+
+
+def _record(options: Options, path: str) -> Row:
+    from selfcal.verbs.identify import identify
+
+    given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
+    document = identify(path, suspicion=False, **given)
+    row: Row = {
+        "recording": document["recording"],
+        "axes": {name: _of(axis, IDENTIFIED) for name, axis in document["axes"].items()},
+    }
+    if options.diagnose:
+        row["diagnosis"] = _diagnosis(path, list(document["axes"]), given)
+    return row
+
+
+def _diagnosis(path: str, names: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
+    from selfcal.verbs.diagnose import diagnose
+
+    try:
+        axes = diagnose(path, **given)["axes"]
+    except UserError as error:
+        return {name: {"error": str(error).removeprefix(f"{path}: ")} for name in names}
+    return {
+        name: _of(axis, DIAGNOSED) | {"causes": sorted({one["cause"] for one in axis.get("findings", [])})}
+        for name, axis in axes.items()
+    }
+
+
+def _of(axis: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: axis[key] for key in keys if key in axis}
+
+
+class ByContent:
+    """A folder of finished recordings, a JSON file each, named by the hash of the recording and of the settings.
+
+    A changed file is another recording. A recording without a result is looked at again each time.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self.folder = folder
+        self.settings = json.dumps(settings, sort_keys=True, default=str)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+
+    def place(self, job: Job) -> Path:
+        """The file of a recording."""
+        return self.folder / f"{hashlib.sha256(f'{job[1]} {self.settings}'.encode()).hexdigest()}.json"
+
+    def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
+        """The row of a recording; None if it has none, or a damaged one."""
+        try:
+            row = json.loads(self.place(jobs[0]).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return [row] if isinstance(row, dict) and "axes" in row else None
+
+    def write(self, k: int, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
+        """Keep the row of a recording."""
+        if "error" not in rows[0]:
+            with whole(self.place(jobs[0])) as temporary:
+                temporary.write_text(json.dumps(rows[0]), encoding="utf-8")
+
+
+def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
+    """All that decides a record beside its recording; `model`: its content."""
+    return {"schema": "selfcal.fleet/1", **asdict(options), "model": model, "version": version}

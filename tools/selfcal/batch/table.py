@@ -1,0 +1,132 @@
+"""The table of a batch: a row for each parameter of the most probable law, axis by axis, as CSV or Parquet."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from selfcal.batch.files import Source, stem
+from selfcal.errors import UserError
+from selfcal.output import whole
+from selfcal.result import HALF_90
+
+COLUMNS = (
+    *("device", "recording", "recorded_at", "station", "lot", "sha256", "version", "axis", "parameter"),
+    *("median", "q05", "q95", "parameter_unit", "law", "probability", "adequate", "causes", "error"),
+)
+_NUMBERS = ("median", "q05", "q95", "probability")
+SUFFIXES = (".csv", ".parquet")
+
+
+class Unit:
+    """One recording of the batch with its answer: `record` (batch/record.py), or `error`."""
+
+    def __init__(self, source: Source, record: Mapping[str, Any]) -> None:
+        known = record.get("recording", {})
+        self.source, self.record = source, record
+        self.device: str = source.device or known.get("serial", "") or stem(source.path)
+        self.recorded_at: str = source.recorded_at or known.get("recorded_at", "")
+        self.error: str | None = record.get("error")
+        self.axes: Mapping[str, Any] = record.get("axes", {})
+
+    @property
+    def place(self) -> tuple[str, str, str]:
+        """Its place in the table."""
+        return self.device, self.recorded_at, self.source.path
+
+    @property
+    def errors(self) -> dict[str, str]:
+        """Why it has no result, by axis; "" stands for the whole recording."""
+        if self.error is not None:
+            return {"": self.error}
+        return {name: axis["error"] for name, axis in self.axes.items() if "error" in axis}
+
+    def causes(self, axis: str) -> list[str]:
+        """The causes that `diagnose` finds on an axis."""
+        found: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
+        return found
+
+
+def best(axis: Mapping[str, Any]) -> str:
+    """The most probable law of an axis."""
+    probability: Mapping[str, float] = axis["hypotheses"]
+    return max(probability, key=lambda law: probability[law])
+
+
+def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
+    """The bias at the end of the record, as the other parameters are."""
+    bias = axis["bias_now"]
+    half = HALF_90 * bias["sd"]
+    return {"median": bias["mean"], "q05": bias["mean"] - half, "q95": bias["mean"] + half, "unit": bias["unit"]}
+
+
+def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
+    """The rows of a recording. A recording, or an axis, without a result is one row with its `error`."""
+    source = unit.source
+    head = dict(zip(COLUMNS, (unit.device, source.path, unit.recorded_at, source.station, source.lot), strict=False))
+    head |= {"sha256": source.sha256, "version": version}
+    if unit.error is not None:
+        yield head | {"error": unit.error}
+    for name, axis in unit.axes.items():
+        if "error" in axis:
+            yield head | {"axis": name, "error": axis["error"]}
+            continue
+        law = best(axis)
+        known = {"law": law, "probability": axis["hypotheses"][law], "adequate": axis["adequate"]}
+        known["causes"] = ";".join(unit.causes(name))
+        unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
+        known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
+        for parameter, estimate in {**axis["parameters"][law], "bias": bias_of(axis)}.items():
+            numbers = {key: estimate[key] for key in ("median", "q05", "q95")}
+            yield {**head, "axis": name, "parameter": parameter, **numbers, "parameter_unit": estimate["unit"], **known}
+
+
+def check_table(path: Path | str) -> None:
+    """Raise UserError for a table that cannot be written by its name's ending."""
+    if Path(path).suffix not in SUFFIXES:
+        raise UserError(f"{path}: the table's name ends in {' or '.join(SUFFIXES)}")
+    if Path(path).suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise UserError(f"{path}: Parquet needs pyarrow: make setup-all, or write a .csv")
+
+
+def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:
+    """Write the rows as the ending says."""
+    if Path(path).suffix == ".csv":
+        write_csv(path, COLUMNS, rows)
+        return
+    import pyarrow
+    from pyarrow import parquet
+
+    types = {name: pyarrow.float64() for name in _NUMBERS} | {"adequate": pyarrow.bool_()}
+    kept = list(rows)
+    columns = {
+        name: pyarrow.array([row.get(name) for row in kept], types.get(name, pyarrow.string())) for name in COLUMNS
+    }
+    with whole(path) as temporary:
+        parquet.write_table(pyarrow.table(columns), temporary)
+
+
+def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str, Any]]) -> None:
+    """Write rows with these columns; one that is absent or None is an empty cell."""
+    with (
+        whole(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,
+    ):
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        for row in rows:
+            writer.writerow([_cell(row.get(name)) for name in columns])
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = str(value)
+    return f"'{text}" if text[:1] in ("=", "+", "@", "\t", "\r") else text

@@ -1,0 +1,166 @@
+"""`selfcal fleet`: many recordings at once, and the table of the units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Unpack
+
+from rich.console import Console
+
+from selfcal.batch.files import sources_of
+from selfcal.batch.record import ByContent, Options, examined, killed, settings_of
+from selfcal.batch.table import Unit, check_table, rows_of, write_table
+from selfcal.document import check_writable
+from selfcal.errors import UserError, note, printable
+from selfcal.fail_on import check, outcome
+from selfcal.loaders import Reading
+from selfcal.model import Model
+from selfcal.spread import spread
+from selfcal.verbs import montecarlo
+
+SCHEMA = "selfcal.fleet/1"
+#: Names that are printed of a kind at most.
+MOST_NAMES = 40
+
+
+def fleet(
+    patterns: Sequence[Path | str],
+    output: Path | str,
+    *,
+    serial_from: str | None = None,
+    units_table: Path | str | None = None,
+    diagnose: bool = False,
+    fail_on: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    results: Path | str | None = None,
+    axes: Sequence[str] = (),
+    model: Path | str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    since_power_on_s: float = 0.0,
+    gate: bool = False,
+    **reading: Unpack[Reading],
+) -> dict[str, Any]:
+    """Identify every recording of the batch and write the table `output`, .csv or .parquet.
+
+    `patterns`: files, or patterns as 'logs/**/*.ulg'. `serial_from`: 'name', the file's; 'name:PATTERN', what a regular
+    expression finds in the path; 'field', the recording's metadata. `units_table`: a CSV of file, device, station, lot
+    and date. `diagnose`: the causes too. `fail_on`: see fail_on.py; a cause needs `diagnose`.
+    `workers`: processes here, one for each processor by default; `scheduler`: a Dask scheduler's address instead.
+    `results`: the folder that keeps finished recordings, OUTPUT.parts by default: a run that was stopped goes on, and a
+    changed file is done anew. The other options are those of `identify`, for each recording.
+    Returns the document `selfcal.fleet/1`: by device what failed, what could not be judged, and the exit `code`.
+    Raises UserError for what the user can put right; a broken recording is a row of the table.
+    """
+    check_table(output)
+    dbc = reading.get("dbc")
+    check_writable(output, inputs=(model, units_table, dbc))
+    check(fail_on)
+    if fail_on is not None and fail_on != "inadequate" and not diagnose:
+        raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
+    if workers is not None and workers < 1:
+        raise UserError("--workers must be at least 1")
+    loaded = Model.load(model)
+    for name in axes:
+        loaded.group_of(name)
+    named = sources_of([str(one) for one in patterns], units_table, serial_from)
+    if Path(output).resolve() in {Path(one.path).resolve() for one in named.sources}:
+        raise UserError(f"{output}: is one of the recordings: give the table a name of its own")
+    for copy, other in named.copies.items():
+        note(f"{copy}: the same recording as {other}: counted once")
+    options = Options(
+        None if model is None else str(Path(model).absolute()),
+        tuple(axes),
+        diagnose,
+        {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
+        {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
+    )
+    version = _version()
+    folder = Path(f"{output}.parts") if results is None else Path(results)
+    keeper = ByContent(folder, settings_of(options, montecarlo.settings_of(loaded), version))
+    own = [one for one in named.sources if not one.copy_of]
+    found = spread(
+        partial(examined, options),
+        [(str(Path(one.path).absolute()), one.content) for one in own],
+        settings={},
+        piece=1,
+        scheduler=scheduler,
+        results=keeper,
+        count=workers,
+        lost=killed,
+        weights=[one.size + 1.0 for one in own],
+        verb="fleet",
+    )
+    record_of = dict(zip((one.path for one in own), found, strict=True))
+    batch = [
+        Unit(one, record_of.get(one.path, {"error": f"is the same recording as {one.copy_of}"}))
+        for one in named.sources
+    ]
+    batch.sort(key=lambda unit: unit.place)
+    write_table(output, (row for unit in batch for row in rows_of(unit, version)))
+    return _document(batch, fail_on)
+
+
+def _version() -> str:
+    import selfcal
+
+    return str(selfcal.__version__)
+
+
+def _document(batch: Sequence[Unit], fail_on: str | None) -> dict[str, Any]:
+    """What the batch comes to, by device."""
+    failed: dict[str, list[str]] = {}
+    unjudged: dict[str, list[str]] = {}
+    for unit in batch:
+        for axis, reason in unit.errors.items():
+            unjudged.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
+        if fail_on is not None and unit.error is None:
+            shown, lines = _by_cause(unit, fail_on)
+            if shown:
+                failed.setdefault(unit.device, []).append(f"{fail_on}: {', '.join(shown)}")
+            elif lines:
+                unjudged.setdefault(unit.device, []).extend(lines)
+    devices = dict.fromkeys(unit.device for unit in batch)
+    return {
+        "schema": SCHEMA,
+        "devices": len(devices),
+        "recordings": len(batch),
+        "failed": failed,
+        "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in unjudged.items()},
+        "code": 1 if failed else 2 if unjudged else 0,
+    }
+
+
+def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
+    """The axes that show it, and why others cannot be judged."""
+    shown, lines = [], []
+    diagnosis = unit.record.get("diagnosis", {})
+    for name, axis in unit.axes.items():
+        if "error" not in axis:
+            found = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
+            shown += [name] if found.code == 1 else []
+            lines += found.lines
+    return shown, lines
+
+
+def show(document: Mapping[str, Any]) -> None:
+    """What a person reads: how many, and by name the devices that need a look."""
+    console = Console()
+    for line in _lines(document):
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{document['recordings']} recordings of {document['devices']} devices"
+    yield from _listed("failed", document["failed"])
+    yield from _listed("not judged", document["not_judged"])
+
+
+def _listed(what: str, devices: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    for device, reasons in list(devices.items())[:MOST_NAMES]:
+        yield f"{what}: {device}: {'; '.join(reasons)}"
+    if len(devices) > MOST_NAMES:
+        yield f"{what}: {len(devices) - MOST_NAMES} more: the table names them"
