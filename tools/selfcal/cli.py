@@ -126,6 +126,14 @@ FailOn = Annotated[
         "--fail-on", metavar="inadequate|CAUSE", help="Exit code 1 when an axis shows it, 2 when one cannot be judged"
     ),
 ]
+Limits = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="LIMITS.yaml", help="Limits of a data sheet; exit code 1 when one fails, 2 when one cannot be told"
+    ),
+]
+Junit = Annotated[Path | None, typer.Option(metavar="FILE.xml", help="Write the limits' verdicts as JUnit's XML")]
+Verdicts = Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the limits' verdicts as CSV")]
 NoTime = Annotated[bool, typer.Option("--no-time", help="Leave the time column out; takes --rate")]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Skip lines of a text that are no rows, and count them")]
 Source = Annotated[
@@ -187,16 +195,27 @@ def _reading_logs(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _judge(result: Mapping[str, Any], fail_on: str | None) -> None:
-    """End by the signal that came, else by what `--fail-on` makes of the result."""
+    """End by the signal that came, else by what `--fail-on` and the limits make of the result."""
     Held().check()
+    codes = [0]
     if fail_on is not None:
         from selfcal.fail_on import outcome
 
         found = outcome(result, fail_on)
         for line in found.lines:
             note(line)
-        if found.code:
-            sys.exit(found.code)
+        codes.append(found.code)
+    if "limits" in result:
+        from selfcal.verdicts import PASS, Verdict, code_of
+
+        known = ("recording", "device")
+        verdicts = [Verdict.of({k: v for k, v in one.items() if k not in known}) for one in result["limits"]]
+        for one, entry in zip(verdicts, result["limits"], strict=True):
+            if one.verdict != PASS:
+                note(f"{entry['recording']}: {one.words}" if "recording" in entry else one.words)
+        codes.append(code_of(verdicts))
+    if any(codes):
+        sys.exit(1 if 1 in codes else 2)
 
 
 @app.command()
@@ -235,6 +254,9 @@ def identify(
         bool, typer.Option("--no-suspicion", help="No second look at the axes that are not adequate")
     ] = False,
     fail_on: FailOn = None,
+    limits: Limits = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
     start: Start = None,
     end: End = None,
     since_power_on: SincePowerOn = 0.0,
@@ -257,6 +279,9 @@ def identify(
         overbound=overbound,
         suspicion=not no_suspicion,
         fail_on=fail_on,
+        limits=limits,
+        junit=junit,
+        verdicts=verdicts,
         start_s=start,
         end_s=end,
         since_power_on_s=since_power_on,
@@ -290,6 +315,9 @@ def diagnose(
         Path | None, typer.Option(metavar="LOG", help="Measure each finding's gain on a second recording of the part")
     ] = None,
     fail_on: FailOn = None,
+    limits: Limits = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
     start: Start = None,
     end: End = None,
     since_power_on: SincePowerOn = 0.0,
@@ -309,6 +337,9 @@ def diagnose(
         write_model=write_model,
         on=on,
         fail_on=fail_on,
+        limits=limits,
+        junit=junit,
+        verdicts=verdicts,
         start_s=start,
         end_s=end,
         since_power_on_s=since_power_on,
@@ -337,6 +368,9 @@ def compare(
             metavar="changed|inadequate|CAUSE", help="Exit code 1 when an axis shows it, 2 when one cannot be judged"
         ),
     ] = None,
+    limits: Limits = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
     start: Start = None,
     end: End = None,
     gate: Gate = False,
@@ -352,6 +386,9 @@ def compare(
         model=model,
         decimate=decimate,
         fail_on=fail_on,
+        limits=limits,
+        junit=junit,
+        verdicts=verdicts,
         start_s=start,
         end_s=end,
         gate=gate,
@@ -389,6 +426,9 @@ def fleet(
     ] = None,
     with_diagnose: Annotated[bool, typer.Option("--diagnose", help="Look for causes too; slower")] = False,
     fail_on: FailOn = None,
+    limits: Limits = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
     ] = None,
@@ -413,6 +453,9 @@ def fleet(
         units_table=units_table,
         diagnose=with_diagnose,
         fail_on=fail_on,
+        limits=limits,
+        junit=junit,
+        verdicts=verdicts,
         workers=workers,
         scheduler=scheduler,
         results=results,

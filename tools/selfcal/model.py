@@ -317,6 +317,31 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def read_yaml(path: Path, kind: str) -> dict[str, Any]:
+    """The mapping of a YAML file of at most MOST_MODEL_BYTES. `kind`: a name for messages, remarks in brackets after
+    it. Raises UserError, with the line where there is one."""
+    plain = kind.split(" (")[0]
+    try:
+        text = read_text(path, MOST_MODEL_BYTES, "not a text file")
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the {plain}: {error.strerror}") from error
+    with reading(path, f"not a {plain}"):
+        try:
+            tree = yaml.load(text, Loader=_Loader)  # a safe loader
+        except yaml.YAMLError as error:
+            mark, what = None, "not valid YAML"
+            if isinstance(error, yaml.MarkedYAMLError):
+                mark = error.problem_mark
+                if isinstance(error, yaml.constructor.ConstructorError) and error.context is None:
+                    what = str(error.problem)  # of _Loader, or an unknown tag
+            line = f"line {mark.line + 1}: " if mark is not None else ""
+            tab = "; indent by spaces: YAML takes no tabs" if "'\\t'" in str(error) else ""
+            raise UserError(f"{path}: {line}{what}{tab}") from error
+    if not isinstance(tree, dict):
+        raise UserError(f"{path}: not a {kind}")
+    return tree
+
+
 class _Reader:
     """Walks the YAML tree; every complaint carries the file and the dotted name of the entry."""
 
@@ -328,25 +353,7 @@ class _Reader:
         return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
 
     def tree(self) -> dict[str, Any]:
-        try:
-            text = read_text(self.path, MOST_MODEL_BYTES, "not a text file")
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot read the model file: {error.strerror}") from error
-        with reading(self.path, "not a model file"):
-            try:
-                tree = yaml.load(text, Loader=_Loader)  # a safe loader
-            except yaml.YAMLError as error:
-                mark, what = None, "not valid YAML"
-                if isinstance(error, yaml.MarkedYAMLError):
-                    mark = error.problem_mark
-                    if isinstance(error, yaml.constructor.ConstructorError) and error.context is None:
-                        what = str(error.problem)  # of _Loader, or an unknown tag
-                line = f"line {mark.line + 1}: " if mark is not None else ""
-                tab = "; indent by spaces: YAML takes no tabs" if "'\\t'" in str(error) else ""
-                raise UserError(f"{self.path}: {line}{what}{tab}") from error
-        if not isinstance(tree, dict):
-            raise UserError(f"{self.path}: not a model file (a YAML mapping with schema: {SCHEMA})")
-        return tree
+        return read_yaml(self.path, f"model file (a YAML mapping with schema: {SCHEMA})")
 
     def entry(self, tree: Mapping[str, Any], key: str, where: str) -> Any:
         if key not in tree:

@@ -18,10 +18,12 @@ from selfcal.ending import Held
 from selfcal.errors import UserError, called, printable
 from selfcal.fail_on import CHANGED, check
 from selfcal.loaders import Reading
+from selfcal.model import Model
 from selfcal.result import HALF_90
 from selfcal.results import Comparison
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
+from selfcal.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
 
 SCHEMA = "selfcal.compare/1"
 #: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
@@ -37,6 +39,9 @@ def compare(
     model: Path | str | None = None,
     decimate: float | None = None,
     fail_on: str | None = None,
+    limits: Path | str | None = None,
+    junit: Path | str | None = None,
+    verdicts: Path | str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
     gate: bool = False,
@@ -52,32 +57,40 @@ def compare(
     not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
     `decimate`, `start_s`, `end_s`, `gate`, `reading`: as `diagnose` has them, of each recording. `fail_on`: see
     fail_on.py; it is only checked here. `report`: file for a page with tables and pictures.
+    `limits`, `junit`, `verdicts`: as `identify` has them, of each recording.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     if len(logs) < 2:
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
-    check_writable(json, report, inputs=(*logs, model))
+    check_options(limits, junit, verdicts)
+    check_writable(json, report, junit, verdicts, inputs=(*logs, model, limits))
+    bounds = None if limits is None else Limits.load(limits, Model.load(model))
     seen = []
-    verdicts: dict[str, dict[str, Any]] = {}
+    judged: list[Judged] = []
+    by_log: dict[str, dict[str, Any]] = {}
     curves: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
     for log in logs:
-        identified = identify(log, suspicion=False, **part)["axes"]
+        document = identify(log, suspicion=False, **part)
+        identified = document["axes"]
+        if bounds is not None:
+            add_verdicts(document, bounds, None, None)
+            judged.append(("", str(log), [Verdict.of(one) for one in document["limits"]]))
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
         Held().check()
-        verdicts[str(log)] = {
+        by_log[str(log)] = {
             name: _verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         for name, axis in identified.items():
             if axis.get("allan"):
                 curves.setdefault(name, {})[str(log)] = axis["allan"]
         seen.append({name: _quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
-    compared = {name: _Compared() for name in sorted({name for one in verdicts.values() for name in one})}
+    compared = {name: _Compared() for name in sorted({name for one in by_log.values() for name in one})}
     for (first, before), (second, after) in pairwise(zip(map(str, logs), seen, strict=True)):
         for name, one in compared.items():
-            error = _incomparable({log: verdicts[log].get(name) for log in (first, second)})
+            error = _incomparable({log: by_log[log].get(name) for log in (first, second)})
             if error is not None:
                 one.errors += [error] if error not in one.errors else []
             elif name in before and name in after:
@@ -88,10 +101,13 @@ def compare(
         "schema": SCHEMA,
         "recordings": [str(log) for log in logs],
         "axes": {name: one.entry() for name, one in compared.items()},
-        "verdicts": verdicts,
+        "verdicts": by_log,
         "quantities": dict(zip(map(str, logs), seen, strict=True)),
         "limit_sd": LIMIT,
     }
+    if bounds is not None:
+        document["limits"] = [{**one.entry(), "recording": log} for _, log, found in judged for one in found]
+        write(judged, junit, verdicts)
     none = not any(one.pairs for one in compared.values())
     if json is not None and not (none and fail_on is None):
         write_json(document, json)

@@ -32,6 +32,7 @@ from selfcal.recording import Recording, list_of, load
 from selfcal.results import Diagnosis
 from selfcal.table import since
 from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
+from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
@@ -41,6 +42,7 @@ FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
 PATIENCE_S = 0.3
 
 
+@on_a_line
 def diagnose(
     log: Path | str | Sequence[Path | str],
     *,
@@ -53,6 +55,9 @@ def diagnose(
     write_model: Path | str | None = None,
     on: Path | str | None = None,
     fail_on: str | None = None,
+    limits: Path | str | None = None,
+    junit: Path | str | None = None,
+    verdicts: Path | str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
     since_power_on_s: float = 0.0,
@@ -69,20 +74,22 @@ def diagnose(
     `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
-    only checked here. `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has them; times found are those of
-    the whole recording.
+    only checked here. `limits`, `junit`, `verdicts`, `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has
+    them; times found are those of the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
     check(fail_on)
+    check_options(limits, junit, verdicts)
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
-    check_writable(json, report, write_model, inputs=(*list_of(log), model))
+    check_writable(json, report, write_model, junit, verdicts, inputs=(*list_of(log), model, limits))
     if write_model is not None:
         check_not_by_hand(write_model)
     loaded = Model.load(model)
+    bounds = None if limits is None else Limits.load(limits, loaded)
     recording = load(log, sensors=loaded.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
@@ -138,6 +145,8 @@ def diagnose(
                 doing.now("pictures")
                 given = _given(axes, model, decimate, recording)
                 write_page(report, document, record, found, given)
+    if bounds is not None:
+        add_verdicts(document, bounds, junit, verdicts)
     if json is not None:
         write_json(document, json)
     return Diagnosis(document)

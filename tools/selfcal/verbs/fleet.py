@@ -19,6 +19,7 @@ from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.spread import spread
 from selfcal.verbs import montecarlo
+from selfcal.verdicts import FAIL, PASS, Judged, Limits, check_options, judge, unjudged, write
 
 SCHEMA = "selfcal.fleet/1"
 #: Names that are printed of a kind at most.
@@ -33,6 +34,9 @@ def fleet(
     units_table: Path | str | None = None,
     diagnose: bool = False,
     fail_on: str | None = None,
+    limits: Path | str | None = None,
+    junit: Path | str | None = None,
+    verdicts: Path | str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
@@ -49,6 +53,7 @@ def fleet(
     `patterns`: files, or patterns as 'logs/**/*.ulg'. `serial_from`: 'name', the file's; 'name:PATTERN', what a regular
     expression finds in the path; 'field', the recording's metadata. `units_table`: a CSV of file, device, station, lot
     and date. `diagnose`: the causes too. `fail_on`: see fail_on.py; a cause needs `diagnose`.
+    `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
     `workers`: processes here, one for each processor by default; `scheduler`: a Dask scheduler's address instead.
     `results`: the folder that keeps finished recordings, OUTPUT.parts by default: a run that was stopped goes on, and a
     changed file is done anew. The other options are those of `identify`, for each recording.
@@ -57,7 +62,8 @@ def fleet(
     """
     check_table(output)
     dbc = reading.get("dbc")
-    check_writable(output, inputs=(model, units_table, dbc))
+    check_options(limits, junit, verdicts)
+    check_writable(output, junit, verdicts, inputs=(model, units_table, dbc, limits))
     check(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
@@ -66,6 +72,7 @@ def fleet(
     loaded = Model.load(model)
     for name in axes:
         loaded.group_of(name)
+    bounds = None if limits is None else Limits.load(limits, loaded)
     named = sources_of([str(one) for one in patterns], units_table, serial_from)
     if Path(output).resolve() in {Path(one.path).resolve() for one in named.sources}:
         raise UserError(f"{output}: is one of the recordings: give the table a name of its own")
@@ -101,7 +108,10 @@ def fleet(
     ]
     batch.sort(key=lambda unit: unit.place)
     write_table(output, (row for unit in batch for row in rows_of(unit, version)))
-    return _document(batch, fail_on)
+    judged = [] if bounds is None else _judged(batch, bounds)
+    if bounds is not None:
+        write(judged, junit, verdicts)
+    return _document(batch, fail_on, judged)
 
 
 def _version() -> str:
@@ -110,27 +120,52 @@ def _version() -> str:
     return str(selfcal.__version__)
 
 
-def _document(batch: Sequence[Unit], fail_on: str | None) -> dict[str, Any]:
+def _judged(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
+    """The verdicts of each recording. A group's limit holds for the axes that any recording of the batch has."""
+    stated = limits.of({name for unit in batch for name in unit.axes})
+    return [
+        (
+            unit.device,
+            unit.source.path,
+            judge(stated, unit.axes, unit.record["recording"]["duration_s"])
+            if unit.error is None
+            else unjudged(stated, unit.error),
+        )
+        for unit in batch
+    ]
+
+
+def _document(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
     """What the batch comes to, by device."""
     failed: dict[str, list[str]] = {}
-    unjudged: dict[str, list[str]] = {}
+    open_: dict[str, list[str]] = {}
+    broken = {unit.source.path for unit in batch if unit.error is not None}  # their error is listed below
+    for device, path, verdicts in judged:
+        for one in verdicts:
+            if one.verdict != PASS and path not in broken:
+                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
     for unit in batch:
         for axis, reason in unit.errors.items():
-            unjudged.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
+            open_.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
         if fail_on is not None and unit.error is None:
             shown, lines = _by_cause(unit, fail_on)
             if shown:
                 failed.setdefault(unit.device, []).append(f"{fail_on}: {', '.join(shown)}")
             elif lines:
-                unjudged.setdefault(unit.device, []).extend(lines)
+                open_.setdefault(unit.device, []).extend(lines)
     devices = dict.fromkeys(unit.device for unit in batch)
     return {
         "schema": SCHEMA,
         "devices": len(devices),
         "recordings": len(batch),
         "failed": failed,
-        "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in unjudged.items()},
-        "code": 1 if failed else 2 if unjudged else 0,
+        "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in open_.items()},
+        "limits": [
+            {"device": device, "recording": path, **one.entry()}
+            for device, path, verdicts in judged
+            for one in verdicts
+        ],
+        "code": 1 if failed else 2 if open_ else 0,
     }
 
 

@@ -35,6 +35,7 @@ from selfcal.result import AxisResult, in_unit
 from selfcal.results import Identification
 from selfcal.summary import summarize
 from selfcal.tables import make_tables
+from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
@@ -45,6 +46,7 @@ SPACING_LEAST = 0.01
 MORE_LAWS_MOST = 5000
 
 
+@on_a_line
 def identify(
     log: Path | str | Sequence[Path | str],
     *,
@@ -59,6 +61,9 @@ def identify(
     overbound: float | None = None,
     suspicion: bool = True,
     fail_on: str | None = None,
+    limits: Path | str | None = None,
+    junit: Path | str | None = None,
+    verdicts: Path | str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
     since_power_on_s: float = 0.0,
@@ -73,6 +78,7 @@ def identify(
     `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
     `export`: a format of `selfcal.export` and the file to write. `suspicion`: look at the axes that are not adequate
     once more, for the cause that explains most. `fail_on`: see fail_on.py; it is only checked here.
+    `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
     `start_s`, `end_s`: the stretch of the recording to look at, s. `since_power_on_s`: from power-on to the recording's
     beginning, s. `gate`: without the bank intervals in which the
     model's stationary gate sees motion.
@@ -80,7 +86,10 @@ def identify(
     UserError for what the user can put right, and if no axis has a result.
     """
     check(fail_on)
-    check_writable(json, plot, None if export is None else export[1], inputs=(*list_of(log), model))
+    check_options(limits, junit, verdicts)
+    check_writable(
+        json, plot, None if export is None else export[1], junit, verdicts, inputs=(*list_of(log), model, limits)
+    )
     if plot is not None:
         check_picture(plot)
     if export is not None and export[0] not in FORMS:
@@ -94,6 +103,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
+    bounds = None if limits is None else Limits.load(limits, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
@@ -134,6 +144,8 @@ def identify(
             if model is None:
                 progress.update(task, description="more laws")
                 _weigh_more_laws(document, recording, doubtful)
+    if bounds is not None:
+        add_verdicts(document, bounds, junit, verdicts)
     if json is not None:
         write_json(document, json)
     if export is not None:
