@@ -429,6 +429,7 @@ def fleet(
     limits: Limits = None,
     junit: Junit = None,
     verdicts: Verdicts = None,
+    json: Json = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
     ] = None,
@@ -456,6 +457,7 @@ def fleet(
         limits=limits,
         junit=junit,
         verdicts=verdicts,
+        json=json,
         workers=workers,
         scheduler=scheduler,
         results=results,
@@ -467,7 +469,7 @@ def fleet(
         gate=gate,
         **reading,
     )
-    verb.show(result)
+    verb.show(result, to_stderr=str(json) == "-")
     sys.exit(result["code"])
 
 

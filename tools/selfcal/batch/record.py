@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from selfcal.checks import CHECK_LIMIT
 from selfcal.errors import UserError, first_line, printable
 from selfcal.output import whole
 from selfcal.spread import Job, Row
@@ -18,6 +19,12 @@ from selfcal.spread import Job, Row
 #: What is kept of an axis of `identify`, and of one of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "not_judged", "unfinished", "error")
+#: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
+READINGS = ("saturation", "outliers", "held_samples", "motion", "stuck")
+INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
+FAR = 8.0
+#: Distinct readings from which on their lattice is known.
+LEAST_DISTINCT = 8
 #: Why a recording whose workers die has no result.
 KILLED = "its worker process was killed each time, maybe for want of memory"
 
@@ -59,7 +66,7 @@ def _record(options: Options, path: str) -> Row:
     document = identify(path, suspicion=False, **given)
     row: Row = {
         "recording": document["recording"],
-        "axes": {name: _of(axis, IDENTIFIED) for name, axis in document["axes"].items()},
+        "axes": {name: _of(axis, IDENTIFIED) | _looks(axis) for name, axis in document["axes"].items()},
     }
     if options.diagnose:
         row["diagnosis"] = _diagnosis(path, list(document["axes"]), given)
@@ -81,6 +88,25 @@ def _diagnosis(path: str, names: Sequence[str], given: Mapping[str, Any]) -> dic
 
 def _of(axis: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
     return {key: axis[key] for key in keys if key in axis}
+
+
+def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
+    """What the readings and the innovations show at once: `marks`, and the `lattice` of the readings where they lie on
+    one. Chance gives a sound axis no mark."""
+    if "error" in axis:
+        return {}
+    checks = axis["checks"]
+    failed = {name: one for name, one in checks.items() if not one["passed"]}
+    marks = [name for name in failed if name in READINGS]
+    marks += [name for name, one in failed.items() if name in INNOVATIONS and _far(one)]
+    marks += ["stuck"] if axis["samples_kept_out"].get("stuck", 0) else []
+    lattice = checks.get("lattice", {})
+    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
+    return {"marks": list(dict.fromkeys(marks)), **known}
+
+
+def _far(check: Mapping[str, Any]) -> bool:
+    return abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
 
 
 class ByContent:

@@ -11,8 +11,9 @@ from rich.console import Console
 
 from selfcal.batch.files import sources_of
 from selfcal.batch.record import ByContent, Options, examined, killed, settings_of
+from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import Unit, check_table, rows_of, write_table
-from selfcal.document import check_writable
+from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError, note, printable
 from selfcal.fail_on import check, outcome
 from selfcal.loaders import Reading
@@ -37,6 +38,7 @@ def fleet(
     limits: Path | str | None = None,
     junit: Path | str | None = None,
     verdicts: Path | str | None = None,
+    json: Path | str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
@@ -57,13 +59,14 @@ def fleet(
     `workers`: processes here, one for each processor by default; `scheduler`: a Dask scheduler's address instead.
     `results`: the folder that keeps finished recordings, OUTPUT.parts by default: a run that was stopped goes on, and a
     changed file is done anew. The other options are those of `identify`, for each recording.
-    Returns the document `selfcal.fleet/1`: by device what failed, what could not be judged, and the exit `code`.
+    Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
+    and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     check_table(output)
     dbc = reading.get("dbc")
     check_options(limits, junit, verdicts)
-    check_writable(output, junit, verdicts, inputs=(model, units_table, dbc, limits))
+    check_writable(output, junit, verdicts, json, inputs=(model, units_table, dbc, limits))
     check(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
@@ -111,7 +114,11 @@ def fleet(
     judged = [] if bounds is None else _judged(batch, bounds)
     if bounds is not None:
         write(judged, junit, verdicts)
-    return _document(batch, fail_on, judged)
+    summary = summed_up(batch, loaded)
+    document = {**_document(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
+    if json is not None:
+        write_json(document, json)
+    return document
 
 
 def _version() -> str:
@@ -181,15 +188,17 @@ def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
     return shown, lines
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: how many, and by name the devices that need a look."""
-    console = Console()
+    console = Console(stderr=to_stderr)
     for line in _lines(document):
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"{document['recordings']} recordings of {document['devices']} devices"
+    yield from document["words"]
+    yield from _listed("unlike the batch", document["unlike"])
     yield from _listed("failed", document["failed"])
     yield from _listed("not judged", document["not_judged"])
 

@@ -1,0 +1,269 @@
+"""The population behind a batch: mean and spread of each quantity, each unit's shrunken estimate, units unlike it.
+
+Empirical Bayes on the posteriors. A unit's quantity x (ln N, ln K, ... or the bias itself) is drawn from a normal of
+mean m and spread t. Its recording measures x with the error that its own posterior has, s:
+
+    y | x ~ N(x, s^2)      x ~ N(m + group, t^2)
+
+m has a flat prior and is integrated out in closed form. t has Jeffreys' prior, t sqrt(sum (t^2 + s^2)^-2), on a grid.
+A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtri
+
+from selfcal.result import HALF_90, of_mixture
+
+Array = NDArray[np.float64]
+#: Units that make a population, and that make a group.
+FEWEST, FEWEST_OF_GROUP = 5, 3
+#: Points of the grid of spreads, and its reach from the spread of the estimates.
+_POINTS, _LEAST, _MOST = 160, 1e-3, 8.0
+#: Probability that a sound unit is called unlike, and that a batch without groups is said to have one.
+FALSE_ALARM = 1e-3
+#: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
+_MAD, _MEDIAN = 1.4826, 1.2533
+#: Robust standard deviations beyond which an estimate is not fitted at first.
+_FIRST = 4.0
+#: Rounds of fit and choice at most.
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One quantity over the units that have it: `y` and `s` [n], the places of the units among all, and whether y is a
+    logarithm."""
+
+    name: str
+    unit: str
+    law: str
+    y: Array
+    s: Array
+    at: NDArray[np.intp]
+    logarithm: bool = True
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Median and the ends of the 90 % interval."""
+
+    median: float
+    q05: float
+    q95: float
+
+    def through(self, function: Callable[[float], float]) -> Interval:
+        """Of a rising function of it."""
+        return Interval(function(self.median), function(self.q05), function(self.q95))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A population: spreads `t` [p] with weights, mean and its variance at each."""
+
+    t: Array
+    weight: Array
+    mean: Array
+    variance: Array
+
+    @property
+    def middle(self) -> Interval:
+        """The population's mean."""
+        _, _, q05, median, q95 = of_mixture(self.weight, self.mean, np.sqrt(self.variance))
+        return Interval(median, q05, q95)
+
+    @property
+    def spread(self) -> Interval:
+        """The population's standard deviation."""
+        total = np.cumsum(self.weight)
+        total = (total - 0.5 * self.weight) / float(total[-1])
+        q05, median, q95 = (float(np.interp(p, total, self.t)) for p in (0.05, 0.5, 0.95))
+        return Interval(median, q05, q95)
+
+    def shrunken(self, y: float, s: float, offset: float = 0.0) -> Interval:
+        """A unit's quantity, by its recording and the population."""
+        share = self.t**2 / (self.t**2 + s**2)
+        mean = self.mean + share * (y - offset - self.mean)
+        variance = share * s**2 + (1.0 - share) ** 2 * self.variance
+        _, _, q05, median, q95 = of_mixture(self.weight, mean, np.sqrt(variance))
+        return Interval(median + offset, q05 + offset, q95 + offset)
+
+    def log_p(self, y: Array, s: Array) -> Array:
+        """ln of the probability that a unit of the population lies as far off as `y` [n], on either side."""
+        sd = np.sqrt(self.t**2 + s[:, None] ** 2 + self.variance)
+        tail = math.log(2.0) + log_ndtr(-np.abs(y[:, None] - self.mean) / sd)
+        high = tail.max(axis=1)
+        mixed: Array = np.minimum(high + np.log((self.weight * np.exp(tail - high[:, None])).sum(axis=1)), 0.0)
+        return mixed
+
+
+def fit(y: Array, s: Array) -> Fit:
+    """The population of measured `y` [n] with errors `s` [n]."""
+    variance = s**2
+    scale = math.sqrt(float(np.var(y, ddof=1)) + float(np.median(variance)))
+    t = scale * np.geomspace(_LEAST, _MOST, _POINTS)
+    w = 1.0 / (t[:, None] ** 2 + variance)
+    total = w.sum(axis=1)
+    mean = (w @ y) / total
+    square = (w * (y - mean[:, None]) ** 2).sum(axis=1)
+    prior = np.log(t) + 0.5 * np.log((w**2).sum(axis=1))
+    ln = prior + 0.5 * np.log(w).sum(axis=1) - 0.5 * np.log(total) - 0.5 * square + np.log(t)  # d ln t
+    weight = np.exp(ln - ln.max())
+    return Fit(t, weight / weight.sum(), mean, 1.0 / total)
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A group whose units all differ: `kind` (station, day, lot) and its `name`; by `offset` (of ln y, or of y)."""
+
+    kind: str
+    name: str
+    quantity: str
+    offset: float
+    log_p: float
+    also: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Unlike:
+    """A unit's quantity far off: its distance from the population's mean, of ln y or of y, and in its own sd."""
+
+    at: int
+    quantity: str
+    off: float
+    log_p: float
+
+
+@dataclass(frozen=True)
+class Population:
+    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it; they are left out."""
+
+    measured: Measured
+    fit: Fit
+    offset: Array
+    apart: tuple[Apart, ...] = ()
+    unlike: tuple[Unlike, ...] = field(default=())
+
+    def shrunken(self, k: int) -> Interval:
+        """The estimate of the quantity's k-th unit by the whole batch. An unlike unit keeps its own."""
+        y, s = float(self.measured.y[k]), float(self.measured.s[k])
+        if int(self.measured.at[k]) in {one.at for one in self.unlike}:
+            return Interval(y, y - HALF_90 * s, y + HALF_90 * s)
+        return self.fit.shrunken(y, s, float(self.offset[k]))
+
+
+def robust(y: Array, s: Array) -> tuple[float, float]:
+    """Median and spread beyond the errors, which a few odd units do not move."""
+    middle = float(np.median(y))
+    scale = _MAD * float(np.median(np.abs(y - middle)))
+    return middle, math.sqrt(max(scale**2 - float(np.median(s**2)), (0.1 * scale) ** 2))
+
+
+#: A grouping: its kind, and for each unit the name of its group, "" for none.
+Grouping = tuple[str, Sequence[str]]
+
+
+def populations(measured: Sequence[Measured], groupings: Sequence[Grouping]) -> list[Population]:
+    """The population of each quantity, with the groups and units that are unlike the rest.
+
+    FALSE_ALARM is shared among a unit's quantities, and among all groups and quantities."""
+    tested = [one for one in measured if one.y.size >= FEWEST]
+    of_unit: dict[int, int] = {}
+    for one in tested:
+        for at in one.at.tolist():
+            of_unit[at] = of_unit.get(at, 0) + 1
+    groups = sum(len(set(names) - {""}) for _, names in groupings)
+    return [
+        _population(one, groupings, of_unit, math.log(FALSE_ALARM / max(1, groups * len(tested)))) for one in tested
+    ]
+
+
+def _population(
+    one: Measured, groupings: Sequence[Grouping], of_unit: Mapping[int, int], group_limit: float
+) -> Population:
+    offset = np.zeros(one.y.size)
+    apart: list[Apart] = []
+    for _ in range(_ROUNDS):
+        found = _most_apart(one, offset, groupings, {(known.kind, known.name) for known in apart})
+        if found is None or found.log_p > group_limit:
+            break
+        apart.append(found)
+        offset = offset + found.offset * _members(one, groupings, found)
+    limit = np.array([math.log(FALSE_ALARM / of_unit[at]) for at in one.at.tolist()])
+    centred = one.y - offset
+    kept = _kept(centred, one.s, limit)
+    population = fit(centred[kept], one.s[kept])
+    log_p = population.log_p(centred, one.s)
+    off = centred - population.middle.median
+    unlike = [Unlike(int(one.at[k]), one.name, float(off[k]), float(log_p[k])) for k in np.flatnonzero(~kept).tolist()]
+    return Population(one, population, offset, tuple(apart), tuple(unlike))
+
+
+def _kept(y: Array, s: Array, limit: Array) -> NDArray[np.bool_]:
+    """The units [n] of the population: each as near as ln probability `limit` [n] by the population of the others.
+
+    It begins without the units that are far off in robust standard deviations, so that a few do not hide each other."""
+    middle, spread = robust(y, s)
+    kept = np.abs(y - middle) <= _FIRST * np.sqrt(spread**2 + s**2)
+    for _ in range(_ROUNDS):
+        back = ~kept & (fit(y[kept], s[kept]).log_p(y, s) > limit)
+        if not back.any():
+            break
+        kept |= back
+    while kept.sum() > FEWEST:
+        log_p = fit(y[kept], s[kept]).log_p(y, s)
+        k = int(np.argmin(np.where(kept, log_p - limit, np.inf)))
+        others = kept.copy()
+        others[k] = False
+        if fit(y[others], s[others]).log_p(y[k : k + 1], s[k : k + 1])[0] > limit[k]:
+            break
+        kept = others
+    return kept
+
+
+def _members(one: Measured, groupings: Sequence[Grouping], group: Apart) -> Array:
+    names = next(names for kind, names in groupings if kind == group.kind)
+    return np.array([float(names[at] == group.name) for at in one.at.tolist()])
+
+
+def _most_apart(
+    one: Measured, offset: Array, groupings: Sequence[Grouping], known: set[tuple[str, str]]
+) -> Apart | None:
+    """The group that differs most from the others, by medians: a few odd units move them little."""
+    centred = one.y - offset
+    best: Apart | None = None
+    same: dict[bytes, list[str]] = {}
+    for kind, names in groupings:
+        for name in dict.fromkeys(names[at] for at in one.at.tolist()):
+            inside = np.array([names[at] == name for at in one.at.tolist()])
+            if not name or (kind, name) in known or inside.sum() < FEWEST_OF_GROUP:
+                continue
+            if inside.sum() > 0.5 * inside.size or (~inside).sum() < FEWEST_OF_GROUP:
+                continue
+            same.setdefault(inside.tobytes(), []).append(f"{kind} {name}")
+            _, within = robust(centred[inside], one.s[inside])
+            _, without = robust(centred[~inside], one.s[~inside])
+            spread = max(within, without)
+            difference = float(np.median(centred[inside]) - np.median(centred[~inside]))
+            variance = [
+                _MEDIAN**2 * float(np.mean(spread**2 + one.s[side] ** 2)) / int(side.sum())
+                for side in (inside, ~inside)
+            ]
+            log_p = math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
+            if best is None or log_p < best.log_p:
+                best = Apart(kind, name, one.name, difference, log_p)
+                places = inside.tobytes()
+    if best is None:
+        return None
+    return Apart(best.kind, best.name, one.name, best.offset, best.log_p, tuple(same[places][1:]))
+
+
+def sd_of(log_p: float) -> float:
+    """How many standard deviations off a two-sided probability is; at most 38."""
+    return float(-ndtri(max(math.exp(max(log_p, -700.0)) / 2.0, 1e-300)))

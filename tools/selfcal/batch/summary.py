@@ -1,0 +1,322 @@
+"""A batch as a whole: its population, the units unlike it, and the causes that a station, a day or a lot has."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaln
+
+from selfcal.batch.population import (
+    FALSE_ALARM,
+    FEWEST,
+    FEWEST_OF_GROUP,
+    Apart,
+    Grouping,
+    Interval,
+    Measured,
+    Population,
+    populations,
+    sd_of,
+)
+from selfcal.batch.table import Unit, bias_of
+from selfcal.laws import RATIOS
+from selfcal.model import Model
+from selfcal.result import HALF_90
+
+#: Nats that one unit may weigh in the choice of the batch's law: an odd one decides nothing.
+MOST_NATS = 10.0
+#: Nats by which a unit's law must be better than the batch's, at most one in e^12 times by chance.
+OTHER_LAW = 12.0
+#: A mark that more of the units have is the batch's own.
+COMMON = 0.1
+#: Relative difference of two lattices.
+LATTICE = 0.05
+#: What groups units, by the attribute of a source.
+KINDS = ("station", "day", "lot")
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A cause that a group's units have and others have not: devices with it inside and outside, of how many."""
+
+    kind: str
+    name: str
+    cause: str
+    inside: tuple[int, int]
+    outside: tuple[int, int]
+    log_p: float
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The devices, each with its recordings in the order of their dates, and what they come to."""
+
+    devices: Mapping[str, Sequence[Unit]]
+    populations: Sequence[Population]
+    unlike: Mapping[str, Sequence[str]]
+    shared: Sequence[Shared]
+
+
+def summed_up(units: Sequence[Unit], model: Model) -> Batch:
+    """The batch of recordings `units`."""
+    devices: dict[str, list[Unit]] = {}
+    for unit in units:
+        if unit.error is None:
+            devices.setdefault(unit.device, []).append(unit)
+    names = list(devices)
+    groupings = [(kind, [_group(kind, devices[name][-1]) for name in names]) for kind in KINDS]
+    laws = _laws(devices)
+    found = populations(list(_measured(devices, laws, model)), groupings)
+    shared = _shared(devices, groupings)
+    unlike: dict[str, list[str]] = {}
+    for population in found:
+        for one in population.unlike:
+            unlike.setdefault(names[one.at], []).append(_off(population, one.off, one.log_p))
+    for name, words in _marked(devices, laws, shared):
+        unlike.setdefault(name, []).append(words)
+    return Batch(devices, found, dict(sorted(unlike.items())), shared)
+
+
+def _group(kind: str, unit: Unit) -> str:
+    return unit.recorded_at[:10] if kind == "day" else str(getattr(unit.source, kind))
+
+
+def _sound(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
+    """The results of an axis by device, of the devices that have one."""
+    found = {
+        name: [unit.axes[axis] for unit in units if axis in unit.axes and "error" not in unit.axes[axis]]
+        for name, units in devices.items()
+    }
+    return {name: axes for name, axes in found.items() if axes}
+
+
+def _axes(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
+    return list(dict.fromkeys(axis for units in devices.values() for unit in units for axis in unit.axes))
+
+
+def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
+    """How many nats each law is behind the best one."""
+    evidence = {law: value for law, value in axis["log_evidence"].items() if value is not None}
+    best = max(evidence.values())
+    return {law: best - value if math.isfinite(value) else math.inf for law, value in evidence.items()}
+
+
+def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
+    """The law that the batch has, by axis: the one with the greatest evidence over all units."""
+    found = {}
+    for axis in _axes(devices):
+        total: Counter[str] = Counter()
+        for axes in _sound(devices, axis).values():
+            for one in axes:
+                for law, nats in _behind(one).items():
+                    total[law] -= min(nats, MOST_NATS)  # type: ignore[assignment]
+        if total:
+            found[axis] = max(total, key=lambda law: total[law])
+    return found
+
+
+def _measured(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model: Model) -> Iterator[Measured]:
+    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
+    place = {name: k for k, name in enumerate(devices)}
+    for axis, law in laws.items():
+        sound = _sound(devices, axis)
+        unit = _unit(sound)
+        sound = {name: axes for name, axes in sound.items() if axes[-1]["bias_now"]["unit"] == unit}
+        at = np.array([place[name] for name in sound], np.intp)
+        parameters = list(next(iter(sound.values()))[0]["parameters"][law])
+        for name in parameters:
+            prior = model.group_of(axis).priors.get(name)
+            flat = prior is not None and prior.law == "uniform"
+            known = [_joined([one["parameters"][law][name] for one in axes], flat) for axes in sound.values()]
+            kept = np.array([one is not None and one[2] for one in known])
+            if kept.sum() < max(FEWEST, 0.5 * kept.size):
+                continue  # the batch does not identify it
+            there = [k for k, one in enumerate(known) if one is not None]
+            y, s = np.array([known[k][:2] for k in there], np.float64).T  # type: ignore[index]
+            of = next(iter(sound.values()))[0]["parameters"][law][name]["unit"]
+            yield Measured(f"{axis}.{name}", "1" if name in RATIOS else of, law, y, s, at[there])
+        bias = [bias_of(axes[-1]) for axes in sound.values()]
+        y = np.array([one["median"] for one in bias])
+        s = np.array([(one["q95"] - one["q05"]) / (2.0 * HALF_90) for one in bias])
+        yield Measured(f"{axis}.bias", unit, law, y, s, at, logarithm=False)
+
+
+def _unit(sound: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """The unit that most devices read in."""
+    counted = Counter(str(axes[-1]["bias_now"]["unit"]) for axes in sound.values())
+    return counted.most_common(1)[0][0]
+
+
+def _joined(estimates: Sequence[Mapping[str, Any]], flat: bool) -> tuple[float, float, bool] | None:
+    """ln of a quantity, its error, and whether a recording identifies it; None: no recording measures it.
+
+    `flat`: its prior is uniform, which in the logarithm leans upwards by s^2."""
+    found = []
+    for one in estimates:
+        median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
+        if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf or one["off_grid"]:
+            continue
+        s = math.log(q95 / q05) / (2.0 * HALF_90)
+        found.append((math.log(median) - (s**2 if flat else 0.0), s))
+    if not found:
+        return None
+    weight = np.array([s**-2 for _, s in found])
+    y = float(weight @ np.array([y for y, _ in found]) / weight.sum())
+    return y, float(weight.sum() ** -0.5), any(one["identified"] for one in estimates)
+
+
+def _off(population: Population, off: float, log_p: float) -> str:
+    measured = population.measured
+    far = f"{sd_of(log_p):.1f} sd off"
+    if measured.logarithm:
+        return f"{measured.name} {math.exp(off):.3g} times the batch's median, {far}"
+    return f"{measured.name} {off:+.3g} {measured.unit} from the batch's mean, {far}"
+
+
+def _marked(
+    devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], shared: Sequence[Shared]
+) -> Iterator[tuple[str, str]]:
+    """Devices with what few others have: marks of the readings, another lattice, another law, a cause."""
+    known = {(one.kind, one.name, one.cause) for one in shared}
+    for axis in _axes(devices):
+        sound = _sound(devices, axis)
+        if len(sound) < FEWEST:
+            continue
+        lattice = [axes[-1]["lattice"] for axes in sound.values() if "lattice" in axes[-1]]
+        step = float(np.median(lattice)) if len(lattice) >= 0.5 * len(sound) else math.nan
+        found: dict[str, list[tuple[str, str]]] = {}
+        for name, axes in sound.items():
+            for mark in dict.fromkeys(mark for one in axes for mark in one.get("marks", [])):
+                found.setdefault(mark, []).append((name, f"{axis} {mark}"))
+            own = axes[-1].get("lattice", math.nan)
+            if abs(own / step - 1.0) > LATTICE:
+                unit = axes[-1]["bias_now"]["unit"]
+                found.setdefault("lattice", []).append(
+                    (name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}")
+                )
+            behind = _behind(axes[-1])
+            if axis in laws and behind.get(laws[axis], math.inf) > OTHER_LAW + math.log(len(sound)):
+                law = min(behind, key=lambda one: behind[one])
+                words = f"{axis} {law} by {behind[laws[axis]]:.0f} nats, the batch's law is {laws[axis]}"
+                found.setdefault(f"law {law}", []).append((name, words))
+            for unit_ in devices[name]:
+                for cause in unit_.causes(axis):
+                    if not any((kind, _group(kind, unit_), cause) in known for kind in KINDS):
+                        found.setdefault(f"cause {cause}", []).append((name, f"{axis} {cause}"))
+        for marked in found.values():
+            told = dict(marked)
+            if len(told) <= max(1.0, COMMON * len(sound)):
+                yield from told.items()
+
+
+def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]) -> list[Shared]:
+    """Causes that a group's units have more often than chance gives it: Fisher's exact test, one-sided.
+
+    FALSE_ALARM is shared among all groups and causes."""
+    causes = [{c for unit in units for axis in unit.axes for c in unit.causes(axis)} for units in devices.values()]
+    named = sorted(set().union(*causes)) if causes else []
+    tests = [
+        (kind, group, names, cause)
+        for kind, names in groupings
+        for group in dict.fromkeys(names)
+        for cause in named
+        if group and FEWEST_OF_GROUP <= names.count(group) < len(names)
+    ]
+    found = []
+    for kind, group, names, cause in tests:
+        inside = [cause in of for of, name in zip(causes, names, strict=True) if name == group]
+        outside = [cause in of for of, name in zip(causes, names, strict=True) if name != group]
+        log_p = _fisher(sum(inside), len(inside), sum(outside), len(outside))
+        if log_p <= math.log(FALSE_ALARM / len(tests)) and sum(inside) > 0.5 * len(inside):
+            found.append(Shared(kind, group, cause, (sum(inside), len(inside)), (sum(outside), len(outside)), log_p))
+    return sorted(found, key=lambda one: one.log_p)
+
+
+def _fisher(a: int, n: int, b: int, m: int) -> float:
+    """ln of the probability of `a` or more of `n`, where a + b of n + m have it."""
+
+    def ln_choose(of: int, k: int) -> float:
+        return float(gammaln(of + 1) - gammaln(k + 1) - gammaln(of - k + 1))
+
+    total = ln_choose(n + m, a + b)
+    terms = [ln_choose(n, k) + ln_choose(m, a + b - k) - total for k in range(a, min(n, a + b) + 1) if a + b - k <= m]
+    high = max(terms)
+    return min(0.0, high + math.log(sum(math.exp(one - high) for one in terms)))
+
+
+# ---------------------------------------------------------------------------------------------------------- in words
+
+
+def document_of(batch: Batch) -> dict[str, Any]:
+    """The keys of `selfcal.fleet/1` that a batch has: `population`, `unlike`, `shared_causes` and `units`."""
+    names = list(batch.devices)
+    units: dict[str, dict[str, Any]] = {}
+    for population in batch.populations:
+        measured = population.measured
+        for k, at in enumerate(measured.at.tolist()):
+            own = population.shrunken(k)
+            units.setdefault(names[at], {})[measured.name] = vars(_plain(measured, own)) | {"unit": measured.unit}
+    return {
+        "population": {one.measured.name: _entry(one, names) for one in batch.populations},
+        "unlike": batch.unlike,
+        "shared_causes": [vars(one) for one in batch.shared],
+        "units": units,
+    }
+
+
+def _plain(measured: Measured, of: Interval) -> Interval:
+    return of.through(math.exp) if measured.logarithm else of
+
+
+def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
+    measured = population.measured
+    return {
+        "law": measured.law,
+        "unit": measured.unit,
+        "units": int(measured.y.size),
+        "of": "ln" if measured.logarithm else "value",
+        "middle": vars(_plain(measured, population.fit.middle)),
+        "spread": vars(population.fit.spread),
+        "left_out": [names[one.at] for one in population.unlike],
+        "apart": [vars(one) for one in population.apart],
+    }
+
+
+def lines_of(batch: Batch) -> Iterator[str]:
+    """A line for each population, each group that is apart and each shared cause."""
+    for one in batch.populations:
+        measured = one.measured
+        middle, spread = _plain(measured, one.fit.middle), one.fit.spread
+        kind = "spread of ln" if measured.logarithm else "spread"
+        yield (
+            f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "
+            f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}]"
+        )
+    for one in batch.populations:
+        for apart in one.apart:
+            yield f"{apart.kind} {apart.name}: {apart_words(one.measured, apart)}"
+    for shared in batch.shared:
+        yield f"{shared.kind} {shared.name}: {shared_words(shared)}"
+
+
+def apart_words(measured: Measured, apart: Apart) -> str:
+    """How a group differs, and whose that is."""
+    how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
+    also = f"; the same units are {', '.join(apart.also)}" if apart.also else ""
+    return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
+
+
+def shared_words(shared: Shared) -> str:
+    """How many units of a group have a cause, and whose it is."""
+    inside, outside = shared.inside, shared.outside
+    there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
+    return f"{shared.cause} in {there}: {_whose(shared.kind)}"
+
+
+def _whose(kind: str) -> str:
+    return "the lot's own" if kind == "lot" else f"the {kind}'s, not the parts'"
