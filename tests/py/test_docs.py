@@ -48,6 +48,7 @@ UNTRIED = {
     "replay log.csv": "QEMU; test_firmware.py",
     "replay tests/data": "QEMU; test_firmware.py",
     "fleet ": "recordings of the reader's own; test_fleet.py",
+    "plan ": "a model of the reader's own; test_plan.py",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
     "navigate": "minutes; test_navigate.py",

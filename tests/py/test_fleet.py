@@ -5,21 +5,28 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import math
 import os
 import shutil
 import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from selfcal.batch.table import COLUMNS
+from selfcal.batch.files import Source
+from selfcal.batch.page import page
+from selfcal.batch.summary import document_of, summed_up
+from selfcal.batch.table import COLUMNS, Unit
 from selfcal.errors import UserError
+from selfcal.model import Model
 from selfcal.recording import save
 from selfcal.spread import DEATHS, Row, spread
-from selfcal.verbs.fleet import fleet
+from selfcal.verbs.fleet import _document, _judged, fleet
+from selfcal.verdicts import Limits
 
 from conftest import COMMAND, case_records, run
 
@@ -274,3 +281,68 @@ def test_a_scheduler_that_is_killed_loses_nothing(tmp_path: Path) -> None:
         command[-1] = address
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
     assert (tmp_path / "t.csv").read_bytes() == (tmp_path / "here.csv").read_bytes()
+
+
+def synthetic(units: int, seed: int = 1) -> list[Unit]:
+    """Recordings of three axes as `fleet` keeps them, of four stations, 50 a day; one in 100 odd, one in 200 broken."""
+    random = np.random.default_rng(seed)
+    found = []
+    for k in range(units):
+        source = Source(
+            f"logs/u{k:05}.npz",
+            device=f"d{k:05}",
+            station=f"s{k % 4}",
+            recorded_at=str(np.datetime64("2026-01-05") + k // 50),
+        )
+        axes: dict[str, Any] = {}
+        for axis in ("gx", "gy", "gz"):
+            N = 0.02 * math.exp(0.05 * random.standard_normal())
+            K = 1e-3 * math.exp(0.15 * random.standard_normal() + (1.5 if k % 100 == 7 else 0.0))
+            estimates = {
+                name: {
+                    "median": value,
+                    "q05": value * 0.9,
+                    "q95": value * 1.1,
+                    "unit": units_of,
+                    "identified": True,
+                    "off_grid": False,
+                }
+                for name, value, units_of in (("N", N, "deg/s/sqrt(Hz)"), ("K", K, "deg/s^2/sqrt(Hz)"))
+            }
+            axes[axis] = {
+                "hypotheses": {"random_walk": 1.0},
+                "log_evidence": {"random_walk": 0.0},
+                "parameters": {"random_walk": estimates},
+                "bias_now": {"mean": 0.3 * random.standard_normal(), "sd": 0.01, "unit": "deg/s"},
+                "adequate": True,
+                "marks": ["saturation"] if k % 300 == 5 else [],
+            }
+        record = {"error": "broken <b>"} if k % 200 == 3 else {"recording": {"duration_s": 3600.0}, "axes": axes}
+        found.append(Unit(source, record))
+    return found
+
+
+def test_the_page_stays_small(tmp_path: Path) -> None:
+    """Of 10 000 units it has less than 1 MB, no script, no address, and the odd units."""
+    batch = synthetic(case_records(2000, 10000))
+    limits = tmp_path / "limits.yaml"
+    limits.write_text("gyro.N: {max: 0.021 deg/s/sqrt(Hz)}\n")
+    judged = _judged(batch, Limits.load(limits, Model.load()))
+    summary = summed_up(batch, Model.load())
+    document = {**_document(batch, None, judged), **document_of(summary)}
+    text = page(document, summary)
+    assert len(text.encode()) < 1_000_000
+    assert "<script" not in text and "http://" not in text and "https://" not in text
+    assert "broken &lt;b&gt;" in text and "<b>d00107</b>: gx.K " in text
+    assert text.count("<svg viewBox") > 9 and "data sheet&#x27;s limit" in text
+    assert set(summary.unlike) >= {f"d{k:05}" for k in range(7, len(batch), 100) if k % 200 != 3}
+    out = os.environ.get("SELFCAL_PAGE")
+    if out:
+        Path(out).write_text(text)
+
+
+def test_the_page_of_a_real_batch(logs: Path) -> None:
+    (logs / "logs/a/bad.csv").write_text("gx[deg/s]\nx\n")
+    fleet(["logs/**/*.*"], "t.csv", report="fleet.html")
+    text = (logs / "fleet.html").read_text()
+    assert "<h1>6 recordings of 6 devices</h1>" in text and "Not judged" in text and "gx.N" in text

@@ -430,6 +430,7 @@ def fleet(
     junit: Junit = None,
     verdicts: Verdicts = None,
     json: Json = None,
+    report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page of the batch")] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
     ] = None,
@@ -458,6 +459,7 @@ def fleet(
         junit=junit,
         verdicts=verdicts,
         json=json,
+        report=report,
         workers=workers,
         scheduler=scheduler,
         results=results,
@@ -471,6 +473,33 @@ def fleet(
     )
     verb.show(result, to_stderr=str(json) == "-")
     sys.exit(result["code"])
+
+
+@app.command()
+def plan(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.yaml", help="Model file of the part", show_default=False)],
+    want: Annotated[
+        list[str],
+        typer.Option(
+            metavar="WISH", help="'K within 20 %', 'bias within 0.001 deg/s', 'law decided 95 %' (repeat for more)"
+        ),
+    ],
+    axis: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Axis of the part; default: the first that `simulate` states")
+    ] = None,
+    records: Annotated[int, typer.Option(metavar="N", help="Simulated parts")] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same parts", min=0)] = 1,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save what is reached over the length")] = None,
+    scheduler: Scheduler = None,
+    json: Json = None,
+) -> None:
+    """How long a part must be recorded, and at what rate, until what is wanted is known."""
+    from selfcal.verbs import plan as verb
+
+    result = verb.plan(
+        model, want=want, axis=axis, records=records, seed=seed, plot=plot, json=json, scheduler=scheduler
+    )
+    verb.show(result, to_stderr=str(json) == "-")
 
 
 @app.command()

@@ -218,6 +218,10 @@ def _kept(y: Array, s: Array, limit: Array) -> NDArray[np.bool_]:
         kept |= back
     while kept.sum() > FEWEST:
         log_p = fit(y[kept], s[kept]).log_p(y, s)
+        far = kept & (log_p <= limit)
+        if far.any() and kept.sum() - far.sum() >= FEWEST:
+            kept = kept & ~far
+            continue
         k = int(np.argmin(np.where(kept, log_p - limit, np.inf)))
         others = kept.copy()
         others[k] = False

@@ -260,7 +260,7 @@ def document_of(batch: Batch) -> dict[str, Any]:
         measured = population.measured
         for k, at in enumerate(measured.at.tolist()):
             own = population.shrunken(k)
-            units.setdefault(names[at], {})[measured.name] = vars(_plain(measured, own)) | {"unit": measured.unit}
+            units.setdefault(names[at], {})[measured.name] = vars(plain(measured, own)) | {"unit": measured.unit}
     return {
         "population": {one.measured.name: _entry(one, names) for one in batch.populations},
         "unlike": batch.unlike,
@@ -269,7 +269,8 @@ def document_of(batch: Batch) -> dict[str, Any]:
     }
 
 
-def _plain(measured: Measured, of: Interval) -> Interval:
+def plain(measured: Measured, of: Interval) -> Interval:
+    """An interval of the quantity itself where the fit is of its logarithm."""
     return of.through(math.exp) if measured.logarithm else of
 
 
@@ -280,7 +281,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "unit": measured.unit,
         "units": int(measured.y.size),
         "of": "ln" if measured.logarithm else "value",
-        "middle": vars(_plain(measured, population.fit.middle)),
+        "middle": vars(plain(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
         "left_out": [names[one.at] for one in population.unlike],
         "apart": [vars(one) for one in population.apart],
@@ -291,7 +292,7 @@ def lines_of(batch: Batch) -> Iterator[str]:
     """A line for each population, each group that is apart and each shared cause."""
     for one in batch.populations:
         measured = one.measured
-        middle, spread = _plain(measured, one.fit.middle), one.fit.spread
+        middle, spread = plain(measured, one.fit.middle), one.fit.spread
         kind = "spread of ln" if measured.logarithm else "spread"
         yield (
             f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "

@@ -47,7 +47,8 @@ class Band:
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart. `marks`: instants or frequencies that a vertical line points out. `stairs`: a histogram's look."""
+    """One chart. `marks`: instants or frequencies that a vertical line points out; `marked`: what they
+    are. `stairs`: a histogram's look."""
 
     title: str
     x_label: str
@@ -58,6 +59,7 @@ class Panel:
     log_y: bool = False
     marks: Sequence[float] = ()
     stairs: bool = False
+    marked: str = "where it was found"
 
     @property
     def drawn(self) -> list[Curve | Band]:
@@ -292,7 +294,7 @@ def _key(figure: Figure) -> str:
         for one in panel.drawn:
             entries.setdefault(one.label, one.kind)
         if panel.marks:
-            entries.setdefault("where it was found", "mark")
+            entries.setdefault(panel.marked, "mark")
     return "".join(
         f"<span class=key><svg viewBox='0 0 28 16' aria-hidden=true>{_SWATCH[kind]}</svg>{escape(label)}</span> "
         for label, kind in entries.items()

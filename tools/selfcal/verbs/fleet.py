@@ -39,6 +39,7 @@ def fleet(
     junit: Path | str | None = None,
     verdicts: Path | str | None = None,
     json: Path | str | None = None,
+    report: Path | str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
@@ -61,12 +62,13 @@ def fleet(
     changed file is done anew. The other options are those of `identify`, for each recording.
     Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
     and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
+    `report`: the page to write.
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     check_table(output)
     dbc = reading.get("dbc")
     check_options(limits, junit, verdicts)
-    check_writable(output, junit, verdicts, json, inputs=(model, units_table, dbc, limits))
+    check_writable(output, junit, verdicts, json, report, inputs=(model, units_table, dbc, limits))
     check(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
@@ -118,6 +120,10 @@ def fleet(
     document = {**_document(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
     if json is not None:
         write_json(document, json)
+    if report is not None:
+        from selfcal.batch.page import write_page
+
+        write_page(report, document, summary)
     return document
 
 
@@ -146,11 +152,6 @@ def _document(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judge
     """What the batch comes to, by device."""
     failed: dict[str, list[str]] = {}
     open_: dict[str, list[str]] = {}
-    broken = {unit.source.path for unit in batch if unit.error is not None}  # their error is listed below
-    for device, path, verdicts in judged:
-        for one in verdicts:
-            if one.verdict != PASS and path not in broken:
-                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
     for unit in batch:
         for axis, reason in unit.errors.items():
             open_.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
@@ -160,6 +161,11 @@ def _document(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judge
                 failed.setdefault(unit.device, []).append(f"{fail_on}: {', '.join(shown)}")
             elif lines:
                 open_.setdefault(unit.device, []).extend(lines)
+    broken = {unit.source.path for unit in batch if unit.error is not None}  # listed with their errors
+    for device, path, verdicts in judged:
+        for one in verdicts:
+            if one.verdict != PASS and path not in broken:
+                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
     devices = dict.fromkeys(unit.device for unit in batch)
     return {
         "schema": SCHEMA,

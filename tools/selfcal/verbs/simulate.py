@@ -45,7 +45,7 @@ def simulate(
         raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
     scene = _scene(model, seed)
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
-    truth = _truth(model, seed)
+    truth = truth_of(model, seed)
     axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
     applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
     asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
@@ -173,7 +173,7 @@ def _scene(model: Model, seed: int) -> _reference.Scene:
     return scene
 
 
-def _truth(model: Model, seed: int) -> dict[str, dict[str, Any]]:
+def truth_of(model: Model, seed: int) -> dict[str, dict[str, Any]]:
     """Per axis: hypothesis, unit, bias, and the parameters of its law; drawn where the model file leaves them open."""
     truth: dict[str, dict[str, Any]] = {}
     for number, name in enumerate(model.axes):

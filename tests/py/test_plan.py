@@ -1,0 +1,102 @@
+"""`selfcal plan`: at the planned length the wish is met, in simulations that the plan has not seen."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from selfcal.errors import UserError
+from selfcal.model import DEFAULT, Model
+from selfcal.verbs.plan import Wish, _half_interval, plan, rows_of
+
+from conftest import case_records, run
+
+PARTS: dict[str, dict[str, Any]] = {
+    "walk": {"hypothesis": "random_walk", "N": 0.03, "K": 4e-3},
+    "markov": {"hypothesis": "gauss_markov", "N": 0.02, "sigma_m": 0.03, "alpha": 0.03},
+}
+
+
+def part(folder: Path, **truth: Any) -> Path:
+    """A model file of this part."""
+    tree = yaml.safe_load(DEFAULT.read_text())
+    tree["simulate"]["axes"] = {"gz": truth}
+    place = folder / "part.yaml"
+    place.write_text(yaml.safe_dump(tree))
+    return place
+
+
+@pytest.mark.parametrize(
+    ("name", "wants"),
+    [
+        ("walk", ("K within 25 %", "N within 5 %")),
+        ("markov", ("sigma_m within 40 %", "law decided 95 %")),
+    ],
+)
+def test_the_planned_length_suffices(tmp_path: Path, name: str, wants: tuple[str, ...]) -> None:
+    """It is reached in 80 to 97 % of 200 other records; of fewer, three standard deviations of both counts."""
+    if name == "markov" and not case_records(0, 1):
+        pytest.skip("SLOW: make cases")
+    records = case_records(60, 200)
+    model = part(tmp_path, **PARTS[name])
+    document = plan(model, want=wants, records=records)
+    off = (0.1, 0.07) if records == 200 else (3.0 * math.sqrt(0.09 * 2 / records),) * 2
+    loaded = Model.load(model)
+    for text, entry in zip(wants, document["wishes"], strict=True):
+        wish = Wish.of(text, "deg/s")
+        samples = math.ceil(entry["duration_s"] * loaded.bank_rate_hz)
+        metric = np.array(
+            [rows_of(loaded, "gz", (wish,), samples, 10**6 + 17 * k)[0]["metrics"][0] for k in range(records)]
+        )
+        share = float((metric <= wish.most).mean())
+        print(f"{name}, {text}: {entry['duration_s']:.0f} s, reached by {share:.3f}")
+        assert 0.9 - off[0] <= share <= 0.9 + off[1], (text, share)
+    assert document["duration_s"] == max(one["duration_s"] for one in document["wishes"])
+
+
+def test_the_information_is_that_of_known_cases() -> None:
+    """White noise alone: ln N has the variance 1 / (2 n)."""
+    from selfcal.laws import NAMED
+
+    half = _half_interval(NAMED["constant"], {"N": 0.02}, "N", 2.0, 5000.0)
+    assert half == pytest.approx(1.6449 / math.sqrt(2 * 10000), rel=0.02)
+    rates = [
+        _half_interval(NAMED["random_walk"], {"N": 0.02, "K": 1e-3}, "K", rate, 3600.0) for rate in (0.5, 1.0, 5.0)
+    ]
+    assert rates[0] is not None and rates[1] is not None and rates[2] is not None
+    assert rates[0] > rates[1] > rates[2]
+
+
+def test_wishes_that_are_none(tmp_path: Path) -> None:
+    for text, words in (
+        ("K soon", "takes 'K within 20 %', 'bias within 0.001 deg/s' or 'law decided 95 %'"),
+        ("bias within 20 %", "a bias may be 0"),
+        ("N within 2 deg/s", "takes a unit as deg/s/sqrt(Hz), or %"),
+        ("K within 0 %", "must be within more than 0"),
+        ("law decided 100 %", "by less than 100 %"),
+    ):
+        with pytest.raises(UserError) as caught:
+            Wish.of(text, "deg/s")
+        assert words in str(caught.value)
+    assert Wish.of("N within 1 deg/sqrt(h)", "deg/s").most == pytest.approx(1.0 / 60.0)
+    model = part(tmp_path, hypothesis="constant", N=0.02)
+    with pytest.raises(UserError, match="hardly a part of"):
+        plan(model, want=["K within 20 %"], records=20)
+    with pytest.raises(UserError, match="no law of"):
+        plan(model, want=["B within 20 %"], records=20)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    """A wish that is soon met; its picture, and the JSON."""
+    part(tmp_path, **PARTS["walk"])
+    given = ("--want", "bias within 0.1 deg/s", "--records", "20", "--plot", "p.png", "--json", "p.json")
+    found = run("plan", "part.yaml", *given, cwd=tmp_path)
+    assert found.returncode == 0 and "in all: record 64 s at 1 Hz or faster" in found.stdout, found.stderr
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "p.json").read_text())["wishes"][0]["duration_s"] == 64.0

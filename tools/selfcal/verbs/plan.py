@@ -1,0 +1,388 @@
+"""`selfcal plan`: how long must a part be recorded, and at what rate, until what is wanted of it is known?
+
+An ensemble answers: parts as the model file's `simulate` entry states them, what it leaves open drawn from the priors.
+Each is recorded for longer and longer, by readings at the bank's rate, and
+identified. The length is the one at which SHARE of the records have what is
+wanted. The Fisher information of the spectrum says how that length changes with the rate.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from selfcal import units
+from selfcal.document import check_writable, write_json
+from selfcal.errors import UserError, printable, short
+from selfcal.laws import PLACES, RATIOS, Law
+from selfcal.model import Model
+from selfcal.plot import COLORS, check_picture, save_picture
+from selfcal.result import HALF_90
+from selfcal.spread import Row, record_seeds, spread
+from selfcal.tables import make_tables
+from selfcal.verbs.montecarlo import has_nodes, simulate_bank_samples
+from selfcal.verbs.simulate import truth_of
+from selfcal.verdicts import duration_words
+
+SCHEMA = "selfcal.plan/1"
+Floats = NDArray[np.float64]
+#: Share of the records that have what is wanted at the planned length.
+SHARE = 0.9
+#: Bank samples of the shortest record, and of the longest.
+LEAST, MOST = 64, 200_000
+#: Halvings of the last step of the length, in its logarithm.
+HALVINGS = 3
+#: A law is there in so many of the records at least.
+LEAST_SHARE = 0.1
+#: A rate is worth a line if it changes the length by this factor.
+WORTH = 0.8
+#: Smallest number of a metric: an interval of no width has no logarithm.
+TINY = 1e-12
+_NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
+_LAW = re.compile(rf"law decided {_NUMBER} ?%")
+_SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) within {_NUMBER} (\S+)")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true one. Of a parameter:
+    half its 90 % interval, over its median if `unit` is ""."""
+
+    text: str
+    parameter: str
+    most: float
+    unit: str = ""
+
+    @staticmethod
+    def of(text: str, like: str) -> Wish:
+        """A text such as `K within 20 %`, of an axis that reads in `like`. Raises UserError."""
+        plain = " ".join(text.split())
+        if match := _LAW.fullmatch(plain):
+            if not 50.0 <= float(match[1]) < 100.0:
+                raise UserError(f"--want '{short(text)}': a law is decided by 50 % or more, and by less than 100 %")
+            return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
+        match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
+        if match is None or match[1] not in ("bias", *PLACES):
+            raise UserError(
+                f"--want '{short(text)}': takes 'K within 20 %', 'bias within 0.001 {like}' or 'law decided 95 %'"
+            )
+        if not 0.0 < float(match[2]) < math.inf:
+            raise UserError(f"--want '{short(text)}': must be within more than 0")
+        if match.re is _SHARE:
+            if match[1] == "bias":
+                raise UserError(f"--want '{short(text)}': a bias may be 0: state a unit, as 'bias within 0.001 {like}'")
+            return Wish(plain, match[1], float(match[2]) / 100.0)
+        unit, own = units.plain(match[3]), units.parameter_unit(match[1], like)
+        if not units.known(unit) or unit == units.LSB or not units.same_kind(unit, own):
+            raise UserError(f"--want '{short(text)}': takes a unit as {own}, or %")
+        return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
+
+
+def plan(
+    model: Path | str,
+    *,
+    want: Sequence[str],
+    axis: str | None = None,
+    records: int = 200,
+    seed: int = 1,
+    plot: Path | str | None = None,
+    json: Path | str | None = None,
+    scheduler: str | None = None,
+) -> dict[str, Any]:
+    """How long to record the part of a model file, so that SHARE of the records have each of the wishes `want`.
+
+    `axis`: the first that the `simulate` entry states, else the first of all. A wish of a parameter is of the records
+    whose law has it. `plot`: a picture of what is reached over the length.
+    Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
+    longest `duration_s`, and `rates` with the lengths that other rates would take.
+    """
+    check_writable(json, plot, inputs=(model,))
+    if plot is not None:
+        check_picture(plot)
+    loaded = Model.load(model)
+    if loaded.regressors or loaded.half_life_s:
+        raise UserError(f"{loaded.path}: plan takes no regressors and no half_life_s: leave them out of the model")
+    name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
+    group = loaded.group_of(name)
+    if isinstance(want, str) or not want:
+        raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
+    wishes = [Wish.of(text, group.unit) for text in want]
+    there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias"}
+    for wish in wishes:
+        if wish.parameter not in there:
+            raise UserError(f"--want '{wish.text}': no law of {loaded.path} has {wish.parameter}")
+    seeds = record_seeds(records, seed)
+    ensemble = _Ensemble(loaded, name, wishes, seeds, scheduler)
+    lengths = [ensemble.length(k) for k in range(len(wishes))]
+    truth = ensemble.typical
+    entries = []
+    for k, wish in enumerate(wishes):
+        length = lengths[k]
+        entries.append(
+            {
+                "wish": wish.text,
+                "duration_s": None if length is None else length / loaded.bank_rate_hz,
+                "most": wish.most,
+                "curve": ensemble.curve(k),
+            }
+        )
+    known = [one for one in lengths if one is not None]
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "model": str(loaded.path),
+        "axis": name,
+        "records": records,
+        "share": SHARE,
+        "rate_hz": loaded.bank_rate_hz,
+        "duration_s": max(known) / loaded.bank_rate_hz if len(known) == len(lengths) else None,
+        "wishes": entries,
+        "rates": _rates(loaded, wishes, lengths, truth),
+    }
+    if json is not None:
+        write_json(document, json)
+    if plot is not None:
+        _picture(document, plot)
+    return document
+
+
+class _Ensemble:
+    """The records at each length that was asked for: metrics [records, wishes], NaN where a wish is not of the law."""
+
+    def __init__(
+        self, model: Model, axis: str, wishes: Sequence[Wish], seeds: Sequence[int], scheduler: str | None
+    ) -> None:
+        self.model, self.axis, self.wishes, self.seeds, self.scheduler = model, axis, wishes, seeds, scheduler
+        self.at: dict[int, Floats] = {}
+        self.typical: dict[str, tuple[Law, dict[str, float]]] = {}
+
+    def metrics(self, samples: int) -> Floats:
+        """Of records of so many bank samples."""
+        if samples not in self.at:
+            rows = spread(
+                partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
+                self.seeds,
+                settings={},
+                scheduler=self.scheduler,
+            )
+            self.at[samples] = np.array([row["metrics"] for row in rows], np.float64)
+            by_law: dict[str, list[dict[str, float]]] = {}
+            for row in rows:
+                by_law.setdefault(row["law"], []).append(row["truth"])
+            self.typical = {
+                law: (
+                    self.model.laws[law],
+                    {key: float(np.exp(np.mean(np.log([one[key] for one in truths])))) for key in truths[0]},
+                )
+                for law, truths in by_law.items()
+            }
+        return self.at[samples]
+
+    def reached(self, k: int, samples: int) -> float:
+        """ln of the metric that SHARE of the records keep, over the wish's: 0 or less is reached."""
+        metric = self.metrics(samples)[:, k]
+        metric = metric[~np.isnan(metric)]
+        if metric.size < LEAST_SHARE * len(self.seeds):
+            raise UserError(
+                f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
+                f"{self.wishes[k].parameter}: state `hypothesis` under simulate.axes.{self.axis}"
+            )
+        return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
+
+    def length(self, k: int) -> int | None:
+        """Bank samples at which the wish is reached; None beyond MOST."""
+        low, high = 0, LEAST
+        while self.reached(k, high) > 0.0:
+            low, high = high, 2 * high
+            if high > MOST:
+                return None
+        if not low:
+            return high
+        for _ in range(HALVINGS):
+            middle = int(math.sqrt(low * high))
+            low, high = (middle, high) if self.reached(k, middle) > 0.0 else (low, middle)
+        above, below = self.reached(k, low), self.reached(k, high)
+        share = above / (above - below) if above > below else 1.0
+        return math.ceil(low * math.exp(share * math.log(high / low)))
+
+    def curve(self, k: int) -> list[dict[str, float]]:
+        """By length: what a tenth, half and nine tenths of the records keep."""
+        found = []
+        for samples, metrics in sorted(self.at.items()):
+            metric = metrics[~np.isnan(metrics[:, k]), k]
+            q10, q50, q90 = np.quantile(metric, (0.1, 0.5, 0.9)).tolist()
+            found.append({"duration_s": samples / self.model.bank_rate_hz, "q10": q10, "q50": q50, "q90": q90})
+        return found
+
+
+def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
+    """One record of the part: its law, truth, and the metric of each wish."""
+    from selfcal.engines.library import Bank
+
+    tables = make_tables(model, model.bank_rate_hz, (axis,))
+    for again in range(1000):
+        truth = dict(truth_of(model, seed + 7_000_003 * again)[axis])
+        law, _ = truth.pop("hypothesis"), truth.pop("unit")
+        if law not in model.laws:
+            raise UserError(f"{model.path}: simulate.axes.{axis}: '{law}' is none of the model's hypotheses")
+        if has_nodes(model.laws[law], truth, tables):
+            break
+    else:
+        raise UserError(f"{model.path}: the grid has no node for the parts that it draws: more nodes, closer priors")
+    y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
+    bank = Bank(tables)
+    bank.push(y[:, None])
+    result = bank.report(0)
+    metrics = []
+    for wish in wishes:
+        if not wish.parameter:
+            metrics.append(1.0 - result.probability[law])
+        elif wish.parameter == "bias":
+            metrics.append(HALF_90 * result.bias_sd)
+        elif wish.parameter in result.parameters[law]:
+            e = result.parameters[law][wish.parameter]
+            half = 0.5 * (e.q95 - e.q05)
+            metrics.append(half if wish.unit else half / e.median)
+        else:
+            metrics.append(math.nan)
+    kept = {key: value for key, value in truth.items() if key in model.laws[law].parameters}
+    return [{"law": law, "truth": kept, "metrics": metrics}]
+
+
+def _rates(
+    model: Model,
+    wishes: Sequence[Wish],
+    lengths: Sequence[int | None],
+    typical: Mapping[str, tuple[Law, Mapping[str, float]]],
+) -> list[dict[str, Any]]:
+    """The lengths at other rates of the bank, by the Fisher information of a typical part: only of wishes about a
+    parameter."""
+    found = []
+    own = model.bank_rate_hz
+    for factor in (0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0):
+        rate = own * factor
+        if rate > model.sensor_rate_hz:
+            break
+        for wish, samples in zip(wishes, lengths, strict=True):
+            law = next((one for one in typical.values() if wish.parameter in one[0].parameters), None)
+            if samples is None or law is None:
+                continue
+            duration_s = samples / own
+            target = _half_interval(*law, wish.parameter, own, duration_s)
+            if target is None:
+                continue
+            low, high = math.log(1e-3), math.log(1e3)
+            for _ in range(40):
+                at = 0.5 * (low + high)
+                half = _half_interval(*law, wish.parameter, rate, duration_s * math.exp(at))
+                low, high = (low, at) if half is not None and half <= target else (at, high)
+            found.append({"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * math.exp(high)})
+    return found
+
+
+def _half_interval(
+    law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float
+) -> float | None:
+    """Half of the 90 % interval of ln of a parameter, by the Fisher information of the spectrum (Whittle's
+    likelihood); None for a law with an oscillation or coloured noise."""
+    if law.has_oscillation or law.coloured_noise or set(truth) & set(RATIOS):
+        return None
+    f = np.geomspace(0.5 / duration_s, 0.5 * rate_hz, 1500) if duration_s * rate_hz > 2.0 else np.array([0.5 * rate_hz])
+    names = list(law.parameters)
+    step = 1e-4
+    ln = {name: math.log(truth[name]) for name in names}
+    gradient = np.array(
+        [
+            (np.log(_spectrum(law, {**ln, name: ln[name] + step}, f)) - np.log(_spectrum(law, ln, f))) / step
+            for name in names
+        ]
+    )
+    width = np.gradient(f) * duration_s if f.size > 1 else np.ones(1)
+    information = (gradient * width) @ gradient.T
+    try:
+        variance = float(np.linalg.inv(information)[names.index(parameter), names.index(parameter)])
+    except np.linalg.LinAlgError:
+        return None
+    return HALF_90 * math.sqrt(variance) if variance > 0.0 else None
+
+
+def _spectrum(law: Law, ln: Mapping[str, float], f: Floats) -> Floats:
+    """Two-sided density of a reading, by ln of the parameters."""
+    w = 2.0 * math.pi * f
+    total = np.full(f.size, math.exp(2.0 * ln["N"]))
+    drift = next((math.exp(value) for name, value in ln.items() if name in ("K", "sigma_m", "B")), 0.0)
+    for term in law.terms:
+        deviation = term.deviation * drift
+        if term.kind == "walk":
+            total = total + (deviation / w) ** 2
+        else:
+            rate = term.bandwidth if term.stated else term.bandwidth * math.exp(ln["alpha"])
+            total = total + 2.0 * deviation**2 * rate / (rate**2 + w**2)
+    return total
+
+
+def _picture(document: Mapping[str, Any], path: Path | str) -> None:
+    """What is reached over the length: median and middle four fifths of the records, and the wish."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    wishes = document["wishes"]
+    figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
+    for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
+        hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
+        q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
+        panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
+        panel.plot(hours, q50, color=color, label="median")
+        panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
+        if wish["duration_s"] is not None:
+            panel.axvline(wish["duration_s"] / 3600.0, color="black", linewidth=1.0, linestyle=":", label="planned")
+        panel.set_xscale("log")
+        panel.set_yscale("log")
+        law = wish["wish"].startswith("law")
+        panel.set_ylabel("1 - P of the true law" if law else "half the 90 % interval")
+        panel.set_title(wish["wish"], loc="left", fontweight="bold")
+        panel.grid(True, which="major", alpha=0.3)
+        panel.legend(fontsize="x-small")
+    panels[-1, 0].set_xlabel("length of the recording, h")
+    figure.tight_layout()
+    save_picture(figure, path, dpi=110)
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """How long for each wish, in all, and what another rate would change."""
+    console = Console(stderr=to_stderr)
+    for line in _lines(document):
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def _lines(document: Mapping[str, Any]) -> list[str]:
+    lines = [f"{document['axis']}: {document['records']} simulated parts, means at {document['rate_hz']:g} Hz"]
+    for wish in document["wishes"]:
+        there = wish["duration_s"]
+        said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
+        lines.append(f"{wish['wish']}: {said}")
+        lines += [
+            f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}"
+            for one in document["rates"]
+            if one["wish"] == wish["wish"] and there is not None and _matters(one, there)
+        ]
+    if document["duration_s"] is not None:
+        lines.append(
+            f"in all: record {duration_words(document['duration_s'])} at {document['rate_hz']:g} Hz or faster: "
+            f"{100.0 * document['share']:g} % of such parts have it then"
+        )
+    return lines
+
+
+def _matters(one: Mapping[str, Any], duration_s: float) -> bool:
+    return not WORTH < one["duration_s"] / duration_s < 1.0 / WORTH
