@@ -127,6 +127,19 @@ def test_one_recording_under_two_names_counts_once(logs: Path, capsys: pytest.Ca
     assert result["not_judged"] == {"B": ["is the same recording as logs/a/sn01.npz of device A"]}
 
 
+def test_its_own_files_are_no_recordings(logs: Path) -> None:
+    """A pattern may match the table, the kept recordings and the page of the run before. Names may be any bytes."""
+    shutil.copy("logs/a/sn00.npz", os.fsdecode(b"logs/a/odd\xff\n.npz"))
+    Path("logs/a/sn00.npz").unlink()
+    for output in ("logs/t.csv", "logs/t.csv", "logs/t.parquet", "logs/t.csv"):
+        if output.endswith(".csv") or importlib.util.find_spec("pyarrow") is not None:
+            given = ["logs/**/*.npz"] if output.endswith("t.parquet") else ["logs/**/*"]
+            result = fleet(given, output, report="logs/t.html", json="logs/t.json", results="logs/kept")
+            assert result["recordings"] == 5 + (output == "logs/t.csv" and Path("logs/t.parquet").exists())
+    with pytest.raises(UserError, match="is one of the recordings"):
+        fleet(["logs/a/sn01.npz"], "logs/x.csv", json="logs/a/sn01.npz")
+
+
 def test_whose_recording_it_is(logs: Path) -> None:
     (logs / "units.csv").write_text(
         "file,device,station,lot,date\nlogs/a/sn00.npz,X7,north,L1,2026-03-01\nsn03.npz,X8,south,L2,2026-03-02\n"

@@ -44,21 +44,27 @@ class Source:
     copy_of: str = ""
 
 
-def matching(patterns: Iterable[str]) -> list[str]:
+def matching(patterns: Iterable[str], own: Sequence[Path]) -> list[str]:
     """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
 
+    `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
     Raises UserError for a pattern that matches none.
     """
     found: dict[str, None] = {}
     for pattern in patterns:
         names = [pattern] if Path(pattern).exists() else glob(pattern, recursive=True)  # noqa: PTH207
-        kept = [name for name in names if _is_recording(Path(name))]
+        kept = [name for name in names if _is_recording(Path(name)) and not _within_any(Path(name), own)]
         if not kept:
             raise UserError(
                 f"no recording matches '{short(pattern)}': give files, or a pattern in quotes as 'logs/**/*.csv'"
             )
         found.update(dict.fromkeys(kept))
     return sorted(found)
+
+
+def _within_any(path: Path, own: Sequence[Path]) -> bool:
+    place = path.absolute()
+    return any(place == one.absolute() or one.absolute() in place.parents for one in own)
 
 
 def _is_recording(path: Path) -> bool:
@@ -97,14 +103,17 @@ class Named:
     copies: dict[str, str]
 
 
-def sources_of(patterns: Sequence[str], table: Path | str | None, serial_from: str | None) -> Named:
-    """The recordings of the patterns, with device, station, lot and date by the table of units, else by `serial_from`.
+def sources_of(
+    patterns: Sequence[str], table: Path | str | None, serial_from: str | None, own: Sequence[Path] = ()
+) -> Named:
+    """The recordings of the patterns but the outputs `own`, with device, station, lot and date by the table of units.
+    A file that the table does not name has its device by `serial_from`.
 
     A recording under two names of one device is one source. Under the names of two devices the second is a source
     with `copy_of`: that device has no recording of its own.
     Raises UserError for a pattern without files, and for a table or a `serial_from` that is none.
     """
-    named = _serials(matching(patterns), serial_from)
+    named = _serials(matching(patterns, own), serial_from)
     units = {} if table is None else _table(Path(table), list(named))
     sources: list[Source] = []
     first: dict[str, Source] = {}

@@ -125,7 +125,10 @@ class ByContent:
 
     def place(self, job: Job) -> Path:
         """The file of a recording."""
-        return self.folder / f"{hashlib.sha256(f'{job[1]} {self.settings}'.encode()).hexdigest()}.json"
+        return (
+            self.folder
+            / f"{hashlib.sha256(f'{job[1]} {self.settings}'.encode('utf-8', 'surrogateescape')).hexdigest()}.json"
+        )
 
     def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
         """The row of a recording; None if it has none, or a damaged one."""

@@ -103,7 +103,8 @@ def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:
     types = {name: pyarrow.float64() for name in _NUMBERS} | {"adequate": pyarrow.bool_()}
     kept = list(rows)
     columns = {
-        name: pyarrow.array([row.get(name) for row in kept], types.get(name, pyarrow.string())) for name in COLUMNS
+        name: pyarrow.array([_sound(row.get(name)) for row in kept], types.get(name, pyarrow.string()))
+        for name in COLUMNS
     }
     with whole(path) as temporary:
         parquet.write_table(pyarrow.table(columns), temporary)
@@ -119,6 +120,11 @@ def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str,
         writer.writerow(columns)
         for row in rows:
             writer.writerow([_cell(row.get(name)) for name in columns])
+
+
+def _sound(value: Any) -> Any:
+    """A text without what a file's name may have that is none."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _cell(value: Any) -> str:

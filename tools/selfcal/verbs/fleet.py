@@ -78,9 +78,14 @@ def fleet(
     for name in axes:
         loaded.group_of(name)
     bounds = None if limits is None else Limits.load(limits, loaded)
-    named = sources_of([str(one) for one in patterns], units_table, serial_from)
-    if Path(output).resolve() in {Path(one.path).resolve() for one in named.sources}:
-        raise UserError(f"{output}: is one of the recordings: give the table a name of its own")
+    folder = Path(f"{output}.parts") if results is None else Path(results)
+    given = {Path(str(one)).resolve() for one in patterns}
+    outputs = [Path(one) for one in (output, junit, verdicts, json, report) if one is not None]
+    for one in outputs:
+        if one.resolve() in given:
+            raise UserError(f"{one}: is one of the recordings: give it a name of its own")
+    own_files = [*outputs, folder, *(Path(one) for one in (model, limits, units_table) if one is not None)]
+    named = sources_of([str(one) for one in patterns], units_table, serial_from, own_files)
     for copy, other in named.copies.items():
         note(f"{copy}: the same recording as {other}: counted once")
     options = Options(
@@ -91,7 +96,6 @@ def fleet(
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
     version = _version()
-    folder = Path(f"{output}.parts") if results is None else Path(results)
     keeper = ByContent(folder, settings_of(options, montecarlo.settings_of(loaded), version))
     own = [one for one in named.sources if not one.copy_of]
     found = spread(

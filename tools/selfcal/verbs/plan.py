@@ -43,8 +43,8 @@ LEAST, MOST = 64, 200_000
 HALVINGS = 3
 #: A law is there in so many of the records at least.
 LEAST_SHARE = 0.1
-#: A rate is worth a line if it changes the length by this factor.
-WORTH = 0.8
+#: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
+FASTER, WORTH = 10.0, 0.8
 #: Smallest number of a metric: an interval of no width has no logarithm.
 TINY = 1e-12
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -371,18 +371,16 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         there = wish["duration_s"]
         said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
         lines.append(f"{wish['wish']}: {said}")
-        lines += [
-            f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}"
-            for one in document["rates"]
-            if one["wish"] == wish["wish"] and there is not None and _matters(one, there)
-        ]
+        for one in document["rates"]:
+            times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
+            factor = one["rate_hz"] / document["rate_hz"]
+            if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
+                lines.append(f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}")
+            if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
+                lines.append(f"  means at {one['rate_hz']:g} Hz suffice: {duration_words(one['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(
             f"in all: record {duration_words(document['duration_s'])} at {document['rate_hz']:g} Hz or faster: "
             f"{100.0 * document['share']:g} % of such parts have it then"
         )
     return lines
-
-
-def _matters(one: Mapping[str, Any], duration_s: float) -> bool:
-    return not WORTH < one["duration_s"] / duration_s < 1.0 / WORTH
