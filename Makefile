@@ -289,10 +289,12 @@ $(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch]) | $(MODEL
 .PHONY: firmware firmware-images flash
 WANTED := $(filter $(or $(TARGET),$(BOARDS)),$(BOARDS))
 NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no SENSOR, no CFLAGS
-# The default sensor is the default model's; another one has a model file of its name.
+# The default sensor is the default model's; another one has a part's file that begins with its name.
 OTHER_SENSOR := $(filter-out adis16405,$(SENSOR))
 IMAGES = $(BUILD)/$(1)$(OTHER_SENSOR:%=-%)
-SENSOR_MODEL := tools/selfcal/models/$(or $(OTHER_SENSOR),default).yaml
+PART := tools/selfcal/models/parts/$(OTHER_SENSOR)
+SENSOR_MODEL := $(firstword $(if $(OTHER_SENSOR),$(wildcard $(PART)*.yaml) $(PART).yaml) \
+                            tools/selfcal/models/default.yaml)
 
 firmware: setup-dev firmware-images $(if $(ACCEPT),bench-images)
 	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py \

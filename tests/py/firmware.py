@@ -18,7 +18,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.model import Model
+from selfcal.model import PARTS, Model
 from selfcal.verbs.codegen import codegen
 from selfcal.wire import AxisReport, Decoder
 
@@ -84,7 +84,7 @@ def image(
         fcntl.flock(lock, fcntl.LOCK_EX)
         model = Model.load().path
         if sensor != image_sizes.SENSOR:
-            model = model.with_name(f"{sensor}.yaml")
+            [model] = PARTS.glob(f"{sensor}*.yaml")
         document = yaml.safe_load(model.read_text())
         if quiet:
             document["bank_rate_hz"] = bank_hz

@@ -220,7 +220,7 @@ def test_models_that_the_other_sensor_cannot_keep_do_not_compile(
     rate: float, channel: str, complaint: str, tmp_path: Path
 ) -> None:
     """The rates of the data sheet; a temperature and no supply."""
-    text = Model.load().path.with_name("icm42688.yaml").read_text()
+    text = Model.load("icm42688p").path.read_text()
     regressor = f"regressors: [{{name: x, kind: column, column: {channel}, reference: 5, sd: {{gyro: 0.5}}}}]\n"
     (tmp_path / "model.yaml").write_text(text + regressor)
     codegen(tmp_path / "model.yaml", tmp_path, target="cortex-m4f", rate=rate)
@@ -231,7 +231,7 @@ def test_models_that_the_other_sensor_cannot_keep_do_not_compile(
 
 def test_a_sensor_and_its_model_file_have_one_lattice() -> None:
     """Of the data sheet; test_icm42688.py holds the driver's readings against the same steps."""
-    gyro, accel = Model.load(Model.load().path.with_name("icm42688.yaml")).groups
+    gyro, accel = Model.load("icm42688p").groups
     assert (gyro.range, gyro.lsb) == pytest.approx((2000.0, 2000.0 / 2**18), rel=1e-7)
     assert (accel.range, accel.lsb) == pytest.approx((16.0 * 9.80665, 16.0 * 9.80665 / 2**17), rel=1e-7)
 
