@@ -58,7 +58,7 @@
 extern "C" {
 #endif
 
-#define SELFCAL_VERSION "0.1.0"
+#define SELFCAL_VERSION "0.2.0"
 
 /* ------------------------------------------------------------------------------------------- status and counters */
 
