@@ -49,6 +49,9 @@ constexpr int stretch_count = 2;
 // side: a chain of multiply-adds waits for its own results, and eight chains wait together.
 constexpr int width = 4, groups = 2, lanes = width * groups;
 typedef double Lanes __attribute__((vector_size(width * sizeof(double))));
+// Of arrays within structs: gcc 12 takes one with rows of an even number of doubles for aligned to a vector, which by
+// itself it is not.
+constexpr std::size_t aligned = sizeof(Lanes);
 // Samples of a piece at most, and at least: shorter ones cost more to join than they save.
 constexpr std::size_t piece_most = 128, piece_least = 8;
 // States up to which the groups' chains are interleaved.
@@ -150,8 +153,9 @@ template <class T, int D> using Square = T[D][D];
 // The model as the filter has it: T double, or Dual for its derivatives too. Where the filter has more states than the
 // model the first ones are 0.
 template <class T, int D> struct Model {
-    Square<T, D> F = {}, Q = {}, P0 = {};
-    T h[D] = {}, R, lost;
+    alignas(aligned) Square<T, D> F = {}, Q = {}, P0 = {};
+    alignas(aligned) T h[D] = {};
+    T R, lost;
     int driver;
 
     explicit Model(const Input &in) {
@@ -240,7 +244,7 @@ void congruent(const Square<T, D> &a, const Square<T, D> &x, const Square<T, D> 
 // The Riccati map of 2^doublings samples with one noise: P := B + A P (1 + C P)^-1 A' (doubling: Anderson & Moore 1979,
 // section 6.7).
 template <class T, int D> struct Jump {
-    Square<T, D> A, B, C;
+    alignas(aligned) Square<T, D> A, B, C;
     double r = -1.0;
 
     void prepare(const Model<T, D> &m, double noise, int doublings) {
@@ -285,7 +289,8 @@ template <class T, int D> struct Jump {
 // The filter's numbers from sample `start` on, until the next ones: F K (0 where the reading is missing), 1 / sqrt(s).
 template <class T, int D> struct Gain {
     std::size_t start;
-    T FK[D], scale;
+    alignas(aligned) T FK[D];
+    T scale;
 };
 
 // Sums of the products of a number's derivatives.
@@ -316,10 +321,11 @@ template <class T, int D, bool PLAIN> struct Filter {
     const Sums &out;
     std::vector<Gain<T, D>> *const gains; // null: nobody asks for them
     const Model<T, D> m;
-    T below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
+    alignas(aligned) T below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
     bool tied[D] = {};                          // whether the state is one of a pair
-    Square<T, D> P;
-    T FK[D] = {}, s = 0.0, scale = 0.0, ln_now = 0.0;
+    alignas(aligned) Square<T, D> P;
+    alignas(aligned) T FK[D] = {};
+    T s = 0.0, scale = 0.0, ln_now = 0.0;
     double s_before = -1.0, r = -1.0;
     int quiet = 0, slowly[stretch_count] = {};
     double since = 1.0;                 // samples since s_before
@@ -328,9 +334,9 @@ template <class T, int D, bool PLAIN> struct Filter {
     Jump<T, D> jumps[stretch_count];
     static constexpr bool plain_numbers = std::is_same_v<T, double>;
     static constexpr int most = plain_numbers ? columns_max : 1; // columns
-    T x[most][D] = {};
+    alignas(aligned) T x[most][D] = {};
     std::size_t joined = 0; // samples of a piece that `left` and `over` are for; 0: for another gain
-    double left[piece_most][D], over[D][D];
+    alignas(aligned) double left[piece_most][D], over[D][D];
     Lanes nu[columns_max][piece_most][groups];
     T G[most][most] = {}, ln_s = 0.0;
     std::size_t counted = 0;
@@ -791,9 +797,10 @@ struct Shifts {
 template <int D> struct Backward {
     static constexpr int E = D + 1;
     const Filter<double, D, false> &filter;
-    double h[E], N[E][E] = {}, R[E][columns_max] = {};
-    double left[E + 1] = {}, on[E], right[E + 1] = {}; // F' x at a: left[a] x[a - 1] + on[a] x[a] + right[a] x[a + 1]
-    bool steady = false;                               // N stays as long as the gain does
+    alignas(aligned) double h[E], N[E][E] = {}, R[E][columns_max] = {};
+    // F' x at a: left[a] x[a - 1] + on[a] x[a] + right[a] x[a + 1]
+    alignas(aligned) double left[E + 1] = {}, on[E], right[E + 1] = {};
+    bool steady = false; // N stays as long as the gain does
 
     explicit Backward(const Filter<double, D, false> &passed) : filter(passed) {
         for (int a = 0; a < E; a++) {
