@@ -504,6 +504,47 @@ def plan(
 
 @app.command()
 @_reading_logs
+def response(
+    reading: Reading,
+    log: Log,
+    input_: Annotated[
+        str, typer.Option("--input", metavar="CH", help="What acts: temp, supply or an axis", show_default=False)
+    ],
+    output: Annotated[str, typer.Option(metavar="AXIS", help="The axis that answers", show_default=False)],
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the block means; default: every sample, up to 20 000")
+    ] = None,
+    json: Json = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Save gain, phase and coherence (.png .pdf .svg)")
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    gate: Gate = False,
+) -> None:
+    """How an axis answers to a channel: gain, lag, order, frequency response, and which of the two acts."""
+    from selfcal.verbs import response as verb
+
+    result = verb.response(
+        log,
+        input=input_,
+        output=output,
+        model=model,
+        decimate=decimate,
+        json=json,
+        plot=plot,
+        start_s=start,
+        end_s=end,
+        gate=gate,
+        **reading,
+    )
+    verb.show(result, to_stderr=str(json) == "-")
+    Held().check()
+
+
+@app.command()
+@_reading_logs
 def convert(
     reading: Reading,
     log: Log,

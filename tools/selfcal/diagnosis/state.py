@@ -144,7 +144,7 @@ class State:
         found: list[tuple[Array, Array, Array]] = []
         for one, theta, ln_share in self.possible(blocks[0], rich=True):
             ln_weight, means, sds = [], [], []
-            for sums in self._sums(one.terms, theta, blocks):
+            for sums in self.sums(one.terms, theta, blocks):
                 c, inverse, rss = sums.coefficients()
                 sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
                 ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
@@ -155,7 +155,7 @@ class State:
         places = [np.swapaxes(np.array([each[i] for each in found]), 0, 1) for i in (1, 2)]
         return np.exp(value - value.max()), places[0], places[1]
 
-    def _sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
+    def sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
         """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
         known = 1 + 1 + len(self.regressors)
         at = 0
@@ -190,7 +190,7 @@ class State:
         """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
         from below for what they gain with it refitted. One pass for many of them."""
         at = self.best if at is None else at
-        found = [ln_likelihood(sums) for sums in self._sums(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])]
+        found = [ln_likelihood(sums) for sums in self.sums(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])]
         return np.array(found) - self.best.ln_likelihood
 
     def least(self, column: Array) -> float:

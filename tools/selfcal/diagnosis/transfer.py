@@ -1,0 +1,331 @@
+"""How an axis answers to a channel: the transfer function between two recorded columns.
+
+Parametric: output = bias + G(s) input + drift + white noise, by prediction error. The drift is a walk or Gauss-Markov
+noise, refitted with each structure of G; so the model is Box and Jenkins's with a first or second order. Empirical:
+the ratio of multitaper spectra, with no model at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import detrend, windows
+from scipy.stats import t
+
+from selfcal.diagnosis.fit import Fit, Sums, ln_likelihood, run
+from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, NOISES, inconstancy
+from selfcal.diagnosis.record import smoothed
+from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
+from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array
+from selfcal.forms import formed
+
+Complex = NDArray[np.complex128]
+#: Probability of an interval.
+PROBABILITY = 0.9
+#: Windows of a rate, s; the numbers of a lag are a factor 2 apart, then finer in so many passes.
+RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
+ZOOMS, FINER = 3, 8
+#: Time constants that stand for the posterior, over those within so many nats of the best one; draws of it.
+FINE, POSSIBLE, DRAWS = 15, 6.0, 4000
+#: Steps of the drift's parameters at least and at most, and nodes of one drift at most.
+NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
+#: ln of the number of independent looks: seven structures and their numbers.
+LN_STRUCTURES = math.log(20.0)
+#: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
+TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 7, 4.0, 8
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A form of G(s). `columns(number)` [k, n] are what its k coefficients multiply, `keys` their names; `numbers` the
+    smoothings, windows or time constants to try, s. `transfer(c, number, s)` is G. `poles`: its order."""
+
+    name: str
+    poles: int
+    keys: tuple[str, ...]
+    numbers: tuple[float, ...]
+    columns: Callable[[float], Array]
+    transfer: Callable[[Array, Array, Complex], Complex]
+
+    @property
+    def own(self) -> int:
+        """Coefficients of the input; the others are of its state at the start of the record."""
+        return sum(not key.startswith("start") for key in self.keys)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A structure at its best number: gain of ln likelihood, its score (half BIC, nats), and the fit. `seen`: every
+    number tried, with its score at the fit's drift."""
+
+    structure: Structure
+    number: float
+    gain: float
+    score: float
+    fit: Fit
+    seen: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of a structure's numbers: coefficients `c` [draws, k] and time constant `lag` [draws], s."""
+
+    structure: Structure
+    c: Array
+    lag: Array
+
+    def at(self, frequency_hz: Array) -> Complex:
+        """G [draws, f]."""
+        s = np.asarray(2j * np.pi * frequency_hz, np.complex128)
+        return self.structure.transfer(self.c[:, :, None], self.lag[:, None], s[None, :])
+
+
+def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure]:
+    """Every structure for an input [n] with its samples dt s apart. `widths_s`: means that may smooth the input's own
+    noise; centred, so that they have no lag."""
+    span = u.size * dt
+    lags = _lags(u.size, dt)
+    windows_s = tuple(dict.fromkeys(max(one, dt) for one in RATE_WINDOWS_S if one <= span / 6.0))
+    widths = tuple(one for one in widths_s if one <= span / 10.0)
+
+    def level(width: float) -> Array:
+        return smoothed(u, max(1, round(width / dt)))
+
+    def slope(window: float) -> Array:
+        if window <= dt:
+            return np.gradient(u, dt)
+        # A line's slope over its window is late by half of it: put back.
+        shift, trailing = round(window / 2.0 / dt), formed(u, "rate", window, 0.0, dt)
+        return np.concatenate([trailing[shift:], np.full(shift, trailing[-1])])
+
+    def late(lag: float, values: Array = u) -> Array:
+        return formed(values, "lag", lag, 0.0, dt)
+
+    def decay(lag: float) -> Array:
+        # A lag begins at rest in `formed`; before the record the input may have moved.
+        gone: Array = np.exp(-np.arange(u.size) * dt / lag)
+        return gone
+
+    middle = widths[len(widths) // 2]
+    return [
+        Structure("static", 0, ("gain",), widths, lambda w: level(w)[None], lambda c, _, s: c[:, 0] + 0.0 * s),
+        Structure("rate", 0, ("rate",), windows_s, lambda w: slope(w)[None], lambda c, _, s: c[:, 0] * s),
+        Structure(
+            "static and rate", 0, ("gain", "rate"), windows_s,
+            lambda w: np.array([level(middle if w > dt else 0.0), slope(w)]), lambda c, _, s: c[:, 0] + c[:, 1] * s,
+        ),
+        Structure(
+            "late rate", 1, ("rate", "start"), lags,
+            lambda lag: np.array([(u - late(lag)) / lag, decay(lag)]), lambda c, lag, s: c[:, 0] * s / (1.0 + lag * s),
+        ),
+        Structure(
+            "lag", 1, ("gain", "start"), lags,
+            lambda lag: np.array([late(lag), decay(lag)]), lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
+        ),
+        Structure(
+            "lag and direct", 1, ("gain", "direct", "start"), lags,
+            lambda lag: np.array([(slow := late(lag)), u - slow, decay(lag)]),
+            lambda c, lag, s: (c[:, 0] + c[:, 1] * lag * s) / (1.0 + lag * s),
+        ),
+        Structure(
+            "second order", 2, ("gain", "start", "start_rate"), lags,
+            lambda lag: np.array([late(lag, late(lag)), (gone := decay(lag)), gone * np.arange(u.size) * dt / lag]),
+            lambda c, lag, s: c[:, 0] / (1.0 + lag * s) ** 2,
+        ),
+    ]  # fmt: skip
+
+
+def tried(state: State, structure: Structure) -> Tried:
+    """The best number of a structure; those of a pole are then looked for between the grid's."""
+    drifts = [state.best, *state.stiffer(1.5)]
+    blocks = [structure.columns(one) for one in structure.numbers]
+    scores = np.max([state.scores(blocks, at) for at in drifts], axis=0)
+    number = structure.numbers[int(np.argmax(scores))]
+    _, fit = state.with_columns(structure.columns(number))
+    seen = dict(zip(structure.numbers, state.scores(blocks, fit), strict=True))
+    factor = 2.0
+    for _ in range(ZOOMS if structure.poles else 0):
+        middle = max(seen, key=lambda one: seen[one])
+        more = [float(x) for x in middle * factor ** np.linspace(-1.0, 1.0, FINER)]
+        seen |= dict(zip(more, state.scores([structure.columns(one) for one in more], fit), strict=True))
+        factor **= 2.0 / (FINER - 1)
+    number = max(seen, key=lambda one: seen[one])
+    gain, fit = state.with_columns(structure.columns(number))
+    free = len(structure.keys) + (structure.poles > 0)
+    score = gain - 0.5 * free * math.log(fit.n)
+    return Tried(structure, number, gain, score, fit, tuple(sorted(seen.items())))
+
+
+def worth(state: State, one: Tried) -> float:
+    """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
+    columns = one.structure.columns(one.number)
+    own = one.structure.own
+    start = max(0.0, state.with_columns(columns[own:])[0]) if own < len(columns) else 0.0
+    gain = min(one.gain, state.rich_gain(columns)) - start
+    return net(gain, own + (one.structure.poles > 0), LN_STRUCTURES + LN_SLOW)
+
+
+def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Posterior:
+    """Draws over coefficients, the time constant, and the drift: every near one, and its parameters."""
+    structure = one.structure
+    if structure.poles:
+        numbers, scores = np.array(one.seen).T
+        inside = np.flatnonzero(scores > scores.max() - POSSIBLE)
+        low, high = numbers[max(inside[0] - 1, 0)], numbers[min(inside[-1] + 1, numbers.size - 1)]
+        grid = np.geomspace(low, high, FINE)
+    else:
+        grid = np.array([one.number])
+    blocks = [structure.columns(float(number)) for number in grid]
+    k = len(blocks[0])
+    ln_weight, means, roots, places = [], [], [], []
+    for fit, theta, ln_share in _drifts(state, blocks[int(np.argmin(np.abs(grid - one.number)))]):
+        for place, sums in enumerate(state.sums(fit.terms, theta, blocks)):
+            c, inverse, rss = sums.coefficients()
+            values, vectors = np.linalg.eigh(rss / sums.n * inverse[-k:, -k:])
+            ln_weight.append(ln_share + _ln_weight(sums))
+            means.append(c[-k:])
+            roots.append(vectors * np.sqrt(np.maximum(values, 0.0)))
+            places.append(place)
+    random = np.random.default_rng(seed)
+    weight = np.exp(np.array(ln_weight) - max(ln_weight))
+    drawn = random.choice(weight.size, DRAWS, p=weight / weight.sum())
+    z = random.standard_normal((DRAWS, k))
+    c = np.array(means)[drawn] + np.einsum("dij,dj->di", np.array(roots)[drawn], z)
+    # Within a cell of the grid any number is as likely.
+    cell = math.log(grid[1] / grid[0]) if grid.size > 1 else 0.0
+    lag = grid[np.array(places)[drawn]] * np.exp(cell * random.uniform(-0.5, 0.5, DRAWS))
+    return Posterior(structure, c[:, : structure.own] @ undistorted.T, lag)
+
+
+def _ln_weight(sums: Sums) -> float:
+    """ln likelihood with every coefficient integrated out. At its maximum, columns like a drift would leave too little
+    of the drift."""
+    _, inverse, rss = sums.coefficients()
+    return ln_likelihood(sums) + 0.5 * float(np.linalg.slogdet(rss / sums.n * inverse)[1])
+
+
+def _drifts(state: State, block: Array) -> Iterator[tuple[Fit, Array, float]]:
+    """Parameters of every near drift that the record leaves possible beside columns [k, n], on a lattice about each
+    fit, and ln of the prior share of each.
+
+    A size is as likely as any other up to the largest. Uniform in its logarithm, most weight would be on no drift at
+    all wherever the record hardly shows one, and intervals of slow coefficients would be too narrow."""
+    for terms in state.near():
+        fit = state.fitted_with(terms, block)
+        low, high = np.array(terms.limits(state.dt)).reshape(-1, 2).T
+        steps = np.clip(np.linalg.norm(fit.spread, axis=1), *NODE_STEPS)
+        is_size = np.array([name in DRIFT_SIZES for name in terms.names])
+        volume = float(np.log(steps / np.where(is_size, 1.0, high - low)).sum()) + 0.5 * math.log(fit.n) * terms.walk
+        found: dict[tuple[int, ...], float] = {}
+        waiting = [(0,) * steps.size]
+        while waiting and len(found) < NODES_MOST:
+            place = waiting.pop(0)
+            theta = fit.theta + steps * place
+            if place in found or np.any((theta < low - 1e-9) | (theta > high + 1e-9)):
+                continue
+            sums = next(iter(state.sums(terms, theta, [block])))
+            found[place] = _ln_weight(sums) + float(theta[is_size].sum())
+            if found[place] > max(found.values()) - POSSIBLE:
+                moves = [(j, way) for j in range(steps.size) for way in (1, -1)]
+                waiting += [tuple(x + way * (i == j) for i, x in enumerate(place)) for j, way in moves]
+        most = max(found.values())
+        for place, value in found.items():
+            if value > most - POSSIBLE:
+                theta = fit.theta + steps * place
+                yield fit, theta, volume + float(theta[is_size].sum())
+
+
+def undistorted(state: State, u: Array, one: Tried, widths_s: Sequence[float], noisy: bool) -> Array:
+    """[k, k]: what the coefficients of an input [n] that was smoothed become for the input itself.
+
+    The smoothed columns z are instruments for the plain ones x: c = (z x)^-1 (z z) c_z. An input that is `noisy` has
+    read what acts with a white noise of its own, which is in z x as well. Second differences show that noise; drawn
+    anew, it is taken out."""
+    number, own = one.number, one.structure.own
+    plain = one.structure.numbers[0] if one.structure.poles == 0 else number
+    sd = math.sqrt(float(np.var(np.diff(u, 2))) / 6.0) if noisy else 0.0
+    random = np.random.default_rng(1)
+    inputs = [u, *(sd * random.standard_normal((NOISES, u.size)) if noisy else ())]
+    pairs = []
+    for values in inputs:
+        same = next(each for each in structures(values, state.dt, widths_s) if each.name == one.structure.name)
+        pairs += [same.columns(number)[:own], same.columns(plain)[:own]]
+    rest = one.structure.columns(number)[own:]
+    series = state.series.beside(np.vstack([*([rest] if len(rest) else []), *pairs]))
+    G = run(series, one.fit.terms, one.fit.theta)[0][0].G[1:, 1:]
+    known = len(G) - 2 * own * len(inputs)
+    left = G[known:, :known] @ np.linalg.pinv(G[:known, :known], rcond=1e-12, hermitian=True) @ G[:known, known:]
+    cross = G[known:, known:] - left
+
+    def of(k: int, i: int, j: int) -> Array:
+        at = 2 * own * k
+        return cross[at + i * own : at + (i + 1) * own, at + j * own : at + (j + 1) * own]
+
+    noise = sum(of(k, 0, 1) for k in range(1, len(inputs))) / NOISES
+    found: Array = np.linalg.pinv(of(0, 0, 1) - noise) @ of(0, 0, 0)
+    return found
+
+
+def source(state: State, u: Array, one: Tried, drawn: Posterior) -> tuple[str, str]:
+    """Whether the record tells that the input acts: "input first" or "cannot tell", and the reason in words.
+
+    A common cause that reaches the input first, and all of it, always looks as the input does."""
+    columns = one.structure.columns(one.number)
+    ahead = [formed(u[::-1], "lag", lag, 0.0, state.dt)[::-1] for lag in _lags(u.size, state.dt)]
+    both = state.scores([np.vstack([columns, column]) for column in ahead], one.fit)
+    if net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST:
+        return "cannot tell", "the input's later values explain the output as well: feedback, or a common cause"
+    fitted = replace(state, fits=(one.fit,))
+    if max(inconstancy(fitted, columns[j], np.delete(columns, j, 0)) for j in range(len(drawn.c[0]))) >= NET_LEAST:
+        return "cannot tell", "the gain depends on the frequency as in no structure: a common cause, or feedback"
+    if not one.structure.poles:
+        return "cannot tell", "both move at once: either may act on the other, or a common cause on both"
+    own = dict(zip(one.structure.keys, np.abs(drawn.c.T), strict=False))
+    slower = np.mean(own.get("direct", 0.0) < own["gain"]) if "gain" in own else 0.0
+    if slower < 0.5 + PROBABILITY / 2.0:
+        return "cannot tell", "the output moves before the input: feedback, or a common cause"
+    if one.gain - state.with_columns(ahead[int(np.argmax(state.scores(ahead, one.fit)))])[0] < ALIKE:
+        return "cannot tell", "the output may follow the input, or the input the output"
+    return "input first", "the output follows the input; a common cause that reaches the input first looks the same"
+
+
+def _lags(n: int, dt: float) -> tuple[float, ...]:
+    """Time constants from dt to a third of the record, a factor 2 apart."""
+    return tuple(float(x) for x in dt * 2.0 ** np.arange(1 + int(math.log2(max(LONGEST_LAG * n, 1.0)))))
+
+
+@dataclass(frozen=True)
+class Empirical:
+    """Ratio of spectra [bands] with the deviations that 90 % of it keep within: of the gain, and of the phase, rad.
+    `coherence`: squared; `chance`: unrelated columns stay below it in 95 % of the bands."""
+
+    frequency_hz: Array
+    ratio: Complex
+    within: Array
+    coherence: Array
+    chance: Array
+
+
+def empirical(u: Array, y: Array, dt: float) -> Empirical:
+    """The empirical transfer function of an input u [n] and an output y [n] without missing samples."""
+    tapers = windows.dpss(u.size, HALF_WIDTH, TAPERS)
+    U, Y = (np.fft.rfft(tapers * detrend(one)) for one in (u, y))
+    low, high = int(HALF_WIDTH), U.shape[1] - 1
+    edges = np.unique(np.geomspace(low, high, max(2, round(BANDS_OF_A_DECADE * math.log10(high / low)))).astype(int))
+    Suu, Syy = (np.add.reduceat((np.abs(one) ** 2).sum(axis=0), edges[:-1]) for one in (U, Y))
+    Suy = np.add.reduceat((np.conj(U) * Y).sum(axis=0), edges[:-1])
+    # reduceat's last band runs on to the end.
+    width = np.diff(np.append(edges[:-1], U.shape[1]))
+    # Neighbouring bins share their tapers' band.
+    freedom = np.maximum(TAPERS, TAPERS * width / (2.0 * HALF_WIDTH) + (TAPERS - 1) / 2.0)
+    ratio: Complex = np.asarray(Suy / Suu, np.complex128)
+    coherence = np.clip(np.abs(Suy) ** 2 / (Suu * Syy), 0.0, 1.0)
+    sd = np.sqrt((1.0 - coherence) * Syy / Suu / (2.0 * (freedom - 1.0)))
+    within = sd * t.ppf(0.5 + PROBABILITY / 2.0, 2.0 * freedom - 2.0)
+    chance = 1.0 - 0.05 ** (1.0 / (freedom - 1.0))
+    middle = (edges[:-1] + (width - 1) / 2.0) / (u.size * dt)
+    return Empirical(middle, ratio, within, coherence, chance)

@@ -1,0 +1,285 @@
+"""`selfcal response`: how an axis answers to a channel, and whether the record shows which of the two acts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from selfcal import units
+from selfcal.diagnosis import transfer
+from selfcal.diagnosis.forms import SMOOTHING_S
+from selfcal.diagnosis.record import Record, of_recording, why_left_out
+from selfcal.diagnosis.state import NET_LEAST, State
+from selfcal.diagnosis.statemodel import Array
+from selfcal.diagnosis.transfer import PROBABILITY, Posterior
+from selfcal.document import check_writable, recording_entry, write_json
+from selfcal.errors import UserError, printable
+from selfcal.loaders import Reading
+from selfcal.model import Model
+from selfcal.plot import check_picture, save_picture
+from selfcal.recording import SIDE_CHANNELS, Recording, bridged, list_of, load
+from selfcal.regressors import coefficient_unit
+from selfcal.verbs.identify import stretch_of
+
+SCHEMA = "selfcal.response/1"
+#: Samples that are looked at as they are; of more, means.
+SAMPLES_MOST = 20_000
+#: Frequencies of the response that is written, and draws that its band is of.
+FREQUENCIES, BAND_DRAWS = 60, 1000
+LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
+NO_INFLUENCE = "this record shows no influence of the input"
+#: Words for the keys of an estimate.
+WORDS = {
+    "gain": "static gain",
+    "rate": "rate coefficient",
+    "direct": "gain of fast changes",
+    "lag_s": "time constant",
+}
+
+
+def response(
+    log: Path | str | Sequence[Path | str],
+    *,
+    input: str,
+    output: str,
+    model: Path | str | None = None,
+    decimate: float | None = None,
+    json: Path | str | None = None,
+    plot: Path | str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    gate: bool = False,
+    **reading: Unpack[Reading],
+) -> dict[str, Any]:
+    """The answer of the axis `output` to the column `input`: temperature, supply or another axis.
+
+    Returns the document `selfcal.response/1` and writes it to `json`; `plot`: its picture. `decimate`: rate of the
+    block means, Hz; default: every sample of 20 000, means of a longer record. `start_s`, `end_s`, `gate`, `reading`:
+    as `identify` has them. Raises UserError for what the user can put right.
+    """
+    check_writable(json, plot, inputs=(*list_of(log), model))
+    if plot is not None:
+        check_picture(plot)
+    loaded = Model.load(model)
+    recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
+    for option, name in (("--input", input), ("--output", output)):
+        if name not in recording.columns:
+            there = ", ".join(recording.columns)
+            raise UserError(f"{recording.path}: {option}: there is no column '{name}' (there are {there})")
+    if input == output:
+        raise UserError(f"--input and --output are both {input}: give two columns")
+    loaded.group_of(output)
+    axes = [name for name in (output, input) if name in loaded.axes]
+    rate_hz = min(recording.clock_of(name).rate_hz for name in axes)
+    if decimate is None and recording.duration_s * rate_hz > SAMPLES_MOST:
+        decimate = SAMPLES_MOST / recording.duration_s
+    record = of_recording(recording, loaded, decimate, axes)
+    for name in axes:
+        if name not in record.axes:
+            raise UserError(f"{recording.path}: {name}: {why_left_out(recording, loaded, name)}")
+    u, unit, noisy = _input(recording, record, input)
+    state = record.axes[output]
+    # The model file may state the input's influence: it is the question here.
+    state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") != input))
+    document = {
+        "schema": SCHEMA,
+        "recording": recording_entry(recording),
+        "input": {"column": input, "unit": unit},
+        "output": {"axis": output, "unit": state.unit},
+        "judged_at_hz": record.rate_hz,
+        **_answer(state, u, unit, noisy),
+    }
+    if plot is not None:
+        plot_response(document, plot)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def _input(recording: Recording, record: Record, name: str) -> tuple[Array, str, bool]:
+    """Values [n] of the input about their median, their unit, and whether they read what acts with a noise of their
+    own. The reading of another axis acts itself."""
+    if name in record.axes:
+        values, unit, noisy = bridged(record.axes[name].y), record.axes[name].unit, False
+    elif name in record.channel_names.values():
+        values, noisy = record.channel_of(name), True
+        unit = recording.columns[name].unit
+        values = units.convert(values, dict(SIDE_CHANNELS.values())[name], unit)
+    else:
+        raise UserError(
+            f"{recording.path}: --input {name} is no axis of the model, no temp and no supply that changes: choose one"
+        )
+    return values - float(np.median(values)), unit, noisy
+
+
+def _answer(state: State, u: Array, unit: str, noisy: bool) -> dict[str, Any]:
+    """Everything that is found of an axis and an input [n] in `unit`, as the document has it."""
+    dt = state.dt
+    widths = (0.0, *SMOOTHING_S) if noisy else (0.0,)
+    found = [transfer.tried(state, one) for one in transfer.structures(u, dt, widths)]
+    chosen = max(found, key=lambda one: one.score)
+    net = transfer.worth(state, chosen)
+    shown = chosen.score > 0.0 and net >= NET_LEAST
+    weight = np.exp(np.array([one.score for one in found]) - max(0.0, chosen.score))
+    weight /= weight.sum()
+    poles = np.array([one.structure.poles for one in found])
+    orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
+    likely = sorted(orders, key=lambda order: -orders[order])
+    held = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
+    entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
+    if shown:
+        whole = transfer.undistorted(state, u, chosen, widths, noisy)
+        drawn = transfer.posterior(state, chosen, whole)
+        verdict, reason = transfer.source(state, u, chosen, drawn)
+        entry |= {
+            "structure": chosen.structure.name,
+            "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, held)), "probability": orders},
+            "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
+            "estimate": _estimate(drawn, state.unit, unit),
+            "source": {"verdict": verdict, "reason": reason},
+            "frequency_response": _band(drawn, state.y.size, dt),
+        }
+    else:
+        least = state.least(u)
+        entry |= {
+            "source": {"verdict": "none", "reason": NO_INFLUENCE},
+            "would_have_been_found": {"gain": least, "unit": coefficient_unit(state.unit, unit)},
+        }
+    return entry | {"empirical": _empirical(state, u)}
+
+
+def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
+    """Posterior of each number of the structure."""
+    keys = drawn.structure.keys[: drawn.structure.own]
+    values = dict(zip(keys, drawn.c.T, strict=True))
+    if drawn.structure.poles:
+        values["lag_s"] = drawn.lag
+    named = {"rate": coefficient_unit(output, f"{unit}/s"), "lag_s": "s"}
+    return {
+        key: {
+            "mean": float(draws.mean()),
+            "sd": float(draws.std()),
+            **dict(zip(("q05", "median", "q95"), np.quantile(draws, (LOW, 0.5, HIGH)).tolist(), strict=True)),
+            "unit": named.get(key, coefficient_unit(output, unit)),
+        }
+        for key, draws in values.items()
+    }
+
+
+def _band(drawn: Posterior, n: int, dt: float) -> dict[str, list[float]]:
+    """Gain and phase over frequency with their 90 % bands, point by point."""
+    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
+    few = Posterior(drawn.structure, drawn.c[:BAND_DRAWS], drawn.lag[:BAND_DRAWS])
+    G = few.at(frequency)
+    gain = np.quantile(np.abs(G), (LOW, 0.5, HIGH), axis=0)
+    middle = G.mean(axis=0)
+    turn = np.quantile(np.angle(G / middle), (LOW, 0.5, HIGH), axis=0)
+    phase = np.degrees(np.unwrap(np.angle(middle)) + turn)
+    named = {"gain_q05": gain[0], "gain": gain[1], "gain_q95": gain[2]}
+    named |= {"phase_deg_q05": phase[0], "phase_deg": phase[1], "phase_deg_q95": phase[2]}
+    return {"frequency_hz": frequency.tolist(), **{key: values.tolist() for key, values in named.items()}}
+
+
+def _empirical(state: State, u: Array) -> dict[str, list[float]]:
+    """The ratio of spectra. Its phase is known nowhere that the band holds 0."""
+    found = transfer.empirical(u, bridged(state.y), state.dt)
+    size = np.abs(found.ratio)
+    turn = np.degrees(np.where(found.within < size, np.arcsin(np.minimum(found.within / size, 1.0)), math.pi))
+    phase = np.degrees(np.angle(found.ratio))
+    named = {
+        "frequency_hz": found.frequency_hz,
+        "gain": size,
+        "gain_q05": np.maximum(size - found.within, 0.0),
+        "gain_q95": size + found.within,
+        "phase_deg": phase,
+        "phase_deg_q05": phase - turn,
+        "phase_deg_q95": phase + turn,
+        "coherence": found.coherence,
+        "coherence_by_chance": found.chance,
+    }
+    return {key: values.tolist() for key, values in named.items()}
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """The answer in a few lines, and the table of its numbers."""
+    console = Console(stderr=to_stderr)
+
+    def line(text: str) -> None:
+        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
+
+    source, axis = document["source"], document["output"]["axis"]
+    line(f"{document['input']['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")
+    if not document["influence"]:
+        least = document["would_have_been_found"]
+        line(f"no influence: {source['reason']}")
+        if math.isfinite(least["gain"]):
+            line(f"a static gain of {least['gain']:.2g} {least['unit']} would have been found")
+        return
+    order = document["order"]
+    others = ", ".join(map(str, order["within_90"]))
+    line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
+    line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("", "median", "5 %", "95 %", "unit"):
+        table.add_column(heading, no_wrap=True)
+    for key, one in document["estimate"].items():
+        table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
+    console.print(table)
+    line(f"source: {source['verdict']}: {source['reason']}")
+
+
+def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
+    """Save gain, phase and coherence over frequency. Raises UserError if the file cannot be written."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (gain, phase, coherence) = pyplot.subplots(
+        3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
+    )
+    column, axis = document["input"], document["output"]
+    found = document["structure"] if document["influence"] else "no influence"
+    figure.suptitle(
+        f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
+        f"source: {document['source']['verdict']}",
+        parse_math=False,
+    )
+    seen = {key: np.array(values) for key, values in document["empirical"].items()}
+    clear = seen["coherence"] > seen["coherence_by_chance"]
+    for panel, key in ((gain, "gain"), (phase, "phase_deg")):
+        for which, color, label in ((clear, "black", "ratio of spectra, 90 %"), (~clear, "0.75", "... by chance")):
+            error = [seen[key] - seen[f"{key}_q05"], seen[f"{key}_q95"] - seen[key]]
+            shown = [np.where(which, one, np.nan) for one in (seen[key], *error)]
+            panel.errorbar(
+                seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
+                elinewidth=1, label=label,
+            )  # fmt: skip
+        if document["influence"]:
+            band = document["frequency_response"]
+            at = band["frequency_hz"]
+            panel.fill_between(at, band[f"{key}_q05"], band[f"{key}_q95"], color="tab:blue", alpha=0.3, linewidth=0)
+            panel.plot(at, band[key], color="tab:blue", label=f"{document['structure']}, 90 %")
+        panel.grid(True, alpha=0.3)
+    gain.set_xscale("log")
+    gain.set_yscale("log")
+    if clear.any():
+        gain.set_ylim(bottom=0.2 * float(seen["gain"][clear].min()))
+    gain.set_ylabel(f"gain, {units.typeset(coefficient_unit(axis['unit'], column['unit']))}")
+    gain.legend(fontsize="small", frameon=False)
+    phase.set_ylabel("phase, degrees")
+    coherence.plot(seen["frequency_hz"], seen["coherence"], color="black", marker="o", markersize=3.5)
+    coherence.plot(seen["frequency_hz"], seen["coherence_by_chance"], color="0.6", linestyle="--", label="by chance")
+    coherence.set_ylim(0.0, 1.02)
+    coherence.set_ylabel("coherence")
+    coherence.set_xlabel("frequency, Hz")
+    coherence.legend(fontsize="small", frameon=False)
+    coherence.grid(True, alpha=0.3)
+    save_picture(figure, path, dpi=110)
