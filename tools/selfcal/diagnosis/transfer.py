@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import detrend, windows
+from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
 from selfcal.diagnosis.fit import Fit, Sums, ln_likelihood, run
@@ -30,13 +30,16 @@ PROBABILITY = 0.9
 RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
 ZOOMS, FINER = 3, 8
 #: Time constants that stand for the posterior, over those within so many nats of the best one; draws of it.
-FINE, POSSIBLE, DRAWS = 15, 6.0, 4000
+FINE, POSSIBLE, DRAWS = 21, 6.0, 4000
 #: Steps of the drift's parameters at least and at most, and nodes of one drift at most.
 NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
 #: ln of the number of independent looks: seven structures and their numbers.
 LN_STRUCTURES = math.log(20.0)
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
-TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 7, 4.0, 8
+TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
+#: Both columns lose their slow power below this bin first: a spectrum as steep as a temperature's would fill the bands
+#: beside its own. The ratio stays.
+CORNER = 20.0
 
 
 @dataclass(frozen=True)
@@ -172,17 +175,21 @@ def worth(state: State, one: Tried) -> float:
 def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Posterior:
     """Draws over coefficients, the time constant, and the drift: every near one, and its parameters."""
     structure = one.structure
+    drifts = list(_drifts(state, structure.columns(one.number)))
+    grid = np.array([one.number])
     if structure.poles:
+        # The largest drift that is possible leaves most time constants possible.
+        fit, theta, _ = max(drifts, key=lambda node: node[2])
         numbers, scores = np.array(one.seen).T
-        inside = np.flatnonzero(scores > scores.max() - POSSIBLE)
+        largest = state.scores([structure.columns(float(x)) for x in numbers], replace(fit, theta=theta))
+        near = (scores > scores.max() - POSSIBLE) | (largest > largest.max() - POSSIBLE)
+        inside = np.flatnonzero(near)
         low, high = numbers[max(inside[0] - 1, 0)], numbers[min(inside[-1] + 1, numbers.size - 1)]
         grid = np.geomspace(low, high, FINE)
-    else:
-        grid = np.array([one.number])
     blocks = [structure.columns(float(number)) for number in grid]
     k = len(blocks[0])
     ln_weight, means, roots, places = [], [], [], []
-    for fit, theta, ln_share in _drifts(state, blocks[int(np.argmin(np.abs(grid - one.number)))]):
+    for fit, theta, ln_share in drifts:
         for place, sums in enumerate(state.sums(fit.terms, theta, blocks)):
             c, inverse, rss = sums.coefficients()
             values, vectors = np.linalg.eigh(rss / sums.n * inverse[-k:, -k:])
@@ -209,13 +216,17 @@ def _ln_weight(sums: Sums) -> float:
 
 
 def _drifts(state: State, block: Array) -> Iterator[tuple[Fit, Array, float]]:
-    """Parameters of every near drift that the record leaves possible beside columns [k, n], on a lattice about each
+    """Parameters of every drift that the record leaves possible beside columns [k, n], on a lattice about each
     fit, and ln of the prior share of each.
 
     A size is as likely as any other up to the largest. Uniform in its logarithm, most weight would be on no drift at
     all wherever the record hardly shows one, and intervals of slow coefficients would be too narrow."""
-    for terms in state.near():
-        fit = state.fitted_with(terms, block)
+    fits = [state.fitted_with(terms, block) for terms in state.bases()]
+    walk = max(one.ln_likelihood for one in fits if one.terms.walk)
+    for fit in fits:
+        terms = fit.terms
+        if not terms.walk and fit.ln_likelihood < walk + ALIKE:
+            continue  # it would forget: of two that fit alike the walk leaves slow coefficients the wider interval
         low, high = np.array(terms.limits(state.dt)).reshape(-1, 2).T
         steps = np.clip(np.linalg.norm(fit.spread, axis=1), *NODE_STEPS)
         is_size = np.array([name in DRIFT_SIZES for name in terms.names])
@@ -313,8 +324,9 @@ class Empirical:
 def empirical(u: Array, y: Array, dt: float) -> Empirical:
     """The empirical transfer function of an input u [n] and an output y [n] without missing samples."""
     tapers = windows.dpss(u.size, HALF_WIDTH, TAPERS)
-    U, Y = (np.fft.rfft(tapers * detrend(one)) for one in (u, y))
-    low, high = int(HALF_WIDTH), U.shape[1] - 1
+    pole = math.exp(-2.0 * math.pi * CORNER / u.size)
+    U, Y = (np.fft.rfft(tapers * lfilter([1.0, -1.0], [1.0, -pole], detrend(one))) for one in (u, y))
+    low, high = math.ceil(HALF_WIDTH), U.shape[1] - 1
     edges = np.unique(np.geomspace(low, high, max(2, round(BANDS_OF_A_DECADE * math.log10(high / low)))).astype(int))
     Suu, Syy = (np.add.reduceat((np.abs(one) ** 2).sum(axis=0), edges[:-1]) for one in (U, Y))
     Suy = np.add.reduceat((np.conj(U) * Y).sum(axis=0), edges[:-1])

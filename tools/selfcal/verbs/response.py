@@ -26,11 +26,13 @@ from selfcal.model import Model
 from selfcal.plot import check_picture, save_picture
 from selfcal.recording import SIDE_CHANNELS, Recording, bridged, list_of, load
 from selfcal.regressors import coefficient_unit
+from selfcal.verbs.diagnose import BELOW_LATTICE
 from selfcal.verbs.identify import stretch_of
 
 SCHEMA = "selfcal.response/1"
-#: Samples that are looked at as they are; of more, means.
-SAMPLES_MOST = 20_000
+#: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
+#: time constants are in memory together.
+SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 #: Frequencies of the response that is written, and draws that its band is of.
 FREQUENCIES, BAND_DRAWS = 60, 1000
 LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
@@ -84,6 +86,10 @@ def response(
     for name in axes:
         if name not in record.axes:
             raise UserError(f"{recording.path}: {name}: {why_left_out(recording, loaded, name)}")
+    if record.present.size > REFUSED_FROM:
+        raise UserError(f"{recording.path}: more than {REFUSED_FROM:,} samples at this rate: take a lower --decimate")
+    if record.axes[output].below_lattice:
+        raise UserError(f"{recording.path}: {output}: {BELOW_LATTICE}")
     u, unit, noisy = _input(recording, record, input)
     state = record.axes[output]
     # The model file may state the input's influence: it is the question here.
@@ -113,9 +119,9 @@ def _input(recording: Recording, record: Record, name: str) -> tuple[Array, str,
         unit = recording.columns[name].unit
         values = units.convert(values, dict(SIDE_CHANNELS.values())[name], unit)
     else:
-        raise UserError(
-            f"{recording.path}: --input {name} is no axis of the model, no temp and no supply that changes: choose one"
-        )
+        known = name in dict(SIDE_CHANNELS.values())
+        reason = "does not change" if known else "is neither temp, nor supply, nor an axis of the model"
+        raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     return values - float(np.median(values)), unit, noisy
 
 
@@ -218,7 +224,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line(f"{document['input']['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")
     if not document["influence"]:
         least = document["would_have_been_found"]
-        line(f"no influence: {source['reason']}")
+        line(str(source["reason"]))
         if math.isfinite(least["gain"]):
             line(f"a static gain of {least['gain']:.2g} {least['unit']} would have been found")
         return
