@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.fit import Fit, Sums, ln_likelihood, run
+from selfcal.diagnosis.fit import Fit, Sums, ln_det, ln_likelihood, run
 from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, NOISES, inconstancy
 from selfcal.diagnosis.record import smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
@@ -212,7 +212,7 @@ def _ln_weight(sums: Sums) -> float:
     """ln likelihood with every coefficient integrated out. At its maximum, columns like a drift would leave too little
     of the drift."""
     _, inverse, rss = sums.coefficients()
-    return ln_likelihood(sums) + 0.5 * float(np.linalg.slogdet(rss / sums.n * inverse)[1])
+    return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
 
 
 def _drifts(state: State, block: Array) -> Iterator[tuple[Fit, Array, float]]:
