@@ -218,6 +218,7 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
 }
 
 const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis) {
+    SELFCAL_ASSERT(axis < imu->bank.model->axes);
     if (imu->kept != NULL) {
         return imu->reason[axis] != SELFCAL_REASON_NO_REPORT ? &imu->kept->report[axis] : NULL;
     }
@@ -225,10 +226,12 @@ const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axi
 }
 
 const selfcal_judgement_t *selfcal_imu_judgement(const selfcal_imu_t *imu, uint8_t axis) {
+    SELFCAL_ASSERT(axis < imu->bank.model->axes);
     return imu->judge != NULL ? &imu->judge->judged[axis] : NULL;
 }
 
 const selfcal_sent_coefficient_t *selfcal_imu_coefficients(const selfcal_imu_t *imu, uint8_t axis) {
+    SELFCAL_ASSERT(axis < imu->bank.model->axes);
     return imu->columns != NULL ? imu->columns->sent[axis] : NULL;
 }
 
@@ -249,6 +252,7 @@ selfcal_reason_t selfcal_imu_reason(const selfcal_imu_t *imu, uint8_t axis) {
 }
 
 float selfcal_imu_bias(const selfcal_imu_t *imu, uint8_t axis) {
+    SELFCAL_ASSERT(axis < imu->bank.model->axes);
     return imu->bias[axis];
 }
 

@@ -269,6 +269,8 @@ selfcal_status_t selfcal_imu_ask(selfcal_imu_t *imu, uint32_t axes);
  * come to nothing, and there is no more to do. */
 selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu);
 
+/* The following take an axis of the model. Another one is a bug (SELFCAL_ASSERT): they do not look. */
+
 /* The last report of an axis, NULL: none yet, or a change has made it one of the past. It stays as it is until another
  * one of the axis (without selfcal_imu_keep(): of any axis) is worked on. */
 const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis);

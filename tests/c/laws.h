@@ -12,9 +12,9 @@ static const selfcal_law_t named_law[NAMED_LAWS] = {
     [GAUSS_MARKOV] = {1U, false, {{SELFCAL_MARKOV, 1.0F, 1.0F, false, false}}},
     [FLICKER] = {3U,
                  false,
-                 {{SELFCAL_MARKOV, 1.0F, 0.05F, false, false},
-                  {SELFCAL_MARKOV, 1.0F, 1.0F, false, false},
-                  {SELFCAL_MARKOV, 1.0F, 20.0F, false, false}}},
+                 {{SELFCAL_MARKOV, 0.96F, 0.0625F, false, false},
+                  {SELFCAL_MARKOV, 0.96F, 1.0F, false, false},
+                  {SELFCAL_MARKOV, 0.96F, 16.0F, false, false}}},
     [MOVING_AVERAGE] = {1U, true, {{SELFCAL_WALK, 1.0F, 0.0F, false, false}}},
     /* a correlation time of 100 s */
     [WALK_AND_MARKOV] = {2U, false,

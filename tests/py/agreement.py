@@ -366,8 +366,8 @@ class Filter:
         if law == "random_walk":
             return Filter(one, rho**2 * one, rho**2 * one)
         assert law in ("gauss_markov", "flicker")
-        rates = alpha * (np.array([0.05, 1.0, 20.0]) if law == "flicker" else one)
-        variance = rho**2
+        rates = alpha * (np.array([0.0625, 1.0, 16.0]) if law == "flicker" else one)
+        variance = rho**2 * (0.96**2 if law == "flicker" else 1.0)
         return Filter(np.exp(-rates), -variance * np.expm1(-2.0 * rates), variance * np.ones(rates.size))
 
 

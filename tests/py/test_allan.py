@@ -82,7 +82,8 @@ def test_closed_forms_are_those_of_the_simulator(law: str) -> None:
 
 def test_closed_forms_are_the_literatures() -> None:
     """For a drift that is slow against the readings (IEEE Std 952, annex C; Allan 1966): N^2 / tau, K^2 tau / 3, the
-    Gauss-Markov form, and flicker's floor 0.664 B, which three terms have to 3 %."""
+    Gauss-Markov form, and flicker's floor 0.664 B: three terms have it to 4 % over two decades, and to 1 % in the
+    mean."""
     m = np.array([200.0, 2000.0, 20000.0])
     tau = 0.01 * m
     assert terms_of(named("constant"), {"N": 0.3}, 0.01).allan_variance(m) == pytest.approx(0.09 / tau, rel=1e-9)
@@ -92,8 +93,10 @@ def test_closed_forms_are_the_literatures() -> None:
     markov = terms_of(named("gauss_markov"), {"N": 1e-9, "sigma_m": 2.0, "alpha": 0.05}, 0.01).allan_variance(m)
     closed = 4.0 * 2.0 / q * (1.0 - (3.0 - 4.0 * np.exp(-q) + np.exp(-2.0 * q)) / (2.0 * q))
     assert markov == pytest.approx(closed, rel=1e-4)
-    flicker = terms_of(named("flicker"), {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(np.array([3300.0]))
-    assert math.sqrt(flicker[0]) == pytest.approx(0.664, rel=0.03)
+    between = np.geomspace(300.0, 48000.0, 20).round()
+    flicker = terms_of(named("flicker"), {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(between)
+    assert np.sqrt(flicker) == pytest.approx(0.664, rel=0.04)
+    assert np.exp(np.log(flicker).mean() / 2.0) == pytest.approx(0.664, rel=0.01)
 
 
 @pytest.mark.parametrize("freedom", [4.0, 20.0, 300.0])
@@ -173,7 +176,8 @@ def test_gaps_part_the_curve_of_the_samples() -> None:
 
 def test_allantools_is_the_oracle() -> None:
     """The deviation of samples is one definition; degrees of freedom are those of Greenhall & Riley, by tables there
-    and by exact sums here: 11 % apart at 8 readings, 4 % from 60 on. The interval is chi-square's."""
+    and by exact sums here: 11 % apart at 8 readings, 5 % from 60 on (flicker of three terms is within 16 % of 1/f). The
+    interval is chi-square's."""
     rng = np.random.default_rng(12)
     y = 7.0 + 0.02 * np.cumsum(rng.standard_normal(3000)) + rng.standard_normal(3000)
     m = np.array([1, 2, 8, 60, 300])
@@ -183,7 +187,7 @@ def test_allantools_is_the_oracle() -> None:
     for length in (8, 60, 300, 600):
         for power, alpha in ((-1.0, 0), (0.0, -1), (1.0, -2)):
             theirs = allantools.edf_greenhall(alpha, 2, length, 3001, overlapping=True)
-            assert freedom_of(power, length, 3000) == pytest.approx(theirs, rel=0.11 if length == 8 else 0.04)
+            assert freedom_of(power, length, 3000) == pytest.approx(theirs, rel=0.11 if length == 8 else 0.05)
     freedom = freedom_of(-1.0, 8, 3000)
     low, high = allantools.confidence_interval(expected[2], freedom, 0.9)
     assert (curve.q05[2], curve.q95[2]) == pytest.approx((low, high), rel=1e-6)
@@ -275,7 +279,7 @@ def test_readings_that_alternate_have_no_deviation_at_two(tmp_path: Path, capsys
     """0, 1, 0, 1 ...: every average of two is the same, which white noise makes as good as never."""
     log = tmp_path / "log.csv"
     save(log, {"gx": ("deg/s", 0.1 * (np.arange(400) % 2))}, 1.0, {})
-    document = identify(log, plot=tmp_path / "out.png", json=tmp_path / "out.json", export=None)
+    document = identify(log, plot=tmp_path / "out.png", json=tmp_path / "out.json")
     assert not document["axes"]["gx"]["checks"]["allan_2s"]["passed"]
     show(document)
     assert "allan_2s model +inf %" in capsys.readouterr().out

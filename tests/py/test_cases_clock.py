@@ -123,6 +123,26 @@ def test_a_stated_rate_is_taken_however_many_samples_are_lost(jitter: float, los
                 clock_of("log.csv", time, 1e-6, wrong * RATE_HZ, fail)
 
 
+@pytest.mark.parametrize("lost", [0.1, 0.35, 0.5, 0.72])
+@pytest.mark.parametrize("jitter", [0.0, 0.06, 0.13])
+def test_another_rate_than_that_of_the_grid_is_refused(lost: float, jitter: float) -> None:
+    """Of 41 Hz, at which lost samples hide best: 4/3, 3/4, 2/3 and half of it, and two rates of no simple ratio. The
+    mean rate between longer steps agrees with some of them. A clock that is 2 % off is accepted."""
+
+    def fail(row: int, why: str) -> NoReturn:
+        raise UserError(f"row {row}: {why}")
+
+    for seed in range(case_records(1, 10)):
+        random = np.random.default_rng([seed, 5])
+        kept = np.flatnonzero(random.random(3000) >= lost)
+        time = np.round(np.sort(kept + jitter * random.standard_normal(kept.size)) / 41.0, 6)
+        for share in (1.333, 0.75, 0.667, 0.5, 0.79, 0.6):
+            with pytest.raises(UserError, match="does not agree with --rate"):
+                clock_of("log.csv", time, 1e-6, 41.0 * share, fail)
+        if lost < 0.5:
+            assert clock_of("log.csv", time, 1e-6, 41.0 * 1.02, fail).rate_hz == 41.0 * 1.02
+
+
 def in_bursts(random: Random, rows: int, lost: float, run: float) -> NDArray[np.bool_]:
     """Which of `rows` samples arrive, bool[rows]: runs of `run` on average, and losses between them."""
     lengths = np.column_stack([random.geometric(1.0 / run, rows), random.geometric((1.0 - lost) / (run * lost), rows)])

@@ -188,6 +188,8 @@ def mutations(data: bytes, chance: random.Random) -> bytes:
     """`data` with a few bytes, words of four bytes, or pieces changed, so that much of it stays sound."""
     made = bytearray(data)
     for _ in range(chance.choice((1, 1, 1, 2, 4))):
+        if not made:
+            break
         at = chance.randrange(len(made))
         match chance.randrange(4):
             case 0:

@@ -64,7 +64,7 @@ def test_a_source_archive_is_whole(tmp_path: Path) -> None:
     assert metadata["Version"] == package_codegen.version(ROOT / "lib")
     assert metadata["License-Expression"] == "MIT"
     assert metadata["Description-Content-Type"] == "text/markdown"
-    assert {"ros", "px4", "ardupilot", "automotive", "lab"} <= set(metadata.get_all("Provides-Extra") or ())
+    assert {"ardupilot", "automotive", "foxglove", "lab", "r"} <= set(metadata.get_all("Provides-Extra") or ())
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64" or shutil.which("objdump") is None, reason="reads x86-64 code")

@@ -236,6 +236,14 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
     assert known <= keywords, known - keywords
 
 
+def test_an_option_that_takes_one_value_is_not_given_twice() -> None:
+    """The first would be lost: two exports, two recordings to measure the gain on."""
+    said = one_error("identify", "log.csv", "--export", "px4", "a", "--export", "vins", "b")
+    assert said == "--export is given 2 times; it takes one value: run once for each"
+    assert one_error("diagnose", "log.csv", "--on=a.csv", "--on", "b.csv").startswith("--on is given 2 times")
+    assert "cannot" in one_error("identify", "no-such.csv", "--axis", "gx", "--axis", "gy")
+
+
 def test_compare_reads_foreign_headers(tmp_path: Path) -> None:
     """Truth: N of the two logs, 0.04 and 0.05 deg/s/sqrt(Hz), 2000 samples at 1 Hz: 10 sd apart."""
     draw = np.random.default_rng(88)

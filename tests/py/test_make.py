@@ -95,7 +95,8 @@ def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
     ):
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / part, tmp_path / part)
-    shutil.copytree(ROOT / "tools" / "setup", tmp_path / "tools" / "setup")
+    for folder in ("tools/setup", "port/sensors"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
     fake = tmp_path / "python"
     fake.write_text(FAKE_PYTHON.format(python=sys.executable))
     fake.chmod(0o755)
@@ -276,7 +277,7 @@ while [ $# -gt 1 ]; do [ "$1" = -o ] && : >"$2" && : >"${2%.o}.su"; shift; done
     path = f"{bin_}:{os.environ['PATH']}"
     flags = checkout / "out" / "flags"
     assert make(*command, "CFLAGS=-DBOARD_GATE=0", cwd=checkout, PATH=path).returncode == 0
-    assert flags.read_text().split() == ["-DBOARD_GATE=0"]
+    assert flags.read_text().split() == ["-DSENSOR=adis16405", "-DBOARD_GATE=0"]
     flags.chmod(0o644)  # as older ones are
     done = make(*command, f"CFLAGS={build_flag(bytes(range(16)))}", cwd=checkout, PATH=path)
     assert done.returncode == 0, done.stderr

@@ -191,9 +191,9 @@ def test_replay_is_the_library_over_the_wire(
     titles: list[str] = []
     drawn = replay_module.plot_run
 
-    def watched(history: Any, path: Any, title: str, *more: Any) -> None:
+    def watched(history: Any, path: Any, title: str, *more: Any, **named: Any) -> None:
         titles.append(title)
-        drawn(history, path, title, *more)
+        drawn(history, path, title, *more, **named)
 
     monkeypatch.setattr(replay_module, "plot_run", watched)
     document = replay(log, report_every=100.0, json=tmp_path / "report.json", plot=tmp_path / "report.png")
@@ -280,12 +280,10 @@ def test_recording_too_short_for_a_report(tmp_path: Path) -> None:
 
 
 def test_recording_without_a_report_says_why(tmp_path: Path) -> None:
-    """As `identify` does: saturated, without any scatter, louder than the priors."""
-    noise = np.random.default_rng(1).normal(size=600)
+    """As `identify` does: saturated, without any scatter."""
     for gx, complaint in (
         (np.full(600, 400.0), "column gx: no usable sample: all are saturated (range 300 deg/s) or stuck"),
         (np.full(600, 1.0), "column gx: all 60 averages are equal (1 deg/s): a stuck or too coarse reading"),
-        (50.0 * noise, "column gx: outside the model's priors, above: Allan deviation at 1 s: gx "),
     ):
         rows = "".join(f"{k / 10:.1f},{value:.6f}\n" for k, value in enumerate(gx))
         (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + rows)

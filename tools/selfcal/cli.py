@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from inspect import Parameter, Signature, signature
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -982,6 +983,18 @@ def _fail(message: str) -> NoReturn:
     sys.exit(USER_ERROR)
 
 
+def _check_once(arguments: Sequence[str]) -> None:
+    """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
+    command = typer.main.get_command(app)
+    verb = getattr(command, "commands", {}).get(arguments[0]) if arguments else None
+    given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
+    for option in verb.params if verb is not None else ():
+        times = sum(given.count(name) for name in option.opts if name.startswith("-"))
+        if times > 1 and not getattr(option, "multiple", True) and not getattr(option, "is_flag", True):
+            name = max(option.opts, key=len)
+            raise UserError(f"{name} is given {times} times; it takes one value: run once for each")
+
+
 def main() -> NoReturn:
     """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
     traceback is our bug."""
@@ -989,6 +1002,7 @@ def main() -> NoReturn:
     if not sys.warnoptions:  # a library's warning is none for the user
         warnings.simplefilter("ignore")
     try:
+        _check_once(sys.argv[1:])
         code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
         if code == INTERRUPTED:  # typer's code for every signal
             leave(last_signal() or code)

@@ -133,6 +133,7 @@ def to_document(
             if isinstance(axis, UserError)
             else {
                 "summary": _summary(axis),
+                "priors": None,  # a verb that knows the model states where they are from
                 "hypotheses": dict(axis.result.probability),
                 "log_evidence": dict(axis.result.log_evidence),
                 "parameters": parameters_entry(axis),

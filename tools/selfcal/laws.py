@@ -176,12 +176,12 @@ def lost_of(x: float, block: int) -> float:
 
 
 def _flicker() -> Law:
-    """Three Gauss-Markov terms of deviation B, their bandwidths a factor of 20 apart.
+    """Three Gauss-Markov terms of deviation 0.96 B, their bandwidths a factor of 16 apart.
 
-    Their two-sided spectrum is B^2 / (2 pi f) within 20 % where 2 pi f is between the outer bandwidths, and within 1 %
+    Their two-sided spectrum is B^2 / (2 pi f) within 16 % where 2 pi f is between the outer bandwidths, and within 1 %
     in the mean over ln f. A factor of 10 comes nearer, but it covers less: on 1/f noise B came out 4 to 7 % too high.
     """
-    return Law(tuple(Term("markov", 1.0, ratio) for ratio in (0.05, 1.0, 20.0)), drift_name="B")
+    return Law(tuple(Term("markov", 0.96, ratio) for ratio in (0.0625, 1.0, 16.0)), drift_name="B")
 
 
 #: Laws that a model file may give by name. `walk_and_markov` takes its time from the model's correlation_time_s.

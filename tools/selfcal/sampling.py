@@ -53,8 +53,13 @@ _MEAN, _GAP = 1.2, 20.0
 #: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
 #: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
-#: Rows over which a stated grid's phase is followed.
+#: Jitter hides lost samples from their neighbours where such a share of the steps is so far from whole intervals.
+_BLURRED_SHARE, _BLURRED = 0.1, 0.3
+#: Rows over which a grid's phase is followed.
 _PIECE_OF_GRID = 100
+#: A stated rate is checked against other grids where so many steps hold missing samples: places in one interval,
+#: places looked at, rows at least, intervals from 1/_OTHER to _OTHER times the stated one, and how far from it (ln).
+_SUSPECT, _FINE, _OTHER_PLACES, _OTHER_ROWS, _OTHER, _OTHER_APART = 0.1, 16, 1 << 21, 100, 4.0, 0.1
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
@@ -103,8 +108,11 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         return _on_grid(time, 1.0 / rate)
     first = _usual(steps) if rate is None else 1.0 / rate
     dt, missing = _fine(time, steps, first)
-    if rate is None and (typical > _MEAN * first or missing.any()) and not _even(time, dt):
-        return _mean_grid(steps)
+    if rate is None and (typical > _MEAN * first or missing.any()):
+        if not _even(time, dt):
+            return _mean_grid(steps)
+        if _blurred(steps, dt):
+            return _on_grid(time, dt)
     return dt, missing
 
 
@@ -133,6 +141,24 @@ def _even(time: NDArray[np.float64], dt: float) -> bool:
 def thinned_grid(time: NDArray[np.float64], dt: float) -> bool:
     """Whether stamps lie on a grid of `dt` and on none of two or three times that: it lost samples, however many."""
     return _even(time, dt) and not _even(time, 2.0 * dt) and not _even(time, 3.0 * dt)
+
+
+def on_other_grid(time: NDArray[np.float64], dt: float, missing: NDArray[np.int64]) -> bool:
+    """Whether stamps lie on a grid whose interval is not the stated one, `dt`: they miss many samples of that one.
+
+    A grid is a line in the spectrum of the stamps, however many samples are lost. Its multiples are lines too."""
+    head = time[:_STRETCH]
+    head = head[head < _OTHER_PLACES / _FINE * dt]
+    if head.size < _OTHER_ROWS or np.count_nonzero(missing) < _SUSPECT * missing.size or _even(time, dt):
+        return False
+    lattice = _lattice(np.diff(time), 1e-9 * dt)
+    if lattice > _COARSE * dt:
+        return abs(math.log(lattice / dt)) > _OTHER_APART and _lossy(np.rint(np.diff(time) / lattice))
+    stamped = np.bincount(np.rint(head * (_FINE / dt)).astype(np.int64))
+    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2
+    turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
+    lines = turns[(power > _COHERENT * head.size**2) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
+    return lines.size > 0 and abs(math.log(lines[0])) > _OTHER_APART
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -331,6 +357,12 @@ def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> F
             break
         missing = again
     return dt, missing
+
+
+def _blurred(steps: NDArray[np.float64], dt: float) -> bool:
+    """Whether jitter makes many steps no multiple of the interval: the phase of the grid counts better then."""
+    turns = steps / dt
+    return float(np.mean(np.abs(turns - np.rint(turns)) > _BLURRED)) > _BLURRED_SHARE
 
 
 def _on_grid(time: NDArray[np.float64], dt: float) -> Found:

@@ -51,6 +51,7 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
         return {}
     m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
     white, walk, floor, reached, weight = [], [], [], [], []
+    drifts, open_drifts = 0.0, 0.0  # probability of the laws with a drift, and of those that leave its size open
     for law, probability in result.probability.items():
         estimates = result.parameters[law]
         medians = {name: estimate.median for name, estimate in estimates.items()}
@@ -58,6 +59,9 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
             continue
         fit = fit_of(law, medians, group, dt_s, n, m, block=block)
         draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+        sizes = [estimates[name].identified for name in ("K", "sigma_m") if name in estimates]
+        drifts += probability * bool(sizes)
+        open_drifts += probability * (bool(sizes) and not any(sizes))
         white.append(draws["N"])
         walk.append(_walk(draws))
         lowest = [
@@ -81,7 +85,7 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
     widest = HALF_90 * math.log(prior.max / prior.min) / math.sqrt(12.0)  # of ln(q95 / q05): half the prior's sd
     if has_walk < _SURE:
         found["rrw"] = _without(found["rrw"], NO_WALK)
-    elif math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
+    elif open_drifts > 0.5 * drifts or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
         found["rrw"] = _without(found["rrw"], WIDE)
     if has_floor < _SURE:
         found["bias_instability"] = _without(

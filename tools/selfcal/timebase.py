@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from selfcal.errors import UserError
 from selfcal.limits import LEAST_RATE_HZ, LONGEST, MOST_RATE_HZ
-from selfcal.sampling import Ambiguous, sampling, thinned_grid
+from selfcal.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
 
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
@@ -216,7 +216,7 @@ def clock_of(
         missing = np.diff((np.cumsum(missing) + np.arange(missing.size))[rows], prepend=missing[0] - 1) - 1
     lossy = 2 * np.count_nonzero(missing) > missing.size
     if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
-        raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
+        raise _disagrees(path, rate)
     rate = found if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
@@ -263,7 +263,13 @@ def _sampling(
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
     if not 0.0 < dt < math.inf or not time[-1] / dt < LONGEST:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
+    if rate is not None and bursts is None and on_other_grid(time, 1.0 / rate, missing):
+        raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
+
+
+def _disagrees(path: object, rate: float) -> UserError:
+    return UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
 
 
 def _bursts(
