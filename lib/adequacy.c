@@ -240,9 +240,9 @@ static selfcal_real_t innovate(selfcal_real_t state[], size_t states, selfcal_re
 static selfcal_real_t noise_of(const selfcal_filter_law_t *law, selfcal_real_t r, uint32_t block) {
     selfcal_real_t lost = R(0.0);
     for (size_t a = 0; a < law->states && r != R(1.0); a++) {
-        lost += averaged_lost(law->noise[a], R(1.0) - law->pole[a], block);
+        lost += selfcal_averaged_lost(law->noise[a], R(1.0) - law->pole[a], block);
     }
-    return R(1.0) + averaged_noise_less_1(r, lost);
+    return averaged_noise(r, lost);
 }
 
 /* One bank sample of noise r; z, or 0 for the first. `w`: of the channels. */

@@ -45,3 +45,12 @@ selfcal_wide_t selfcal_white_left_out(const selfcal_law_t *law, selfcal_wide_t s
     }
     return sum;
 }
+
+selfcal_real_t selfcal_averaged_lost(selfcal_real_t q, selfcal_real_t beta, uint32_t block) {
+    if (block == 1U) {
+        return R(0.0);
+    }
+    const selfcal_real_t p = r_fma(beta, r_fma(beta, R(-0.24333), R(-0.71527)), R(1.0)) /
+                             r_fma(beta, r_fma(beta, R(4.406458), R(-10.364797)), R(6.0));
+    return q * p * r_fma(R(1.2) - R(1.2) * p, R(1.0) / (selfcal_real_t)block, R(1.0));
+}

@@ -352,14 +352,14 @@ static selfcal_real_t sum_error(selfcal_real_t a, selfcal_real_t b, selfcal_real
  * slowly, and would tilt n/2 nats by 3e-8: the mean of what it is short of goes into the scale of the span's sums. */
 static void gains_varying(const selfcal_batch_t *batch, selfcal_node_t *node, uint32_t block, gains_t *gains) {
     const span_t span = gains->span;
-    const selfcal_real_t lost = batch->part ? averaged_lost(node->q, node->beta, block) : R(0.0);
+    const selfcal_real_t lost = batch->part ? selfcal_averaged_lost(node->q, node->beta, block) : R(0.0);
     selfcal_real_t product_less_1 = R(0.0); /* of all s: ln s of a small P keeps its digits */
     selfcal_real_t a = R(0.0), short_of = R(0.0);
     selfcal_moving_t *now = &node->gains.moving;
     const selfcal_real_t pull = now->c / (R(1.0) - node->beta) * node->u_inf; /* phi u_inf / (1 + p_inf) */
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_real_t r_less_1 = batch->part ? averaged_noise_less_1(batch->r[i], lost) : R(0.0);
-        const selfcal_real_t r = R(1.0) + r_less_1;
+        const selfcal_real_t r = batch->part ? averaged_noise(batch->r[i], lost) : R(1.0);
+        const selfcal_real_t r_less_1 = r - R(1.0);
         const selfcal_real_t p = r_fmax(node->p_inf + now->d, R(0.0));
         const selfcal_real_t s = r + p;
         const selfcal_real_t inv_s = R(1.0) / s;
@@ -493,7 +493,7 @@ static void run_gap(selfcal_t *self, uint32_t count, size_t from, size_t to) {
             now->d = r_fmin((selfcal_real_t)(d + intervals * (selfcal_wide_t)node->q), P_MAX);
             continue; /* the prediction x stays */
         }
-        const selfcal_wide_t less = -expm1(intervals * log1p(-beta)); /* 1 - phi^count */
+        const selfcal_wide_t less = -expm1(intervals * log(1.0 - beta)); /* 1 - phi^count */
         const selfcal_wide_t less_sq = less * (2.0 - less);
         const selfcal_wide_t stationary = (selfcal_wide_t)node->q / (beta * (2.0 - beta));
         now->d = r_fmin((selfcal_real_t)(d + less_sq * (stationary - (selfcal_wide_t)node->p_inf - d)), P_MAX);

@@ -354,10 +354,10 @@ static void state_gains_varying(const selfcal_batch_t *batch, selfcal_node_t *no
     selfcal_real_t lost = R(0.0);
     bool rests = false;
     for (size_t a = 0; a < order && batch->part; a++) {
-        lost += in_pair(term, a) ? R(0.0) : averaged_lost(term->q[a], term->beta[a], block);
+        lost += in_pair(term, a) ? R(0.0) : selfcal_averaged_lost(term->q[a], term->beta[a], block);
     }
     for (uint32_t i = span.from; i < span.to; i++) {
-        const selfcal_wide_t r = 1.0 + (selfcal_wide_t)averaged_noise_less_1(batch->r[i], lost);
+        const selfcal_wide_t r = (selfcal_wide_t)averaged_noise(batch->r[i], lost);
         const gain_t gain = gain_of(term, order, r);
         const selfcal_real_t inv_s = (selfcal_real_t)(1.0 / gain.s);
         gains->sums.inv_s[i] = inv_s;

@@ -56,8 +56,8 @@ selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t
         return R(0.0);
     }
     const selfcal_real_t q = r_exp(R(2.0) * ln_rho) * (beta > R(0.0) ? beta * (R(2.0) - beta) : R(1.0));
-    const selfcal_real_t lost = averaged_lost(q, beta, work->bank->model->block);
-    return R(0.5) * r_log1p(averaged_noise_less_1(R(1.0) + less_1, lost));
+    const selfcal_real_t lost = selfcal_averaged_lost(q, beta, work->bank->model->block);
+    return R(0.5) * r_log1p(averaged_noise(R(1.0) + less_1, lost) - R(1.0));
 }
 
 /* `beta`: selfcal_expected_beta() the alpha. */
@@ -91,9 +91,9 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
     e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
     e->per_v = R(1.0) / (R(1.0) + real.v_less_1);
     const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
-    if (truth->wide) {
-        e->ln_v = log1p(wide.v_less_1 + (selfcal_wide_t)more);
-        e->ln_sigma = 0.5 * (e->ln_v - log1p(wide.s_less_1));
+    if (truth->wide) { /* digits below 1e-16 do not matter here, and log1p takes 1 KB of flash */
+        e->ln_v = log(1.0 + (wide.v_less_1 + (selfcal_wide_t)more));
+        e->ln_sigma = 0.5 * (e->ln_v - log(1.0 + wide.s_less_1));
         e->profile = -0.5 * work->bank->weight * (e->ln_v - truth->ln_v);
     } else {
         const selfcal_real_t ln_v = r_log1p(real.v_less_1 + more);

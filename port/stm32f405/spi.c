@@ -104,7 +104,7 @@ static bool exchange(const uint8_t *out, uint8_t *in, size_t count)
     return done;
 }
 
-static bool begin(const uint8_t *out, uint8_t *in, size_t count)
+static bool begin(const uint8_t *out, uint8_t *in, size_t count) /* NOLINT(readability-non-const-parameter): DMA */
 {
     stop_dma();
     select_sensor(false); /* one that never ended is broken off */

@@ -23,6 +23,8 @@ from selfcal.rest import BIAS_SD, rest_of
 
 #: N is laid so far either way about the record's, and a drift beyond the default ratio to N by so much.
 DECADES, DRIFT_MARGIN = 100.0, 10.0
+#: Limits of N nearer than this factor are knowledge of the part (a warm start, a model by hand): they stay.
+NARROW = 10.0
 #: The record's N is outside a limit from so many of its own standard deviations on; that of ln N times sqrt(n).
 OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
 #: Its drift is outside where the deviation over some time is above all that the priors allow by so much.
@@ -168,8 +170,12 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
 
 
 def outside(group: Group, seen: Seen) -> bool:
-    """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level."""
-    N, margin = group.priors["N"], math.exp(OUTSIDE_SD * MEDIAN_SD / math.sqrt(float(seen.differences[0])))
+    """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level. Never of a group
+    whose N is known."""
+    N = group.priors["N"]
+    if N.max < NARROW * N.min:
+        return False
+    margin = math.exp(OUTSIDE_SD * MEDIAN_SD / math.sqrt(float(seen.differences[0])))
     beyond = not N.min / margin <= seen.N <= N.max * margin
     return beyond or _drifts(group, seen) or abs(seen.level) > BIAS_SD * group.priors["bias"].sd
 
