@@ -985,8 +985,9 @@ def _fail(message: str) -> NoReturn:
 
 def _check_once(arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
-    command = typer.main.get_command(app)
-    verb = getattr(command, "commands", {}).get(arguments[0]) if arguments else None
+    if not arguments or arguments[0].startswith("-"):
+        return  # typer makes its own options anew with each command that it makes
+    verb = getattr(typer.main.get_command(app), "commands", {}).get(arguments[0])
     given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
     for option in verb.params if verb is not None else ():
         times = sum(given.count(name) for name in option.opts if name.startswith("-"))
