@@ -983,11 +983,9 @@ def _fail(message: str) -> NoReturn:
     sys.exit(USER_ERROR)
 
 
-def _check_once(arguments: Sequence[str]) -> None:
+def _check_once(verbs: Mapping[str, Any], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
-    if not arguments or arguments[0].startswith("-"):
-        return  # typer makes its own options anew with each command that it makes
-    verb = getattr(typer.main.get_command(app), "commands", {}).get(arguments[0])
+    verb = verbs.get(arguments[0]) if arguments else None
     given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
     for option in verb.params if verb is not None else ():
         times = sum(given.count(name) for name in option.opts if name.startswith("-"))
@@ -1003,8 +1001,9 @@ def main() -> NoReturn:
     if not sys.warnoptions:  # a library's warning is none for the user
         warnings.simplefilter("ignore")
     try:
-        _check_once(sys.argv[1:])
-        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        whole = typer.main.get_command(app)
+        _check_once(getattr(whole, "commands", {}), sys.argv[1:])
+        code = whole(args=sys.argv[1:] or ["--help"], standalone_mode=False)
         if code == INTERRUPTED:  # typer's code for every signal
             leave(last_signal() or code)
         sys.exit(code)
