@@ -8,7 +8,7 @@
 #define JOINED(name, what) name##_##what
 #define OF(name, what) JOINED(name, what)
 #define QUOTED(name) #name
-#define HEADER(name) QUOTED(name.h)
+#define HEADER(name) QUOTED(name.h) /* NOLINT(bugprone-macro-parentheses): the name of a file */
 #include HEADER(SENSOR)
 
 /* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no
@@ -59,7 +59,7 @@ void readings_pause(bool on)
     }
 }
 
-/* Channels of the model from the sensor's. */
+/* Channels of the model from the sensor's. NOLINTNEXTLINE(readability-non-const-parameter): a model may read none */
 static void take_channels(const float side[PORT_SIDE], float channels[])
 {
 #if SELFCAL_MODEL_CHANNELS > 0
