@@ -15,12 +15,25 @@ constexpr double pi = 3.14159265358979323846;
 
 // What a stream of random numbers is for. Axis streams are numbered axis * 16 + purpose.
 enum Purpose : std::uint64_t {
-    white, drift, flicker, outliers, motion, temperature, supply, missing, intervals, earlier
+    white,
+    drift,
+    flicker,
+    outliers,
+    motion,
+    temperature,
+    supply,
+    missing,
+    intervals,
+    earlier
 };
 
-Random stream(std::uint64_t seed, std::size_t axis, Purpose purpose) { return Random(seed, axis * 16 + purpose); }
+Random stream(std::uint64_t seed, std::size_t axis, Purpose purpose) {
+    return Random(seed, axis * 16 + purpose);
+}
 
-double on_lattice(double value, double lsb) { return lsb > 0.0 ? std::round(value / lsb) * lsb : value; }
+double on_lattice(double value, double lsb) {
+    return lsb > 0.0 ? std::round(value / lsb) * lsb : value;
+}
 
 // A stationary Gauss-Markov process sampled every dt, exactly.
 class GaussMarkov {

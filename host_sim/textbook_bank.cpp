@@ -25,7 +25,7 @@ struct Drift {
 
 // A term at the last of `block` samples, and its mean over them, from the term before: sample by sample.
 struct Block {
-    double phi, mean;              // of the term, of its mean
+    double phi, mean;                // of the term, of its mean
     double var, covariance, of_mean; // of the noise in either
     double scatter;                  // variance of m readings drawn from the block about its mean, over M/m - 1
 };
@@ -294,7 +294,9 @@ Posterior combine(std::size_t laws, const std::vector<Node> &nodes, const std::v
 
 } // namespace
 
-double bandwidth(const Term &term, double second) { return term.stated ? term.bandwidth : term.bandwidth * second; }
+double bandwidth(const Term &term, double second) {
+    return term.stated ? term.bandwidth : term.bandwidth * second;
+}
 
 double deviation(const Law &law, const Term &term, double drift, double second) {
     const double own = term.deviation * drift * (term.by_ratio ? second : 1.0);
@@ -335,9 +337,8 @@ Filtered run_filter(const Record &record, const Law &law, const Node &node, doub
 
 std::vector<Filtered> run_filters(const Record &record, const std::vector<Law> &laws, const std::vector<Node> &nodes) {
     std::vector<Filtered> out(nodes.size());
-    parallel_for(nodes.size(), [&](std::size_t j) {
-        out[j] = run_filter(record, laws[nodes[j].hypothesis], nodes[j]);
-    });
+    parallel_for(nodes.size(),
+                 [&](std::size_t j) { out[j] = run_filter(record, laws[nodes[j].hypothesis], nodes[j]); });
     return out;
 }
 

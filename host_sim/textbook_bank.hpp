@@ -75,10 +75,10 @@ struct Record {
     const double *r; // [n] factor on sigma_v^2, or null for 1
     std::size_t n;
     double dt_s;
-    double bias_mean, bias_sd; // prior of x0, unit
-    std::size_t regressors = 0;              // at most regressors_max
-    const double *z = nullptr;               // [n][regressors], finite where y is
-    const double *coefficient_sd = nullptr;  // [regressors] prior of each coefficient, unit per unit of its regressor
+    double bias_mean, bias_sd;              // prior of x0, unit
+    std::size_t regressors = 0;             // at most regressors_max
+    const double *z = nullptr;              // [n][regressors], finite where y is
+    const double *coefficient_sd = nullptr; // [regressors] prior of each coefficient, unit per unit of its regressor
     std::size_t block = 1; // samples that y is the mean of; x_0 = 0 is one dt before the middle of the first block
 };
 
@@ -100,11 +100,11 @@ std::vector<Filtered> run_filters(const Record &record, const std::vector<Law> &
 
 // Posterior of the whole bank after one sample. A hypothesis of probability 0 has NaN moments.
 struct Posterior {
-    std::vector<double> weight;                   // [nodes], sum 1: mu_i^kj Pr(H = h_k | Y_i)          (11), (13)
-    std::vector<double> probability;              //                                                     (13)
-    std::vector<Eigen::Vector3d> mean;            // of (drift, second, sigma_v) under each hypothesis   (12)
-    std::vector<Eigen::Matrix3d> covariance;      //                                                     (14)
-    std::vector<double> bias_mean, bias_var;      // of x0 + x_i + c' z_i under each hypothesis          (12), (14)
+    std::vector<double> weight;              // [nodes], sum 1: mu_i^kj Pr(H = h_k | Y_i)          (11), (13)
+    std::vector<double> probability;         //                                                     (13)
+    std::vector<Eigen::Vector3d> mean;       // of (drift, second, sigma_v) under each hypothesis   (12)
+    std::vector<Eigen::Matrix3d> covariance; //                                                     (14)
+    std::vector<double> bias_mean, bias_var; // of x0 + x_i + c' z_i under each hypothesis          (12), (14)
 };
 
 // The bank at chosen samples. `ln_prior` [nodes] is ln(mu_0^kj Pr(H = h_k)) up to one constant; `after` [m] ascending,

@@ -26,9 +26,9 @@
  * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/README.md). */
 #include "bank.h"
 
-#define SLOW R(0.0625) /* l: a mean over some 16 bank samples */
+#define SLOW R(0.0625)          /* l: a mean over some 16 bank samples */
 #define ALL_KNOWN R(0.70710678) /* over all epochs the doubt about the parameters adds as much as the noise, at most */
-#define LARGEST R(30.0) /* |z| is held there: one wild sample says all that it can, and z^4 stays a float */
+#define LARGEST R(30.0)         /* |z| is held there: one wild sample says all that it can, and z^4 stays a float */
 
 selfcal_status_t selfcal_adequacy_init(selfcal_adequacy_t *self, const selfcal_t *bank) {
     if (self == NULL || bank == NULL) {
@@ -72,8 +72,8 @@ static points_t points_of(const selfcal_model_t *model, const selfcal_law_t *law
                           selfcal_wide_t drift, selfcal_wide_t second) {
     const selfcal_wide_t dt = (selfcal_wide_t)model->dt_s, white = N * N / dt;
     const selfcal_wide_t square = drift * drift * (has_walk(law) ? dt : 1.0);
-    const selfcal_wide_t variance = fmax(white - selfcal_white_left_out(law, second, dt, model->block) * square,
-                                         WHITE_LEAST * white);
+    const selfcal_wide_t variance =
+        fmax(white - selfcal_white_left_out(law, second, dt, model->block) * square, WHITE_LEAST * white);
     const points_t points = {variance, square / variance};
     return points;
 }
@@ -171,8 +171,8 @@ static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
         selfcal_watch_t *watch = &self->watch[axis];
         watch->running = watch->known && !selfcal_retired(bank, axis);
-        watch->begun = watch->begun && watch->running && watch->next.states == watch->law.states &&
-            self->changes != NULL;
+        watch->begun =
+            watch->begun && watch->running && watch->next.states == watch->law.states && self->changes != NULL;
         if (watch->begun) {
             carry_over(watch);
         }
@@ -379,7 +379,7 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
         suspect(&found, SELFCAL_SUSPECT_VARIANCE_CHANGE, r_fmax(known * variance / r_sqrt(R(2.0) * n), R(0.0)), limit);
         suspect(&found, SELFCAL_SUSPECT_VARIANCE_CHANGE, change / r_sqrt(R(2.0) * n), limit);
         suspect(&found, SELFCAL_SUSPECT_OUTLIERS, watch->fourth / r_sqrt(R(24.0) * n),
-              (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT_KURTOSIS);
+                (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT_KURTOSIS);
     }
     told->state = found.most > R(1.0) ? SELFCAL_INADEQUATE : SELFCAL_ADEQUATE;
 }

@@ -11,7 +11,7 @@ selfcal_averaged_t selfcal_averaged(selfcal_real_t x, uint32_t block) {
     selfcal_averaged_t of = {R(1.0), R(1.0), R(0.0)};
     if (block > 1U) {
         const selfcal_real_t m = (selfcal_real_t)block, held = r_fmin(x, (selfcal_real_t)ALPHA_DT_MAX),
-            of_sample = r_fmin(x / m, (selfcal_real_t)ALPHA_DT_MAX);
+                             of_sample = r_fmin(x / m, (selfcal_real_t)ALPHA_DT_MAX);
         const selfcal_real_t beta = -r_expm1(-held), b = -m * r_expm1(-of_sample);
         of.now = (R(1.0) - beta) * b / (beta * (R(1.0) - b / m));
         of.gain = beta / (b * of.now);
@@ -26,7 +26,7 @@ static selfcal_wide_t averaged_rest(selfcal_wide_t x, uint32_t block) {
         return averaged_walk(block) * x / 3.0; /* right to x^2/20 */
     }
     const selfcal_wide_t m = (selfcal_wide_t)block, beta = -expm1(-fmin(x, ALPHA_DT_MAX)),
-        b = -m * expm1(-fmin(x / m, ALPHA_DT_MAX)), of_sample = 1.0 - b / m;
+                         b = -m * expm1(-fmin(x / m, ALPHA_DT_MAX)), of_sample = 1.0 - b / m;
     const selfcal_wide_t gain = beta * beta * of_sample / ((1.0 - beta) * b * b);
     return fmax(gain - (1.0 + of_sample - 2.0 * of_sample * beta / b) / b, 0.0);
 }
@@ -39,8 +39,8 @@ selfcal_wide_t selfcal_white_left_out(const selfcal_law_t *law, selfcal_wide_t s
         if (term->kind == SELFCAL_WALK) {
             sum += averaged_walk(block) / 6.0 * (selfcal_wide_t)term->deviation * (selfcal_wide_t)term->deviation;
         } else if (term->kind == SELFCAL_MARKOV) { /* an oscillation turns little within a block */
-            sum += averaged_rest(bandwidth_of(term, second) * dt_s, block) *
-                   markov_variance(law, term, 1.0, second, dt_s);
+            sum +=
+                averaged_rest(bandwidth_of(term, second) * dt_s, block) * markov_variance(law, term, 1.0, second, dt_s);
         }
     }
     return sum;

@@ -69,7 +69,6 @@ selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
     return place;
 }
 
-
 static bool valid_law(const selfcal_law_t *law, const selfcal_states_code_t *states, float dt_s) {
     if (law == NULL || law->terms > SELFCAL_LAW_TERMS || !is_bool(&law->coloured_noise)) {
         return false;
@@ -82,9 +81,8 @@ bool selfcal_law_is_sum(const selfcal_law_t *law) {
 }
 
 static bool valid_model(const selfcal_model_t *model) {
-    if ((model->forgetting != NULL &&
-         (model->forgetting->code == NULL ||
-          !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
+    if ((model->forgetting != NULL && (model->forgetting->code == NULL ||
+                                       !(model->forgetting->half_life_s >= (float)SELFCAL_BATCH * model->dt_s))) ||
         !(model->dt_s >= DT_MIN) || !(model->dt_s <= DT_MAX) || model->block == 0U || model->axes == 0U ||
         model->axes > SELFCAL_AXES_MAX || model->hypotheses == 0U || model->hypotheses > SELFCAL_HYPOTHESES_MAX ||
         model->axis == NULL || model->hypothesis == NULL) {
@@ -126,7 +124,7 @@ static bool valid_model(const selfcal_model_t *model) {
         return false;
     }
     return nodes == model->nodes && nodes <= SELFCAL_NODES_MAX &&
-        (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
+           (regressors == NULL || (regressors->code != NULL && regressors->code->valid(model)));
 }
 
 void selfcal_bank_start_node(selfcal_t *self, uint16_t index) {
@@ -208,7 +206,7 @@ static ln_range_t first_ln_sigma(selfcal_t *self, uint8_t axis) {
     const selfcal_prior_t *prior = &self->model->axis[axis].prior[SELFCAL_N];
     const selfcal_real_t half_ln_dt = R(0.5) * r_log((selfcal_real_t)self->model->dt_s);
     const selfcal_real_t least = (selfcal_real_t)prior->ln_min - half_ln_dt,
-        most = (selfcal_real_t)prior->ln_max - half_ln_dt;
+                         most = (selfcal_real_t)prior->ln_max - half_ln_dt;
     ln_range_t range = {least, least};
     const bool gappy = squares < NEIGHBOURS_MIN && squares + 1U < batch->count;
     if (gappy) {
@@ -333,8 +331,8 @@ void selfcal_add_products(selfcal_sum_t *sum, const gains_t *gains, const innova
         const selfcal_real_t product = one->weighted[i] * other->nu[i];
         const selfcal_sum_t total = two_sum(value.hi, product);
         value.hi = total.hi;
-        value.lo += r_fma_exact(one->low[i], other->nu[i], r_fma_exact(one->weighted[i], other->nu[i], -product)) +
-            total.lo;
+        value.lo +=
+            r_fma_exact(one->low[i], other->nu[i], r_fma_exact(one->weighted[i], other->nu[i], -product)) + total.lo;
     }
     const selfcal_sum_t scale = gains->scale;
     const selfcal_real_t product = scale.hi * value.hi;
@@ -426,8 +424,8 @@ void selfcal_bank_leave_level(selfcal_t *self, size_t j) {
 /* With regressors no node counts as level: their columns always move. */
 static void run_span(selfcal_t *self, span_t span, size_t from, size_t to) {
     const selfcal_regressors_t *regressors = self->model->regressors;
-    void (*const run)(selfcal_t *, size_t, const gains_t *) = regressors != NULL ? regressors->code->run
-        : selfcal_kernel_run;
+    void (*const run)(selfcal_t *, size_t, const gains_t *) =
+        regressors != NULL ? regressors->code->run : selfcal_kernel_run;
     const selfcal_batch_t *batch = waiting(self);
     bool whole = true;
     for (uint32_t i = span.from; i < span.to && batch->part; i++) {
@@ -641,6 +639,7 @@ void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, self
 /* ln x to 1e-11, in a third of the time that log() takes in software: x = 2^k m, and m q/64 is so near 1 that its ln
  * needs few digits. */
 selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x) {
+    /* clang-format off */
     static const selfcal_wide_t ln_q[] = { /* ln(q/64) from q = 43 on */
         -0.39768296766610944, -0.3746934494414107, -0.3522205935893521, -0.33024168687057687, -0.3087354816496133,
         -0.2876820724517809, -0.26706278524904525, -0.24686007793152578, -0.22705745063534608, -0.2076393647782445,
@@ -651,6 +650,7 @@ selfcal_wide_t selfcal_bank_ln(selfcal_wide_t x) {
         0.1451820098444979, 0.15860503017663857, 0.17185025692665923, 0.184922338494012, 0.19782574332991987,
         0.21056476910734964, 0.22314355131420976, 0.2355660713127669, 0.24783616390458127, 0.25995752443692605,
         0.27193371548364176, 0.2837681731306446, 0.2954642128938359};
+    /* clang-format on */
     if (!(x > 0.0 && x <= DBL_MAX)) {
         return log(x);
     }
@@ -685,7 +685,8 @@ static selfcal_averaged_t averaged_at(const selfcal_t *self, selfcal_place_t pla
 selfcal_wide_t selfcal_bank_per_prediction(const selfcal_t *self, uint16_t index) {
     const selfcal_place_t place = selfcal_bank_place(self, index);
     return has_decay(self->model->hypothesis[place.hypothesis].law)
-               ? (selfcal_wide_t)averaged_at(self, place).now / (1.0 - (selfcal_wide_t)self->node[index].beta) : 1.0;
+               ? (selfcal_wide_t)averaged_at(self, place).now / (1.0 - (selfcal_wide_t)self->node[index].beta)
+               : 1.0;
 }
 
 void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t *view) {
@@ -720,8 +721,8 @@ void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t
         const selfcal_wide_t over = (selfcal_wide_t)of.now;
         view->drift *= over;
         view->bias_left = 1.0 - over * (1.0 - view->bias_left);
-        view->drift_var = over * over * view->drift_var +
-                          (selfcal_wide_t)(r_exp(R(2.0) * place.ln_rho) * of.after / of.gain);
+        view->drift_var =
+            over * over * view->drift_var + (selfcal_wide_t)(r_exp(R(2.0) * place.ln_rho) * of.after / of.gain);
     } else {
         view->drift_var += (selfcal_wide_t)(node->q * averaged_walk_after(self->model->block));
     }

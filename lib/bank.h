@@ -287,8 +287,8 @@ static inline selfcal_moving_t moving_of(const selfcal_node_t *node) {
 /* A level node's samples have added this to A since it became level. */
 static inline selfcal_wide_t level_a(const selfcal_node_t *node) {
     const selfcal_wide_t u = (selfcal_wide_t)node->u_inf;
-    return node->level ? (selfcal_wide_t)(node->steady - node->level_from) * u * u /
-        (1.0 + (selfcal_wide_t)node->p_inf) : 0.0;
+    return node->level ? (selfcal_wide_t)(node->steady - node->level_from) * u * u / (1.0 + (selfcal_wide_t)node->p_inf)
+                       : 0.0;
 }
 
 #endif

@@ -76,8 +76,7 @@ static bool columns_sound(const selfcal_t *self) {
     for (size_t k = 0; k < p; k++) {
         const selfcal_column_t *column = &columns->column[k];
         if (!isfinite(column->last) || !isfinite(column->origin) || !isfinite(column->first) ||
-            !isfinite(column->offset) ||
-            !isfinite(column->sum)) {
+            !isfinite(column->offset) || !isfinite(column->sum)) {
             return false;
         }
     }
@@ -130,8 +129,7 @@ static void hand_over_columns(selfcal_t *self) {
 /* The node's zero-bias filter over one series, `y` [SELFCAL_BATCH] or all 1 if NULL. Returns the next prediction. What
  * is rounded off each step is a part of its change, and the change is small where the filter is slow. */
 static selfcal_sum_t filter_column(const selfcal_t *self, size_t j, const gains_t *gains, const selfcal_real_t *y,
-                            selfcal_sum_t x,
-                            innovations_t *out) {
+                                   selfcal_sum_t x, innovations_t *out) {
     const selfcal_real_t minus_beta = -self->node[j].beta;
     const uint32_t from = gains->span.from, count = gains->span.to - gains->span.from;
     for (uint32_t i = 0; i < count; i++) {
@@ -153,7 +151,7 @@ static void run_columns(selfcal_t *self, size_t j, const gains_t *gains) {
     for (size_t k = 0; k <= p; k++) {
         selfcal_sum_t *x = &self->columns->x[j * (p + 1U) + k];
         *x = filter_column(self, j, gains, k == 0U ? NULL : self->columns->column[k - 1U].z[1U - self->gathering], *x,
-                    &column[k]);
+                           &column[k]);
         for (size_t l = 0; l <= k; l++) {
             selfcal_add_products(a++, gains, &column[l], &column[k]);
         }
@@ -162,7 +160,7 @@ static void run_columns(selfcal_t *self, size_t j, const gains_t *gains) {
         const reading_sums_t sums = selfcal_kernel_reading(self, at);
         selfcal_kernel_set_reading_drift(self, at,
                                          filter_column(self, j, gains, waiting(self)->y[at - j * axes],
-                                                selfcal_kernel_reading_drift(self, at), &reading));
+                                                       selfcal_kernel_reading_drift(self, at), &reading));
         selfcal_add_products(sums.c, gains, &reading, &reading);
         selfcal_add_products(sums.b, gains, &column[0], &reading);
         for (size_t k = 0; k < p; k++) {
@@ -191,31 +189,31 @@ static void gap_columns(selfcal_t *self, size_t j, selfcal_wide_t less) {
  * offset) and the coefficients of a subset of the regressors. Matrices are symmetric, the lower half is held. */
 typedef struct {
     selfcal_node_view_t node;
-    uint8_t order;                   /* unknowns: the level and the coefficients */
-    uint8_t regressor[UNKNOWNS_MAX]; /* of each, from 1 on */
+    uint8_t order;                                                 /* unknowns: the level and the coefficients */
+    uint8_t regressor[UNKNOWNS_MAX];                               /* of each, from 1 on */
     selfcal_wide_t a[UNKNOWNS_MAX][UNKNOWNS_MAX], b[UNKNOWNS_MAX]; /* sums A and B */
-    selfcal_wide_t sd[UNKNOWNS_MAX];       /* of the priors of x0 and of the coefficients */
-    selfcal_wide_t prior_mean[UNKNOWNS_MAX]; /* of the coefficients; 0 of x0 */
+    selfcal_wide_t sd[UNKNOWNS_MAX];                               /* of the priors of x0 and of the coefficients */
+    selfcal_wide_t prior_mean[UNKNOWNS_MAX];                       /* of the coefficients; 0 of x0 */
     /* offset from the prior; first values of the regressors less their references */
     selfcal_wide_t first[UNKNOWNS_MAX];
-    selfcal_wide_t last[UNKNOWNS_MAX];     /* value at the last interval: 1, and the columns about their first */
-    selfcal_wide_t left[UNKNOWNS_MAX];     /* change of x0 + c' z + drift there per unit of each */
+    selfcal_wide_t last[UNKNOWNS_MAX]; /* value at the last interval: 1, and the columns about their first */
+    selfcal_wide_t left[UNKNOWNS_MAX]; /* change of x0 + c' z + drift there per unit of each */
     selfcal_wide_t lost[UNKNOWNS_MAX][SELFCAL_TERMS_MAX]; /* what the drift, each term of it, takes of that */
-    selfcal_wide_t drift[SELFCAL_TERMS_MAX]; /* of the readings at the estimate 0 */
-    selfcal_wide_t estimate[UNKNOWNS_MAX]; /* A^-1 B; 0 for what cannot be told from those before it */
-    selfcal_wide_t rest[UNKNOWNS_MAX];     /* B - A estimate */
-    selfcal_wide_t residual;               /* C - B' A^-1 B, that is (C - 2 B' t + t' A t) at the estimate t */
+    selfcal_wide_t drift[SELFCAL_TERMS_MAX];              /* of the readings at the estimate 0 */
+    selfcal_wide_t estimate[UNKNOWNS_MAX];                /* A^-1 B; 0 for what cannot be told from those before it */
+    selfcal_wide_t rest[UNKNOWNS_MAX];                    /* B - A estimate */
+    selfcal_wide_t residual; /* C - B' A^-1 B, that is (C - 2 B' t + t' A t) at the estimate t */
 } normal_t;
 
 /* What the priors add at sigma_v^2 = variance:
  *   -2 ln p(Y | node, sigma_v) = n ln(2 pi sigma_v^2) + D + residual / sigma_v^2 + ln_det + miss. */
 typedef struct {
-    selfcal_wide_t ln_det;   /* ln det(1 + P0 A / sigma_v^2), P0 the covariance of all priors */
+    selfcal_wide_t ln_det; /* ln det(1 + P0 A / sigma_v^2), P0 the covariance of all priors */
     /* square of what the estimate misses the priors' mean by, over the sum of their covariances */
     selfcal_wide_t miss;
     /* of samples that went into the unknowns: tr U, U = (A/sigma_v^2 + P0^-1)^-1 A/sigma_v^2, 0 to order */
     selfcal_wide_t share;
-    selfcal_wide_t noise;    /* part of `miss` that goes as 1/sigma_v^2: what the priors leave unexplained */
+    selfcal_wide_t noise; /* part of `miss` that goes as 1/sigma_v^2: what the priors leave unexplained */
     /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
     selfcal_wide_t bent;
     selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
@@ -351,8 +349,8 @@ static void inverse_sums(const normal_t *normal, selfcal_wide_t variance, selfca
             for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
                 fit->now.own[1 + t] += normal->left[i] * column[j] * normal->lost[j][t] / variance;
                 for (size_t u = 0; u <= t; u++) { /* all i and j: G^-1 is symmetric */
-                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] += normal->lost[i][t] * column[j] *
-                        normal->lost[j][u] / variance;
+                    fit->now.own[1 + SELFCAL_TERMS_MAX + term_pair(t, u)] +=
+                        normal->lost[i][t] * column[j] * normal->lost[j][u] / variance;
                 }
             }
             fit->bent += 2.0 * pulled[i] * column[j] * pulled[j];
@@ -535,7 +533,7 @@ static void fade_columns(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal
 }
 
 const selfcal_regressors_code_t selfcal_regressors_code = {
-    valid_regressors, init_columns,      columns_sound, usable_values, add_values,         close_columns,
-    hand_over_columns, run_columns,       gap_columns,   fade_columns,  field_with_columns, now_with_columns,
-    finish_coefficients,
+    valid_regressors,   init_columns,      columns_sound,       usable_values, add_values,
+    close_columns,      hand_over_columns, run_columns,         gap_columns,   fade_columns,
+    field_with_columns, now_with_columns,  finish_coefficients,
 };

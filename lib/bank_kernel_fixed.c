@@ -460,7 +460,7 @@ static bool steps_are_sound(const selfcal_t *self) {
         return false;
     }
     const uint32_t shift = gain_shift(self->integers.step_beta),
-        count = self->integers.step_to - self->integers.step_from;
+                   count = self->integers.step_to - self->integers.step_from;
     const int32_t mantissa = to_fixed(self->integers.step_beta, (int)shift + 14);
     for (size_t axis = 0; axis < self->model->axes && count > 0U; axis++) {
         const int32_t *y = &self->integers.y[axis][self->integers.step_from], *d = self->integers.step[axis];

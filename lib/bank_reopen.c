@@ -37,10 +37,12 @@ static uint16_t nearest(const selfcal_t *self, const selfcal_reopening_t *at) {
         first += hypothesis_nodes(&self->model->hypothesis[h]);
     }
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    const selfcal_real_t row = rows > 1U ? ((selfcal_real_t)at->ln_rho - self->rho_lo[at->hypothesis]) /
-        self->rho_step[at->hypothesis] : R(0.0);
+    const selfcal_real_t row =
+        rows > 1U ? ((selfcal_real_t)at->ln_rho - self->rho_lo[at->hypothesis]) / self->rho_step[at->hypothesis]
+                  : R(0.0);
     const selfcal_real_t column = columns > 1U ? ((selfcal_real_t)at->ln_second - self->alpha_lo[at->hypothesis]) /
-        self->alpha_step[at->hypothesis] : R(0.0);
+                                                     self->alpha_step[at->hypothesis]
+                                               : R(0.0);
     /* a place that is not a number counts as the first */
     const size_t i = (size_t)r_fmin(r_fmax(row + R(0.5), R(0.0)), (selfcal_real_t)(rows - 1U));
     const size_t k = (size_t)r_fmin(r_fmax(column + R(0.5), R(0.0)), (selfcal_real_t)(columns - 1U));
@@ -72,8 +74,8 @@ static void bias_at(const selfcal_t *self, uint8_t axis, const selfcal_reopening
 
 static bool valid(const selfcal_t *self, const selfcal_reopening_t at[]) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
-        if (at[axis].hypothesis >= self->model->hypotheses || !isfinite(at[axis].bias) ||
-            !(at[axis].bias_sd >= 0.0F) || !isfinite(at[axis].bias_sd)) {
+        if (at[axis].hypothesis >= self->model->hypotheses || !isfinite(at[axis].bias) || !(at[axis].bias_sd >= 0.0F) ||
+            !isfinite(at[axis].bias_sd)) {
             return false;
         }
     }

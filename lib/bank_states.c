@@ -109,7 +109,7 @@ static swing_t after(swing_t x, swing_t y) {
 /* The stationary variance of each state is the first one's q. */
 static swing_t turn_of(const selfcal_term_node_t *node) {
     const swing_t turn = {phi_of(node, node->pair), -(selfcal_wide_t)node->beta[node->pair],
-        (selfcal_wide_t)node->q[node->pair]};
+                          (selfcal_wide_t)node->q[node->pair]};
     return turn;
 }
 
@@ -198,8 +198,8 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
         } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_wide_t rate = bandwidth_of(term, second) * dt_s; /* of an interval */
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)rate, self->model->block);
-            const selfcal_wide_t variance = (selfcal_wide_t)of.gain *
-                                            markov_variance(law, term, square, second, dt_s); /* stationary */
+            const selfcal_wide_t variance =
+                (selfcal_wide_t)of.gain * markov_variance(law, term, square, second, dt_s); /* stationary */
             node->beta[a] = (selfcal_real_t)-expm1(-fmin(rate, ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
@@ -210,8 +210,8 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
         const size_t last = law->terms;
         /* White noise that the drift leaves out is missing at all frequencies. */
         const selfcal_wide_t out = selfcal_white_left_out(law, second, dt_s, self->model->block) * square;
-        const selfcal_wide_t per_ratio_sq = fmax((1.0 + out) / (second * second) - out,
-                                                 exp(-2.0 * (selfcal_wide_t)LN_RATIO_MAX));
+        const selfcal_wide_t per_ratio_sq =
+            fmax((1.0 + out) / (second * second) - out, exp(-2.0 * (selfcal_wide_t)LN_RATIO_MAX));
         node->theta = (selfcal_real_t)tanh(-0.25 * log(per_ratio_sq)); /* (ratio - 1)/(ratio + 1) */
         node->beta[last] = R(1.0);
         node->p[term_pair(last, last)] = (selfcal_wide_t)node->theta * (selfcal_wide_t)node->theta * white_of(node);
@@ -249,8 +249,8 @@ static gain_t gain_of(const selfcal_term_node_t *node, size_t order, selfcal_wid
         }
     }
     for (size_t a = 0; a < order; a++) {
-        gain.kappa[a] = (phi_of(node, a) * gain.kappa[a] +
-                         (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
+        gain.kappa[a] =
+            (phi_of(node, a) * gain.kappa[a] + (a + 1U == order ? (selfcal_wide_t)node->theta * white : 0.0)) / gain.s;
     }
     return gain;
 }
@@ -385,9 +385,7 @@ static void state_gains_varying(const selfcal_batch_t *batch, selfcal_node_t *no
 /* One series, `y` [SELFCAL_BATCH] or all 1 if NULL, through a span; `x` are its states. Sums are taken to twice the
  * digits. */
 static void filter_states(const selfcal_term_node_t *term, size_t order, const term_gains_t *gains,
-                          const selfcal_real_t *y,
-                   selfcal_sum_t x[],
-                   innovations_t *out) {
+                          const selfcal_real_t *y, selfcal_sum_t x[], innovations_t *out) {
     const uint32_t from = gains->sums.span.from, count = gains->sums.span.to - from;
     for (uint32_t i = 0; i < count; i++) {
         selfcal_sum_t rest = {y != NULL ? y[from + i] : R(1.0), R(0.0)};
@@ -489,10 +487,10 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     }
     for (size_t a = 0; a < order; a++) {
         const selfcal_wide_t beta = (selfcal_wide_t)term->beta[a], q = (selfcal_wide_t)term->q[a],
-            theta = (selfcal_wide_t)term->theta;
+                             theta = (selfcal_wide_t)term->theta;
         if (!in_pair(term, a)) {
-            term->p[term_pair(a, a)] += beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a])
-                                                   : intervals * q;
+            term->p[term_pair(a, a)] +=
+                beta > 0.0 ? q / (beta * (2.0 - beta)) * less[a] * (2.0 - less[a]) : intervals * q;
         }
         term->p[term_pair(a, a)] += a + 1U == order ? theta * theta * white_of(term) : 0.0;
     }
@@ -551,8 +549,7 @@ static void terms_now(const selfcal_t *self, size_t j, terms_now_t *now) {
         } else if (term->kind == SELFCAL_MARKOV) {
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)(bandwidth_of(term, second) * dt_s), block);
             now->per_prediction.of[a][a] = (selfcal_wide_t)of.now / phi_of(node, a);
-            now->after[term_pair(a, a)] =
-                markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
+            now->after[term_pair(a, a)] = markov_variance(law, term, square, second, dt_s) * (selfcal_wide_t)of.after;
         }
     }
 }
@@ -643,14 +640,13 @@ static bool states_sound(const selfcal_t *self) {
     }
     for (size_t k = 0; k < nodes; k++) {
         const selfcal_term_node_t *node = &terms->node[k];
-        if (!is_bool(&node->steady) || node->pair >= SELFCAL_TERMS_MAX ||
-            !(node->theta > R(-1.0)) || !(node->theta < R(1.0))) {
+        if (!is_bool(&node->steady) || node->pair >= SELFCAL_TERMS_MAX || !(node->theta > R(-1.0)) ||
+            !(node->theta < R(1.0))) {
             return false;
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             if (!(node->beta[a] >= R(0.0)) || !(node->beta[a] <= R(1.0)) || !(node->q[a] >= R(0.0)) ||
-                !isfinite(node->q[a]) ||
-                !(node->p[term_pair(a, a)] >= 0.0)) {
+                !isfinite(node->q[a]) || !(node->p[term_pair(a, a)] >= 0.0)) {
                 return false;
             }
         }
@@ -698,7 +694,7 @@ static bool valid_term(const selfcal_term_t *term, float dt_s) {
     const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
     const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
     return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN &&
-        term->deviation <= FACTOR_MAX &&
+           term->deviation <= FACTOR_MAX &&
            (walk || swing || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
 }
 
@@ -725,6 +721,6 @@ static void fall_of(const selfcal_term_t *first, selfcal_real_t elapsed_s, selfc
 }
 
 const selfcal_states_code_t selfcal_states_code = {
-    valid_sum, init_states, states_sound, start_node, run_states, run_states_gap,
-    settle_node, fade_states, restart_states, view_states, spread_of, drift_of, fall_of,
+    valid_sum,   init_states,    states_sound, start_node, run_states, run_states_gap, settle_node,
+    fade_states, restart_states, view_states,  spread_of,  drift_of,   fall_of,
 };

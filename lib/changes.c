@@ -21,16 +21,16 @@
 #define CALM_LIMIT R(4.0) /* below it what was learned is kept for a step to come */
 #define HELD R(4.0)
 #define HOLD 24U
-#define SETTLE 8U            /* of HOLD: what comes after them must bear the step out */
+#define SETTLE 8U /* of HOLD: what comes after them must bear the step out */
 #define LATE_LIMIT R(2.0)
-#define GAP_MAX 64U          /* bank intervals; a step after a longer gap begins with the first sample after it */
+#define GAP_MAX 64U /* bank intervals; a step after a longer gap begins with the first sample after it */
 #define WINDOW 64U
-#define LOUDER R(1.75) /* a window of normal z is so with probability 2e-6 ... */
+#define LOUDER R(1.75)  /* a window of normal z is so with probability 2e-6 ... */
 #define QUIETER R(0.55) /* ... and so with 4e-4 (4e6 windows simulated) */
 #define SQUARE_MAX R(4.0)
-#define WINDOWS_MIN 8U       /* before a change can be told */
-#define WINDOWS_MAX 64U      /* that the mean before remembers */
-#define WEIGHT_KEPT 16.0     /* bank samples that what was learned of the noise counts for after it has changed */
+#define WINDOWS_MIN 8U   /* before a change can be told */
+#define WINDOWS_MAX 64U  /* that the mean before remembers */
+#define WEIGHT_KEPT 16.0 /* bank samples that what was learned of the noise counts for after it has changed */
 
 /* The filters begin anew: what the onsets follow is no more. */
 static void clear_onsets(selfcal_changes_t *self) {
@@ -170,8 +170,7 @@ static void tell_steps(selfcal_changes_t *self, const selfcal_adequacy_t *adequa
 /* A window has ended. */
 static void look_for_variance(selfcal_changes_t *self, uint8_t axis, float dt_s) {
     selfcal_change_watch_t *watch = &self->watch[axis];
-    const selfcal_real_t power = watch->power / (selfcal_real_t)WINDOW,
-        square = watch->square / (selfcal_real_t)WINDOW;
+    const selfcal_real_t power = watch->power / (selfcal_real_t)WINDOW, square = watch->square / (selfcal_real_t)WINDOW;
     watch->power = watch->square = watch->sum = R(0.0);
     const bool judged = watch->windows >= WINDOWS_MIN && watch->level > R(0.0);
     const bool up = judged && power > LOUDER * watch->level, down = judged && power < QUIETER * watch->level;

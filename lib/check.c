@@ -6,8 +6,8 @@ SELFCAL_STATIC_ASSERT(axes, SELFCAL_AXES_MAX >= 1 && SELFCAL_AXES_MAX <= 16);
 SELFCAL_STATIC_ASSERT(hypotheses, SELFCAL_HYPOTHESES_MAX >= 1 && SELFCAL_HYPOTHESES_MAX <= 16);
 SELFCAL_STATIC_ASSERT(grid_has_a_spline, SELFCAL_GRID_MAX >= 6 && SELFCAL_GRID_MAX <= 64);
 SELFCAL_STATIC_ASSERT(alpha, SELFCAL_ALPHA_MAX >= 6 && SELFCAL_ALPHA_MAX <= SELFCAL_GRID_MAX);
-SELFCAL_STATIC_ASSERT(nodes_of_one, SELFCAL_HYPOTHESIS_NODES_MAX >= SELFCAL_GRID_MAX &&
-                      SELFCAL_HYPOTHESIS_NODES_MAX <= 65535);
+SELFCAL_STATIC_ASSERT(nodes_of_one,
+                      SELFCAL_HYPOTHESIS_NODES_MAX >= SELFCAL_GRID_MAX && SELFCAL_HYPOTHESIS_NODES_MAX <= 65535);
 SELFCAL_STATIC_ASSERT(nodes_of_all, SELFCAL_NODES_MAX >= SELFCAL_HYPOTHESIS_NODES_MAX && SELFCAL_NODES_MAX <= 65535);
 SELFCAL_STATIC_ASSERT(regressors, SELFCAL_REGRESSORS_MAX >= 1 && SELFCAL_REGRESSORS_MAX <= 6);
 SELFCAL_STATIC_ASSERT(terms, SELFCAL_TERMS_MAX == 1 || SELFCAL_TERMS_MAX == 3);
@@ -30,10 +30,10 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_two_regressors, /* 8 p + 4, in integers 8
                              (SELFCAL_STATE_SUMS > 0U ? 40 : 20)));
 SELFCAL_STATIC_ASSERT(bytes_a_node_of_a_sum,
                       SELFCAL_TERMS_MAX != 3 ||
-                      PRICED(SELFCAL_TERMS_SIZE(2, 0, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 104 + 24 * 2));
+                          PRICED(SELFCAL_TERMS_SIZE(2, 0, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 104 + 24 * 2));
 SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum,
                       SELFCAL_TERMS_MAX != 3 || SELFCAL_STATE_SUMS > 0U ||
-                      PRICED(SELFCAL_TERMS_SIZE(1, 1, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 24));
+                          PRICED(SELFCAL_TERMS_SIZE(1, 1, 2) - SELFCAL_TERMS_SIZE(1, 0, 2) == 24));
 
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
 #define Q_MAX R(1e12)
@@ -52,8 +52,7 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum,
 
 static bool flags_are_bools(const selfcal_t *self) {
     return is_bool(&self->batch[0].part) && is_bool(&self->batch[1].part) && is_bool(&self->started) &&
-        is_bool(&self->dropped) &&
-           is_bool(&self->in_gap);
+           is_bool(&self->dropped) && is_bool(&self->in_gap);
 }
 
 /* False for NaN. */
@@ -69,7 +68,7 @@ static bool memory_is_laid_out(const selfcal_t *self) {
     }
     const size_t cells = (size_t)model->nodes * model->axes;
     return self->b != NULL && self->c == self->b + cells &&
-        (const void *)self->node == (const void *)(self->c + cells) &&
+           (const void *)self->node == (const void *)(self->c + cells) &&
            (const void *)self->x == (const void *)(self->node + model->nodes);
 }
 
@@ -110,13 +109,14 @@ static bool batches_are_sound(const selfcal_t *self) {
     if (gathered->count >= SELFCAL_BATCH || gathered->gap_after > 0U || waits->count > SELFCAL_BATCH ||
         self->ran >= self->model->nodes || (self->ran > 0U && waits->count == 0U && waits->gap_after == 0U) ||
         self->push_nodes == 0U || !(self->keep > 0.0) || !(self->keep <= 1.0) || !(self->weight >= 0.0) ||
-        !(self->beginning >= 0.0) || !(self->beginning <= 1.0) ||
-        (self->n > 0U && !(self->weight > 0.0)) || !weight_is_sound(self)) {
+        !(self->beginning >= 0.0) || !(self->beginning <= 1.0) || (self->n > 0U && !(self->weight > 0.0)) ||
+        !weight_is_sound(self)) {
         return false;
     }
     /* time before the first sample is no gap */
-    if (self->n == 0U && (waits->count > 0U ? waits->gap[0] : gathered->count > 0U ? gathered->gap[0]
-                          : self->pending_gap) > 0U) {
+    if (self->n == 0U && (waits->count > 0U      ? waits->gap[0]
+                          : gathered->count > 0U ? gathered->gap[0]
+                                                 : self->pending_gap) > 0U) {
         return false;
     }
     return batch_is_sound(self, gathered) && batch_is_sound(self, waits);
@@ -129,8 +129,7 @@ static bool intake_is_sound(const selfcal_t *self) {
         (!self->started && (self->position > 0U || self->in_gap)) || count->samples < self->used ||
         selfcal_count(self) > count->samples - self->used || count->samples - self->used < self->within_dof ||
         count->blocks_part > selfcal_count(self) || (self->in_gap && count->gaps == 0U) ||
-        (self->dropped && self->used > 0U) ||
-        !within(self->variance_ratio, R(1.0) / ratio_max, ratio_max) ||
+        (self->dropped && self->used > 0U) || !within(self->variance_ratio, R(1.0) / ratio_max, ratio_max) ||
         self->retired >= (1UL << self->model->axes) - 1U) { /* the last axis is never retired */
         return false;
     }
@@ -178,8 +177,7 @@ static bool node_is_sound(const selfcal_t *self, size_t i, bool sum) {
     if (!within(node->beta, R(0.0), BETA_MAX) || !within(node->q, R(0.0), Q_MAX) ||
         !within(node->p_inf, node->q * (R(1.0) - SLACK), (R(1.0) + node->q) * (R(1.0) + SLACK)) ||
         !within(now.c, R(0.0), R(1.0)) || !within(now.d, -P_MAX, P_MAX) ||
-        node->p_inf + now.d < node->q - SLACK * node->p_inf - LEAST ||
-        !within(node->u_inf, R(0.0), R(1.0)) ||
+        node->p_inf + now.d < node->q - SLACK * node->p_inf - LEAST || !within(node->u_inf, R(0.0), R(1.0)) ||
         !within(node->u_inf + now.e, -SLACK, R(1.0) + SLACK) ||
         (node->level ? now.d != R(0.0) || now.e != R(0.0) : node->level_from > 0U) || node->level_from > node->steady ||
         node->steady > seen || !finite_sum(node->a) || !(node->a.hi >= R(0.0)) || !finite_sum(node->ln_s)) {
@@ -219,8 +217,7 @@ selfcal_status_t selfcal_check(const selfcal_t *self) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (!flags_are_bools(self) || !memory_is_laid_out(self) || !batches_are_sound(self) || !intake_is_sound(self) ||
-        !selfcal_kernel_sound(self) ||
-        !regressors_are_sound(self) || !states_are_sound(self)) {
+        !selfcal_kernel_sound(self) || !regressors_are_sound(self) || !states_are_sound(self)) {
         return SELFCAL_CORRUPT;
     }
     const selfcal_batch_t *waits = &self->batch[1U - self->gathering];

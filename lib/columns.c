@@ -195,7 +195,7 @@ static float gained(selfcal_trail_t *trail, float value, uint64_t stride) {
         return 0.0F;
     }
     const uint64_t bin = trail->bin, most = (uint64_t)BINS * bin;
-    uint64_t ahead = bin - trail->in_bin; /* samples from the last one to the next bin end */
+    uint64_t ahead = bin - trail->in_bin;         /* samples from the last one to the next bin end */
     if (stride > most && ahead + most < stride) { /* a long gap: older ends leave the ring anyway */
         ahead += (stride - most - ahead) / bin * bin;
     }

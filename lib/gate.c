@@ -220,8 +220,7 @@ static void start_window(selfcal_gate_t *gate) {
 
 selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_config_t *config) {
     if (gate == NULL || config == NULL || config->axes == 0U || config->axes > SELFCAL_AXES_MAX ||
-        config->window < 2U ||
-        !(config->false_alarm >= 0.0F) || !(config->false_alarm <= 0.1F) || config->hold == 0U ||
+        config->window < 2U || !(config->false_alarm >= 0.0F) || !(config->false_alarm <= 0.1F) || config->hold == 0U ||
         config->memory == 0U) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -244,9 +243,8 @@ selfcal_status_t selfcal_gate_init(selfcal_gate_t *gate, const selfcal_gate_conf
 
 selfcal_status_t selfcal_gate_noise(selfcal_gate_t *gate, uint8_t axis, const selfcal_gate_noise_t *noise) {
     if (gate == NULL || noise == NULL || axis >= gate->config.axes || !(noise->sigma > 0.0F) ||
-        !(noise->within > 0.0F) ||
-        !(noise->spread > 0.0F) || !(noise->level > 0.0F) || !isfinite(noise->within) || !isfinite(noise->spread) ||
-        !isfinite(noise->level)) {
+        !(noise->within > 0.0F) || !(noise->spread > 0.0F) || !(noise->level > 0.0F) || !isfinite(noise->within) ||
+        !isfinite(noise->spread) || !isfinite(noise->level)) {
         return SELFCAL_BAD_ARGUMENT;
     }
     gate->axis[axis] = *noise;
@@ -290,8 +288,7 @@ selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis,
 /* sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)); `rates`: of the gyros only; `times`: by how much an
  * axis's variance is greater than was measured, NULL: by nothing. */
 static float distance(const selfcal_gate_t *gate, const float mean[], selfcal_real_t inv_n,
-                      const selfcal_level_t *level, bool rates,
-                      const float times[]) {
+                      const selfcal_level_t *level, bool rates, const float times[]) {
     float sum = 0.0F;
     for (uint8_t axis = 0; axis < gate->config.axes; axis++) {
         if (present(gate, axis) && (gate->config.is_rate[axis] || !rates)) {
@@ -455,9 +452,8 @@ static void judge(selfcal_gate_t *gate) {
     }
     follow(gate, mean, scatter, inv_n, shaken);
     const uint32_t hold = gate->config.hold, settle = gate->config.settle;
-    const bool back =
-        !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true,
-                                  NULL) <= gate->rate_moved_above;
+    const bool back = !gate->rested || distance(gate, gate->found.mean, gate->found.gamma, &gate->rest, true, NULL) <=
+                                           gate->rate_moved_above;
     const bool settled = settle >= hold && gate->calm > settle;
     if (settled && gate->quiet < gate->calm) {
         start_noise(gate);

@@ -205,8 +205,8 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
     if (imu->kept != NULL && !imu->work.gathered) {
         imu->kept->gathered_at = imu->kept->passed - imu->bank.position;
     }
-    const selfcal_status_t status = imu->columns != NULL ? imu->pipe->columns->step(imu)
-                                                         : selfcal_report_step(&imu->work, &imu->report);
+    const selfcal_status_t status =
+        imu->columns != NULL ? imu->pipe->columns->step(imu) : selfcal_report_step(&imu->work, &imu->report);
     if (status == SELFCAL_BUSY) {
         return status;
     }

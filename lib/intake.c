@@ -194,7 +194,7 @@ static uint32_t faults(selfcal_t *self, const float sample[]) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         const selfcal_axis_t *limits = &self->model->axis[axis];
         const uint32_t value = float_bits(sample[axis]), last = float_bits(self->last[axis]),
-            range = float_bits(limits->range);
+                       range = float_bits(limits->range);
         const uint32_t magnitude = value & MAGNITUDE;
         /* range > 0 */
         if (magnitude >= float_bits(SELFCAL_SAMPLE_MAX) || (range - 1U < INFINITE && magnitude >= range)) {
@@ -222,7 +222,7 @@ static uint32_t outliers(selfcal_t *self, const float sample[], uint32_t live) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         selfcal_usual_t *usual = &self->usual;
         const bool far = (live >> axis & 1U) != 0U && usual->limit[axis] > 0.0F &&
-            fabsf(sample[axis] - usual->level[axis]) > usual->limit[axis];
+                         fabsf(sample[axis] - usual->level[axis]) > usual->limit[axis];
         if (!far) {
             usual->run[axis] = 0;
         } else if (usual->run[axis] < OUTLIER_RUN) {
@@ -321,6 +321,7 @@ const selfcal_counters_t *selfcal_counters(const selfcal_t *self) {
 
 float selfcal_within_sd(const selfcal_t *self, uint8_t axis) {
     SELFCAL_ASSERT(axis < self->model->axes);
-    return self->within_dof > 0U &&
-        !selfcal_retired(self, axis) ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof) : NAN;
+    return self->within_dof > 0U && !selfcal_retired(self, axis)
+               ? (float)sqrt(self->within[axis] / (selfcal_wide_t)self->within_dof)
+               : NAN;
 }

@@ -70,8 +70,8 @@ static inline bool has_ratio(const selfcal_law_t *law) {
 /* One plain term, or none: the filters of bank.c. All others are sums (bank_states.c). */
 static inline bool is_plain(const selfcal_law_t *law) {
     const selfcal_term_t *term = &law->term[0];
-    const bool walk = term->kind == SELFCAL_WALK, markov = term->kind == SELFCAL_MARKOV && term->bandwidth == 1.0F &&
-        !term->stated;
+    const bool walk = term->kind == SELFCAL_WALK,
+               markov = term->kind == SELFCAL_MARKOV && term->bandwidth == 1.0F && !term->stated;
     return !law->coloured_noise &&
            (law->terms == 0U || (law->terms == 1U && term->deviation == 1.0F && !term->by_ratio && (walk || markov)));
 }
@@ -88,8 +88,7 @@ static inline selfcal_wide_t bandwidth_of(const selfcal_term_t *term, selfcal_wi
 /* Stationary variance of a Gauss-Markov term over sigma_v^2, at a node of rho^2 = `square` and of the law's second
  * parameter. Of an oscillation half of it, for each of its two states. */
 static inline selfcal_wide_t markov_variance(const selfcal_law_t *law, const selfcal_term_t *term,
-                                             selfcal_wide_t square,
-                                             selfcal_wide_t second, selfcal_wide_t dt_s) {
+                                             selfcal_wide_t square, selfcal_wide_t second, selfcal_wide_t dt_s) {
     const selfcal_wide_t deviation = (selfcal_wide_t)term->deviation * (term->by_ratio ? second : 1.0);
     const bool markov = term->kind == SELFCAL_MARKOV;
     const selfcal_wide_t variance = (markov ? 1.0 : 0.5) * deviation * deviation * square;

@@ -8,11 +8,11 @@ typedef struct {
 static moments_t predict_law(const selfcal_model_t *model, const selfcal_law_t *law,
                              const selfcal_posterior_t *posterior, selfcal_real_t elapsed_s) {
     moments_t now = {(selfcal_real_t)posterior->bias_mean,
-        (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
+                     (selfcal_real_t)posterior->bias_sd * (selfcal_real_t)posterior->bias_sd};
     for (uint8_t a = 0; a < law->terms; a++) {
         if (law->term[a].kind == SELFCAL_WALK) {
             const selfcal_real_t deviation = (selfcal_real_t)law->term[a].deviation,
-                rate = deviation * deviation * elapsed_s;
+                                 rate = deviation * deviation * elapsed_s;
             const selfcal_real_t mean = (selfcal_real_t)posterior->parameter[SELFCAL_K].mean;
             const selfcal_real_t sd = (selfcal_real_t)posterior->parameter[SELFCAL_K].sd;
             now.var = r_fma(r_fma(mean, mean, sd * sd), rate, now.var);

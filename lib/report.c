@@ -22,8 +22,8 @@ static void finish_hypothesis(selfcal_work_t *work, selfcal_posterior_t *posteri
         work->lost = work->lost || !(work->sigma.drop[work->hypothesis] > SIGMA_DEPTH); /* else the priors exclude it */
         return;
     }
-    posterior->ln_evidence = work->top_profile + (selfcal_wide_t)work->peak + (selfcal_wide_t)work->search.best +
-                             log(work->sum.mass);
+    posterior->ln_evidence =
+        work->top_profile + (selfcal_wide_t)work->peak + (selfcal_wide_t)work->search.best + log(work->sum.mass);
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
         if (has_parameter(hypothesis_of(work)->law, p)) {
             posterior->ln_evidence += (selfcal_wide_t)ln_prior_density(&prior_of(work)[p]);
@@ -92,15 +92,14 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
     selfcal_real_t sum = R(0.0), mean = R(0.0), square = R(0.0);
     for (uint8_t h = 0; h < model->hypotheses; h++) {
         selfcal_posterior_t *posterior = &report->hypothesis[h];
-        const selfcal_real_t weight =
-            r_exp((selfcal_real_t)(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability -
-                                   best));
+        const selfcal_real_t weight = r_exp(
+            (selfcal_real_t)(posterior->ln_evidence + (selfcal_wide_t)model->hypothesis[h].ln_probability - best));
         posterior->probability = (float)weight;
         sum += weight;
         /* a law without evidence has no bias, and counts for nothing; if none has any, all is NaN */
         if (weight != R(0.0)) {
             const selfcal_real_t off = (selfcal_real_t)posterior->bias_mean - about,
-                sd = (selfcal_real_t)posterior->bias_sd;
+                                 sd = (selfcal_real_t)posterior->bias_sd;
             mean = r_fma(weight, off, mean);
             square = r_fma(weight, r_fma(off, off, sd * sd), square);
         }
@@ -152,7 +151,7 @@ static selfcal_status_t step_gather(selfcal_work_t *work, selfcal_report_t *repo
     report->n = work->bank->n;
     go_to(work, TRUTH);
     return work->bank->weight + 1.0 < (selfcal_wide_t)(SELFCAL_REPORT_MIN + work->unknowns) ? SELFCAL_TOO_SHORT
-        : SELFCAL_BUSY;
+                                                                                            : SELFCAL_BUSY;
 }
 
 static selfcal_status_t step_truth(selfcal_work_t *work, selfcal_report_t *report) {
@@ -268,7 +267,7 @@ static selfcal_status_t step_whole(selfcal_work_t *work, selfcal_report_t *repor
 /* By stage. Each step says SELFCAL_BUSY, or the status that ends the report. */
 typedef selfcal_status_t (*stage_t)(selfcal_work_t *, selfcal_report_t *);
 static const stage_t stages[] = {
-    step_gather, step_truth, step_fit,     step_sigma, step_values,    step_spline,   step_spline, step_search,
+    step_gather, step_truth,   step_fit,     step_sigma, step_values,    step_spline,   step_spline, step_search,
     step_sum,    step_weights, step_weights, step_bias,  step_estimates, step_evidence, step_whole,
 };
 

@@ -3,8 +3,7 @@
 
 /* The terms' part of `now` at a node of a sum, x0 given with its variance. */
 static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0, selfcal_wide_t variance,
-                      selfcal_wide_t bias_left,
-                      selfcal_now_t *now) {
+                      selfcal_wide_t bias_left, selfcal_now_t *now) {
     const size_t index = (size_t)work->first_node + k;
     selfcal_wide_t lost[SELFCAL_TERMS_MAX], of_reading[SELFCAL_TERMS_MAX];
     const selfcal_states_code_t *states = work->bank->model->states;
@@ -23,8 +22,7 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_wide_t x0,
  * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) stationary, times sigma_v^2. `off`: the
  * node's mean less bias_about. */
 static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_view_t *v, const selfcal_now_t *now,
-                         selfcal_wide_t own,
-                         selfcal_wide_t off) {
+                         selfcal_wide_t own, selfcal_wide_t off) {
     const selfcal_law_t *law = hypothesis_of(work)->law;
     const size_t terms = terms_of(law);
     const selfcal_wide_t square = (selfcal_wide_t)r_exp(R(2.0) * (selfcal_real_t)v->ln_rho);
@@ -82,7 +80,7 @@ void selfcal_bias_step(selfcal_work_t *work) {
     } else {
         const selfcal_wide_t prior_precision = sigma_sq * work->per_bias_sd * work->per_bias_sd;
         const selfcal_wide_t variance = (selfcal_wide_t)(R(1.0) / (selfcal_real_t)(v->a + prior_precision)),
-            lost = 1.0 - v->bias_left;
+                             lost = 1.0 - v->bias_left;
         const selfcal_wide_t x0 = (v->b - offset * prior_precision) * variance;
         now.mean = v->drift + x0 * v->bias_left;
         now.drift[0] = now.mean - x0;
@@ -97,7 +95,7 @@ void selfcal_bias_step(selfcal_work_t *work) {
         work->bias.about = now.mean;
     }
     const selfcal_wide_t off = now.mean - work->bias.about,
-        weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
+                         weighed = (selfcal_wide_t)work->scratch.grid.spline[0][k] * off;
     work->bias.weight += (selfcal_wide_t)work->scratch.grid.spline[0][k];
     work->bias.first += weighed;
     work->bias.second += weighed * off;

@@ -52,7 +52,7 @@ selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln
 static selfcal_real_t left_out_of(const selfcal_work_t *work, selfcal_real_t ln_second) {
     const selfcal_model_t *model = work->bank->model;
     return (selfcal_real_t)selfcal_white_left_out(hypothesis_of(work)->law, (selfcal_wide_t)r_exp(ln_second),
-                                          (selfcal_wide_t)model->dt_s, model->block) /
+                                                  (selfcal_wide_t)model->dt_s, model->block) /
            selfcal_points_gain(work, ln_second);
 }
 
@@ -77,12 +77,12 @@ void selfcal_cells_limits(selfcal_work_t *work) {
     if (hypothesis->rho != NULL) {
         const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
         const selfcal_real_t lo = half_ln_dt(work) - drift_shift(work, work->search.limit_lo[1]),
-            hi = half_ln_dt(work) - drift_shift(work, work->search.limit_hi[1]);
+                             hi = half_ln_dt(work) - drift_shift(work, work->search.limit_hi[1]);
         work->search.limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + lo;
         work->search.limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + hi;
         /* this far over N/sqrt(dt), farther over sigma_v */
-        const selfcal_real_t of_noise = r_exp(R(2.0) * work->search.limit_hi[0]) *
-                                        left_out_of(work, work->search.limit_hi[1]);
+        const selfcal_real_t of_noise =
+            r_exp(R(2.0) * work->search.limit_hi[0]) * left_out_of(work, work->search.limit_hi[1]);
         work->search.limit_hi[0] -= R(0.5) * r_log1p(-r_fmin(of_noise, LEFT_OUT_LIMIT));
     }
 }
@@ -181,7 +181,7 @@ reach_t selfcal_cells_reach(const selfcal_work_t *work, const selfcal_real_t ln_
         const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
         const selfcal_prior_t *prior = &work->scratch.grid.row.prior[p];
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min - ln_value[p],
-            hi = (selfcal_real_t)prior->ln_max - ln_value[p];
+                             hi = (selfcal_real_t)prior->ln_max - ln_value[p];
         if (j == 0U && (lo > half[j] || hi < -half[j])) {
             half[j] = R(0.0);
             whole = R(6.0);

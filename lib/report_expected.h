@@ -3,7 +3,7 @@
 typedef struct {
     T v_less_1; /* the innovations' variance over sigma_v^2 of the data, less 1 */
     T s_less_1; /* what the filter itself takes it to be, over its own sigma_v^2, less 1 */
-    T gain, p; /* phi K; 1 - psi */
+    T gain, p;  /* phi K; 1 - psi */
 } NAME(expected_t);
 
 /* The predicted drift variance that the filter of (rho, 1 - phi = beta), a random walk with a beta of 0, converges to,

@@ -36,8 +36,8 @@ static bool too_coarse(const selfcal_work_t *work) {
         return rest * weight > R(0.08);
     }
     const bool pair = hypothesis_of(work)->alpha != NULL;
-    return rest * (r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) + R(18.0) *
-                   work->truth.missed) > (work->truth.pair ? R(0.4) : R(0.02)) ||
+    return rest * (r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) + R(18.0) * work->truth.missed) >
+               (work->truth.pair ? R(0.4) : R(0.02)) ||
            selfcal_spectrum_range(weight) > LINES_APART * (selfcal_real_t)(SELFCAL_LINES - 1);
 }
 
@@ -84,8 +84,8 @@ typedef struct {
     const selfcal_prior_t *prior;
     /* at sigma_v's conditional mode; what it runs through at each sigma_v of the cell */
     selfcal_real_t ln_value, width;
-    selfcal_real_t off;             /* from the best cell, relative */
-    bool cut;                       /* the limits do not leave all of it */
+    selfcal_real_t off; /* from the best cell, relative */
+    bool cut;           /* the limits do not leave all of it */
     spread_t spread;
 } side_t;
 
@@ -110,8 +110,7 @@ static sums_t sum_cut(const selfcal_work_t *work, const side_t side[2], unsigned
     const selfcal_real_t width = work->sigma.width;
     sums_t sum = {R(0.0), R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     for (int k = 0; k < SELFCAL_SIGMA_CELLS; k++) {
-        const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width,
-            e = work->scratch.grid.delta_expm1[k];
+        const selfcal_real_t delta = from + ((selfcal_real_t)k + R(0.5)) * width, e = work->scratch.grid.delta_expm1[k];
         selfcal_real_t w = height * work->scratch.grid.delta_weight[k], ln[2], dev[2];
         for (unsigned j = 0; j < sides; j++) {
             const side_t *s = &side[j];
@@ -262,9 +261,9 @@ static void sum_part(selfcal_work_t *work, uint16_t count, part_t *part) {
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         selfcal_cells_parameters(work, &cell, ln_value);
         const selfcal_real_t steps = i == 0U || last ? R(1.0) : R(2.0);
-        const selfcal_real_t change[2] = {
-            (after.ln_sigma - before.ln_sigma + (after.ln_white - before.ln_white)) / steps,
-            wide + (after.ln_sigma - before.ln_sigma) / steps};
+        const selfcal_real_t change[2] = {(after.ln_sigma - before.ln_sigma + (after.ln_white - before.ln_white)) /
+                                              steps,
+                                          wide + (after.ln_sigma - before.ln_sigma) / steps};
         unsigned cost = 1;
         const sums_t sum = sum_cell(work, ln_value, cell.profile, density, change, &cost);
         spent += cost;

@@ -124,7 +124,7 @@ static selfcal_real_t quantile(const selfcal_work_t *work, unsigned p, selfcal_r
             const selfcal_real_t first = mass - R(0.5) * slope; /* density where the bin begins */
             const selfcal_real_t root = first + r_sqrt(r_fmax(r_fma(first, first, R(2.0) * slope * more), R(0.0)));
             return work->sum.range_lo[p] +
-                ((selfcal_real_t)bin + (root > R(0.0) ? r_fmin(R(2.0) * more / root, R(1.0)) : R(1.0))) * step;
+                   ((selfcal_real_t)bin + (root > R(0.0) ? r_fmin(R(2.0) * more / root, R(1.0)) : R(1.0))) * step;
         }
         below += mass;
     }
@@ -150,7 +150,7 @@ static void add_modes(selfcal_work_t *work, unsigned p) {
     const selfcal_real_t *modes = work->scratch.grid.modes[p == SELFCAL_N ? 0 : 1];
     selfcal_real_t *bins = work->scratch.grid.histogram[p], kernel[SELFCAL_HISTOGRAM + 2] = {R(0.0)};
     const selfcal_real_t step = selfcal_histogram_step(work, p),
-        width = (work->sigma.hi - work->sigma.lo) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
+                         width = (work->sigma.hi - work->sigma.lo) / (selfcal_real_t)SELFCAL_SIGMA_CELLS;
     const int zero = (int)(-work->sigma.lo / step) + 1; /* the bin of a delta of 0 */
     spread_t spread = selfcal_histogram_spread(work, p, kernel, width);
     spread.lo = -((selfcal_real_t)zero + R(0.5)) * step;
@@ -163,13 +163,13 @@ static void add_modes(selfcal_work_t *work, unsigned p) {
         kernel[k] += kernel[k - 1];
     }
     const int wide = (int)((work->sigma.hi - work->sigma.lo) / step) + 3,
-        most = wide < SELFCAL_HISTOGRAM ? wide : SELFCAL_HISTOGRAM;
+              most = wide < SELFCAL_HISTOGRAM ? wide : SELFCAL_HISTOGRAM;
     selfcal_real_t mass = R(0.0);
     for (int i = 0; i < SELFCAL_HISTOGRAM; i++) {
         mass += modes[i];
         if (mass > R(0.0)) {
             const int first = i < zero ? zero - i : 0, room = SELFCAL_HISTOGRAM + zero - i,
-                last = most < room ? most : room;
+                      last = most < room ? most : room;
             for (int k = first; k < last; k++) { /* no whole cell reaches beyond the limits */
                 bins[i + k - zero] = r_fma(mass, kernel[k], bins[i + k - zero]);
             }
@@ -180,7 +180,7 @@ static void add_modes(selfcal_work_t *work, unsigned p) {
 void selfcal_histogram_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
     const selfcal_real_t centre = r_exp(work->search.best_ln[p]),
-        mean = (selfcal_real_t)(work->sum.first[p] / work->sum.mass);
+                         mean = (selfcal_real_t)(work->sum.first[p] / work->sum.mass);
     const selfcal_real_t variance =
         r_fmax(r_fma(-mean, mean, (selfcal_real_t)(work->sum.second[p] / work->sum.mass)), R(0.0));
     const selfcal_real_t step = selfcal_histogram_step(work, p);

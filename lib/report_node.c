@@ -119,9 +119,9 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
         return;
     }
     work->ln_top = log(work->top.var);
-    work->top_profile = -0.5 *
-        (work->bank->weight * (SELFCAL_LN_2PI + work->ln_top + 1.0 + (selfcal_wide_t)work->top.cost) + work->top.ln_s +
-                                (selfcal_wide_t)work->top.extra);
+    work->top_profile =
+        -0.5 * (work->bank->weight * (SELFCAL_LN_2PI + work->ln_top + 1.0 + (selfcal_wide_t)work->top.cost) +
+                work->top.ln_s + (selfcal_wide_t)work->top.extra);
     work->best_node = model->nodes;
     for (uint16_t k = 0; k < model->nodes; k++) {
         work->hypothesis = place_of(work, k).hypothesis;
@@ -141,7 +141,7 @@ void selfcal_node_step_values(selfcal_work_t *work) {
     for (uint16_t k = step_part(work, STEP_VALUES, nodes); k < work->at; k++) {
         const selfcal_place_t place = place_of(work, k);
         selfcal_real_t *profile = &work->field[0][work->first_node + k],
-            *ln_sigma = &work->field[1][work->first_node + k];
+                       *ln_sigma = &work->field[1][work->first_node + k];
         expectation_t e;
         selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), &e);
         *profile = (selfcal_real_t)((selfcal_wide_t)(*profile - work->peak) - e.profile);

@@ -41,7 +41,7 @@ static bool next_range(selfcal_range_t *range, const selfcal_real_t height[SAMPL
     *open = *open && (top == 0U || top == SAMPLES - 1U);
     const selfcal_real_t whole = range->hi - range->lo, step = whole / (selfcal_real_t)SAMPLES;
     const selfcal_real_t below = (*open && top == 0U ? GROWTH_TO_PEAK : GROWTH) * whole,
-        above = (*open && top > 0U ? GROWTH_TO_PEAK : GROWTH) * whole;
+                         above = (*open && top > 0U ? GROWTH_TO_PEAK : GROWTH) * whole;
     const selfcal_real_t lo = r_fmax(first == 0U ? range->lo - below : sample_at(range, first) - step, limit->lo);
     const selfcal_real_t hi =
         r_fmin(last == SAMPLES - 1U ? range->hi + above : sample_at(range, last) + step, limit->hi);
@@ -127,8 +127,8 @@ static bool find_row(selfcal_work_t *work) {
         last--;
     }
     if (first > 0U) {
-        next.lo = row_end(work, sample_at(range, first), height[first], sample_at(range, first - 1U),
-                          height[first - 1U]);
+        next.lo =
+            row_end(work, sample_at(range, first), height[first], sample_at(range, first - 1U), height[first - 1U]);
     }
     if (last < SAMPLES - 1U) {
         next.hi = row_end(work, sample_at(range, last), height[last], sample_at(range, last + 1U), height[last + 1U]);
@@ -227,7 +227,8 @@ bool selfcal_search_step(selfcal_work_t *work) {
         begin_pass(work);
         return false;
     }
-    work->search.least[1] = rows
-        ? selfcal_cells_for_peak(work->scratch.grid.height, work->search.best - PEAK * work->search.depth, 32) : 1U;
+    work->search.least[1] =
+        rows ? selfcal_cells_for_peak(work->scratch.grid.height, work->search.best - PEAK * work->search.depth, 32)
+             : 1U;
     return true;
 }

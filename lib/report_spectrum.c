@@ -66,8 +66,8 @@ static void set_lines(selfcal_work_t *work) {
             R(1.0) + R(2.0) * truth->variance * truth->rate / r_fma(truth->rate, truth->rate, truth->distance[m]);
         /* of its band in the record's frequencies */
         const selfcal_real_t share = omega * step / (R(3.1415927) * weight);
-        truth->power[m] = spectrum * r_sqrt(share); /* until the fit is solved, a prior deviation */
-        if (m % 3U < 2U) { /* as of the line in the middle */
+        truth->power[m] = spectrum * r_sqrt(share);      /* until the fit is solved, a prior deviation */
+        if (m % 3U < 2U) {                               /* as of the line in the middle */
             end[0] = end[1] = R(6.0) * spectrum * share; /* two ends, a band of three lines */
         }
         end += m % 3U == 2U ? 2U : 0U;
@@ -119,8 +119,7 @@ static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
 static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t off, selfcal_real_t deficit) {
     const selfcal_truth_t *truth = &work->truth;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
-    const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U &&
-        truth->noise_less_1 == R(0.0);
+    const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->noise_less_1 == R(0.0);
     const selfcal_real_t far = (even ? FAR_EVEN : FAR) * deficit;
     const selfcal_real_t weight = R(1.0) / (R(1.0) + UNSETTLED / (e->p_sq * n * n) + far), per_v = weight * e->per_v;
     if (even && UNSETTLED > R(20.0) * e->p_sq * n * n && work->bank->model->nodes > UNSETTLED_NODES) {
@@ -160,7 +159,7 @@ void selfcal_spectrum_solve(selfcal_work_t *work) {
  * that is none, where no other node lies near enough to the drift. */
 static bool too_slow(const selfcal_work_t *work, const expectation_t *e, selfcal_real_t scatter) {
     return (selfcal_wide_t)scatter - e->ln_sigma - work->ln_sigma_off < (selfcal_wide_t)HALF_LN_LEAST &&
-        work->truth.rate < R(0.5);
+           work->truth.rate < R(0.5);
 }
 
 static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t scatter, expectation_t *e) {

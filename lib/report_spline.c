@@ -11,9 +11,9 @@ static int knot(int nodes, int k) {
 /* By the Cox-de Boor recursion. */
 uint8_t selfcal_spline_basis(uint16_t nodes, selfcal_real_t z, selfcal_real_t out[6]) {
     /* No more lies between six knots: 7 or, of 9 or 10 nodes, all. */
-    static const selfcal_real_t inverse[10] = {R(0.0), R(1.0), R(1.0) / R(2.0), R(1.0) / R(3.0), R(1.0) / R(4.0),
-                                               R(1.0) / R(5.0), R(1.0) / R(6.0), R(1.0) / R(7.0), R(1.0) / R(8.0),
-                                                   R(1.0) / R(9.0)};
+    static const selfcal_real_t inverse[10] = {R(0.0),          R(1.0),          R(1.0) / R(2.0), R(1.0) / R(3.0),
+                                               R(1.0) / R(4.0), R(1.0) / R(5.0), R(1.0) / R(6.0), R(1.0) / R(7.0),
+                                               R(1.0) / R(8.0), R(1.0) / R(9.0)};
     z = r_fmin(r_fmax(z, R(0.0)), (selfcal_real_t)(nodes - 1U));
     int span = (int)z + 3; /* unless a knot is missing there */
     span = span < 6 ? 5 : (span >= nodes - 1 ? nodes - 1 : span);

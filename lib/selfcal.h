@@ -136,9 +136,9 @@ typedef struct {
 
 typedef struct {
     float probability;
-    selfcal_wide_t ln_evidence; /* nats, density of the bank samples in 1/unit each */
+    selfcal_wide_t ln_evidence;                       /* nats, density of the bank samples in 1/unit each */
     selfcal_estimate_t parameter[SELFCAL_PARAMETERS]; /* those its law has; the others are NaN with flags 0 */
-    float bias_mean, bias_sd;   /* x0 + drift now (+ c' z with regressors) under this hypothesis, unit */
+    float bias_mean, bias_sd;                 /* x0 + drift now (+ c' z with regressors) under this hypothesis, unit */
     selfcal_decay_t decay[SELFCAL_ALPHA_MAX]; /* where a term decays; else 0 */
 } selfcal_posterior_t;
 
@@ -176,12 +176,12 @@ typedef enum {
     SELFCAL_REASON_NO_REPORT = 2,       /* none yet */
     SELFCAL_REASON_LAW_NOT_WATCHED = 3, /* not judged: the likeliest law has coloured noise */
     SELFCAL_REASON_RETIRED = 4,
-    SELFCAL_REASON_OUTSIDE_PRIORS = 5,  /* the report has no numbers */
-    SELFCAL_REASON_MOVING = 6,          /* no report yet, and the gate sees motion */
-    SELFCAL_REASON_INADEQUATE = 7,      /* the model does not explain the readings */
-    SELFCAL_REASON_NOT_IDENTIFIED = 8,  /* half of the probability has an N or a drift that is not */
-    SELFCAL_REASON_BAD_SAMPLE = 9,      /* on some axis it is not finite or saturated */
-    SELFCAL_REASON_STUCK = 10           /* the axis repeats one reading */
+    SELFCAL_REASON_OUTSIDE_PRIORS = 5, /* the report has no numbers */
+    SELFCAL_REASON_MOVING = 6,         /* no report yet, and the gate sees motion */
+    SELFCAL_REASON_INADEQUATE = 7,     /* the model does not explain the readings */
+    SELFCAL_REASON_NOT_IDENTIFIED = 8, /* half of the probability has an N or a drift that is not */
+    SELFCAL_REASON_BAD_SAMPLE = 9,     /* on some axis it is not finite or saturated */
+    SELFCAL_REASON_STUCK = 10          /* the axis repeats one reading */
 } selfcal_reason_t;
 
 /* A change that was found while the samples came. */
@@ -204,9 +204,9 @@ typedef struct {
 
 /* A corrected sample, by axis of the model, unit; sd NAN: there is none of this axis. */
 typedef struct {
-    float value[SELFCAL_AXES_MAX]; /* reading less bias, see selfcal_predict() */
-    float sd[SELFCAL_AXES_MAX];    /* of that bias */
-    uint32_t motion;               /* code as in selfcal.dbc */
+    float value[SELFCAL_AXES_MAX];             /* reading less bias, see selfcal_predict() */
+    float sd[SELFCAL_AXES_MAX];                /* of that bias */
+    uint32_t motion;                           /* code as in selfcal.dbc */
     selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* why there is none, or why it is not to be relied on */
 } selfcal_corrected_t;
 

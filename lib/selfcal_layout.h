@@ -48,8 +48,8 @@ typedef struct {
     int32_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH];
     /* growth of nu before each sample and after the last, for a pole */
     int32_t step[SELFCAL_AXES_MAX][SELFCAL_BATCH + 1];
-    uint32_t step_from, step_to;                       /* samples of those steps; from == to: none */
-    float step_beta;                                   /* 1 - the pole */
+    uint32_t step_from, step_to; /* samples of those steps; from == to: none */
+    float step_beta;             /* 1 - the pole */
 } selfcal_integers_t;
 
 #else
@@ -103,24 +103,24 @@ typedef struct {
         selfcal_moving_t moving;
         selfcal_settled_t settled; /* of a level node in the integer kernels */
     } gains;
-    bool level;                         /* d = e = 0: the kernel sums plain nu */
-    uint8_t g_shift, u_shift, w_shift;  /* of `settled` */
-    uint32_t steady;     /* samples seen with d = 0: their ln s is added when asked for */
+    bool level;                        /* d = e = 0: the kernel sums plain nu */
+    uint8_t g_shift, u_shift, w_shift; /* of `settled` */
+    uint32_t steady;                   /* samples seen with d = 0: their ln s is added when asked for */
     uint32_t level_from; /* steady when it became level: what later samples add to A is added when asked for */
     selfcal_sum_t a;     /* sum u^2 / s */
     selfcal_sum_t ln_s;  /* sum ln s of the other samples */
 } selfcal_node_t;
 
 /* Bytes of memory for the bank: for each node 56, and 20 more per axis (check.c holds it to that). */
-#define SELFCAL_SIZE(nodes, axes) \
-    ((size_t)(nodes) * \
+#define SELFCAL_SIZE(nodes, axes)                                                                                      \
+    ((size_t)(nodes) *                                                                                                 \
      (sizeof(selfcal_node_t) + (size_t)(axes) * (2U * sizeof(selfcal_total_t) + sizeof(selfcal_drift_t))))
 
 /* Bank samples on their way into the sums. */
 typedef struct {
     selfcal_real_t y[SELFCAL_AXES_MAX][SELFCAL_BATCH]; /* less offset */
-    selfcal_real_t r[SELFCAL_BATCH]; /* white-noise variance of each over a whole block's */
-    uint32_t gap[SELFCAL_BATCH];     /* bank intervals without a sample before each */
+    selfcal_real_t r[SELFCAL_BATCH];                   /* white-noise variance of each over a whole block's */
+    uint32_t gap[SELFCAL_BATCH];                       /* bank intervals without a sample before each */
     uint32_t gap_after;
     uint32_t count;
     bool part; /* some r is not 1 */
@@ -136,7 +136,7 @@ typedef struct {
 } selfcal_column_t;
 
 typedef struct {
-    selfcal_column_t *column;   /* [regressors] */
+    selfcal_column_t *column; /* [regressors] */
     /* [nodes][rows]: for "1" and each regressor, sums of its innovation times those up to its own, over s */
     selfcal_sum_t *a;
     selfcal_sum_t *b;           /* [nodes][axes][regressors]: sum of its innovation times nu over s */
@@ -149,12 +149,12 @@ typedef struct {
 
 /* Bytes beyond SELFCAL_SIZE for p regressors, 0 for none. For each node in the float build 4 (p + 1) (p + 4), and per
  * axis 8 p + 4; 8 p + 24 in the integer one. */
-#define SELFCAL_REGRESSORS_SIZE(nodes, axes, p) \
-    ((size_t)(p) == 0U \
-         ? (size_t)0U \
-         : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) + \
-               (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) * \
-                                      sizeof(selfcal_sum_t) + \
+#define SELFCAL_REGRESSORS_SIZE(nodes, axes, p)                                                                        \
+    ((size_t)(p) == 0U                                                                                                 \
+         ? (size_t)0U                                                                                                  \
+         : 7U + sizeof(selfcal_columns_t) + (size_t)(p) * sizeof(selfcal_column_t) +                                   \
+               (size_t)(nodes) * ((SELFCAL_REGRESSORS_ROWS((p) + 1U) + (size_t)(axes) * (p) + (size_t)(p) + 1U) *      \
+                                      sizeof(selfcal_sum_t) +                                                          \
                                   (size_t)(axes) * sizeof(selfcal_reading_t)))
 
 /* Gain side of a node of several states, relative to sigma_v. States are scaled so that the reading is their sum and
@@ -163,26 +163,26 @@ typedef struct {
     selfcal_wide_t p[SELFCAL_TERM_PAIRS];                         /* predicted covariance of the states, lower half */
     selfcal_real_t beta[SELFCAL_TERMS_MAX], q[SELFCAL_TERMS_MAX]; /* 1 - pole, and variance added per interval */
     selfcal_real_t theta; /* of a moving average, whose part e_(i-1) is the last state */
-    uint8_t pair; /* the second state of an oscillation; 0: the law has none. Its beta and q are turn_of()'s */
-    bool steady;  /* p has converged */
+    uint8_t pair;         /* the second state of an oscillation; 0: the law has none. Its beta and q are turn_of()'s */
+    bool steady;          /* p has converged */
 } selfcal_term_node_t;
 
 typedef struct {
     selfcal_term_node_t *node; /* [nodes of sums] */
     /* [those][1 + regressors + axes][SELFCAL_TERMS_MAX]: predicted states over "1", the columns, the readings */
     selfcal_sum_t *x;
-    selfcal_sum_t *bc;         /* [those][axes][SELFCAL_STATE_SUMS]: sums B and C of the readings */
+    selfcal_sum_t *bc; /* [those][axes][SELFCAL_STATE_SUMS]: sums B and C of the readings */
 } selfcal_terms_t;
 
 /* Bytes beyond those for a model with `nodes` nodes of sums, 0 for none. For each in the float build 104 + 24 p, and
  * per axis 24. */
-#define SELFCAL_TERMS_SIZE(nodes, axes, p) \
-    ((size_t)(nodes) == 0U \
-         ? (size_t)0U \
-         : 7U + sizeof(selfcal_terms_t) + \
-               (size_t)(nodes) * (sizeof(selfcal_term_node_t) + \
-                                  (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX + \
-                                   (size_t)(axes) * (SELFCAL_TERMS_MAX + SELFCAL_STATE_SUMS)) * sizeof(selfcal_sum_t)))
+#define SELFCAL_TERMS_SIZE(nodes, axes, p)                                                                             \
+    ((size_t)(nodes) == 0U ? (size_t)0U                                                                                \
+                           : 7U + sizeof(selfcal_terms_t) +                                                            \
+                                 (size_t)(nodes) * (sizeof(selfcal_term_node_t) +                                      \
+                                                    (((size_t)(p) + 1U) * SELFCAL_TERMS_MAX +                          \
+                                                     (size_t)(axes) * (SELFCAL_TERMS_MAX + SELFCAL_STATE_SUMS)) *      \
+                                                        sizeof(selfcal_sum_t)))
 
 /* What an axis's samples are held against, see selfcal_handling_t. */
 typedef struct {
@@ -220,8 +220,8 @@ struct selfcal {
     uint32_t block;                          /* samples a bank interval now has */
     selfcal_real_t variance_ratio;           /* r of a whole block */
     selfcal_block_t sums[SELFCAL_AXES_MAX];
-    uint32_t position, used; /* samples of this block: passed, and usable */
-    bool dropped;            /* the rest of it counts for nothing */
+    uint32_t position, used;                 /* samples of this block: passed, and usable */
+    bool dropped;                            /* the rest of it counts for nothing */
     selfcal_wide_t within[SELFCAL_AXES_MAX]; /* sum of squares about the block means */
     uint64_t within_dof;
     float last[SELFCAL_AXES_MAX];
@@ -231,8 +231,8 @@ struct selfcal {
     uint64_t powered;                /* samples since power-on less those counted, modulo 2^64 */
     /* of the bias's prior, unit: the model's until selfcal_reopen() */
     float prior_mean[SELFCAL_AXES_MAX], prior_sd[SELFCAL_AXES_MAX];
-    uint32_t retired;                /* a bit for each axis */
-    uint32_t watched;                /* samples looked at since the axes were last judged ... */
+    uint32_t retired;                      /* a bit for each axis */
+    uint32_t watched;                      /* samples looked at since the axes were last judged ... */
     uint32_t bad[SELFCAL_AXES_MAX];        /* ... those of them with the axis at fault ... */
     uint16_t bad_blocks[SELFCAL_AXES_MAX]; /* ... and judgements in a row that went against it */
     selfcal_usual_t usual;
@@ -270,10 +270,11 @@ struct selfcal_former {
 
 /* By SELFCAL_REPORT_QUALITY: cells a dimension, cells of sigma_v where a limit cuts, bins of a parameter's
  * histogram. */
-#define SELFCAL_BY_QUALITY(fuzz, module, host, reference) \
-    (SELFCAL_REPORT_QUALITY == 0 ? (fuzz) \
-                                 : SELFCAL_REPORT_QUALITY == 1 ? (module) \
-                                                               : SELFCAL_REPORT_QUALITY == 2 ? (host) : (reference))
+#define SELFCAL_BY_QUALITY(fuzz, module, host, reference)                                                              \
+    (SELFCAL_REPORT_QUALITY == 0   ? (fuzz)                                                                            \
+     : SELFCAL_REPORT_QUALITY == 1 ? (module)                                                                          \
+     : SELFCAL_REPORT_QUALITY == 2 ? (host)                                                                            \
+                                   : (reference))
 #define SELFCAL_REPORT_CELLS SELFCAL_BY_QUALITY(16, 24, 80, 192)
 #define SELFCAL_SIGMA_CELLS SELFCAL_BY_QUALITY(8, 24, 48, 96)
 #define SELFCAL_HISTOGRAM SELFCAL_BY_QUALITY(32, 64, 128, 512)
@@ -326,8 +327,8 @@ typedef struct {
     uint8_t basis_first;
     selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
     selfcal_real_t left_out, noise_sq; /* white_left_out(); the square of the ratio of coloured noise, else 1 */
-    const selfcal_prior_t *prior; /* of the hypothesis on the axis */
-    selfcal_parameter_t drift;    /* which parameter goes with rho */
+    const selfcal_prior_t *prior;      /* of the hypothesis on the axis */
+    selfcal_parameter_t drift;         /* which parameter goes with rho */
 } selfcal_cell_row_t;
 
 /* Where in ln rho or ln alpha the likelihood counts. */
@@ -338,7 +339,7 @@ typedef struct {
 #define SELFCAL_SEARCH_SAMPLES 8 /* of one search pass */
 typedef struct {
     uint8_t pass;
-    bool open; /* the peak of the row in hand may lie beyond its range */
+    bool open;                               /* the peak of the row in hand may lie beyond its range */
     selfcal_real_t limit_lo[2], limit_hi[2]; /* permitted by the priors: (ln rho, ln alpha) */
     selfcal_range_t range[2];                /* of these the row in hand, and the rows */
     uint8_t least[2];                        /* cells that its peak needs */
@@ -368,11 +369,11 @@ struct selfcal_work {
     selfcal_t *bank;
     uint8_t axis, hypothesis, stage;
     uint16_t first_node;
-    uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
-    uint32_t batches; /* of the bank, when the sums came to rest */
-    bool lost;        /* a law that the priors allow has ended without an evidence */
-    bool gathered;    /* the nodes run over the last batch: samples from now on come later than the report */
-    uint8_t mask, unknowns;               /* regressors in use; those and the bias */
+    uint16_t row, at;       /* in the stage: row of cells; node, cell of the row, or parameter that is next */
+    uint32_t batches;       /* of the bank, when the sums came to rest */
+    bool lost;              /* a law that the priors allow has ended without an evidence */
+    bool gathered;          /* the nodes run over the last batch: samples from now on come later than the report */
+    uint8_t mask, unknowns; /* regressors in use; those and the bias */
     selfcal_coefficients_t *coefficients; /* [hypotheses] or NULL */
     uint16_t best_node;                   /* of all: the likeliest */
     selfcal_top_t top;                    /* ... whatever its law, and its ln var and ln-likelihood */
@@ -478,9 +479,9 @@ typedef struct {
 
 typedef struct {
     bool known, running, begun;
-    selfcal_reason_t reason; /* if not known */
-    selfcal_filter_law_t next, law; /* of the last report; in use */
-    selfcal_reopening_t likely;     /* where the likeliest law of the last report lies */
+    selfcal_reason_t reason;                             /* if not known */
+    selfcal_filter_law_t next, law;                      /* of the last report; in use */
+    selfcal_reopening_t likely;                          /* where the likeliest law of the last report lies */
     selfcal_real_t gain[SELFCAL_FILTER_STATES], root, z; /* of the last bank sample; root of 1/S; z as it is */
     selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
     selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
@@ -492,9 +493,9 @@ typedef struct {
 enum { SELFCAL_ONSETS = 8 };
 typedef struct {
     selfcal_real_t state[SELFCAL_FILTER_STATES]; /* of the filter, over a step of 1 */
-    selfcal_real_t along, weight, size; /* sums of z w, z held, and of w^2; of z w */
-    selfcal_real_t late, late_weight;   /* along and weight when the score had been over its limit for a while */
-    uint16_t age, held;                 /* bank samples; those in a row with the score over its limit */
+    selfcal_real_t along, weight, size;          /* sums of z w, z held, and of w^2; of z w */
+    selfcal_real_t late, late_weight; /* along and weight when the score had been over its limit for a while */
+    uint16_t age, held;               /* bank samples; those in a row with the score over its limit */
 } selfcal_onset_t;
 
 typedef struct {
@@ -506,11 +507,11 @@ typedef struct {
 } selfcal_change_watch_t;
 
 struct selfcal_changes {
-    uint32_t in_window; /* its bank samples so far */
+    uint32_t in_window;                  /* its bank samples so far */
     uint32_t found_at[SELFCAL_AXES_MAX]; /* bank intervals before the last change was found */
-    float *learned;  /* [nodes][axes]: before a change */
-    bool keeps, due; /* there is something in it; it is to be renewed */
-    uint32_t found;  /* a bit for each axis with a change that is not yet handled: */
+    float *learned;                      /* [nodes][axes]: before a change */
+    bool keeps, due;                     /* there is something in it; it is to be renewed */
+    uint32_t found;                      /* a bit for each axis with a change that is not yet handled: */
     selfcal_change_t change[SELFCAL_AXES_MAX];
     float bias[SELFCAL_AXES_MAX], bias_sd[SELFCAL_AXES_MAX]; /* after a step, unit; less the bank's offset */
     selfcal_change_watch_t watch[SELFCAL_AXES_MAX];
@@ -554,8 +555,8 @@ typedef struct {
 } selfcal_imu_judge_t;
 
 struct selfcal_kept {
-    uint64_t passed;      /* samples, the missing ones too */
-    uint64_t gathered_at; /* of them, to the end of the last bank interval of the report under way */
+    uint64_t passed;                     /* samples, the missing ones too */
+    uint64_t gathered_at;                /* of them, to the end of the last bank interval of the report under way */
     uint64_t rests_on[SELFCAL_AXES_MAX]; /* ... of each axis's last report */
     selfcal_report_t report[SELFCAL_AXES_MAX];
     float reading[SELFCAL_AXES_MAX]; /* the newest */
@@ -570,11 +571,11 @@ struct selfcal_imu {
     selfcal_changes_t *changes; /* with what was learned before a change behind it */
     selfcal_kept_t *kept;       /* or NULL */
     const selfcal_pipe_t *pipe;
-    void *memory;               /* of the bank */
-    uint16_t due;   /* reports, a bit for each axis */
-    bool watching;  /* the gate is on */
-    bool computing; /* a report is worked out */
-    bool whole;     /* it is whole */
+    void *memory;                              /* of the bank */
+    uint16_t due;                              /* reports, a bit for each axis */
+    bool watching;                             /* the gate is on */
+    bool computing;                            /* a report is worked out */
+    bool whole;                                /* it is whole */
     selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* of each axis's last report */
     float bias[SELFCAL_AXES_MAX];              /* likewise; NAN: none */
     selfcal_t bank;
@@ -584,12 +585,12 @@ struct selfcal_imu {
 
 /* Bytes of a part, of all that is learned before a change, and of the parts that a model names. */
 #define SELFCAL_PART(bytes) (((size_t)(bytes) + 7U) / 8U * 8U)
-#define SELFCAL_CHANGES_SIZE(nodes, axes) \
+#define SELFCAL_CHANGES_SIZE(nodes, axes)                                                                              \
     SELFCAL_PART(sizeof(selfcal_changes_t) + (size_t)(nodes) * (axes) * sizeof(float))
-#define SELFCAL_PARTS_SIZE(nodes, axes, gate, columns, judged, changes) \
-    (((gate) ? SELFCAL_PART(sizeof(selfcal_watched_t)) : 0U) + \
-     ((columns) ? SELFCAL_PART(sizeof(selfcal_imu_columns_t)) : 0U) + \
-     ((judged) ? SELFCAL_PART(sizeof(selfcal_imu_judge_t)) : 0U) + \
+#define SELFCAL_PARTS_SIZE(nodes, axes, gate, columns, judged, changes)                                                \
+    (((gate) ? SELFCAL_PART(sizeof(selfcal_watched_t)) : 0U) +                                                         \
+     ((columns) ? SELFCAL_PART(sizeof(selfcal_imu_columns_t)) : 0U) +                                                  \
+     ((judged) ? SELFCAL_PART(sizeof(selfcal_imu_judge_t)) : 0U) +                                                     \
      ((changes) ? SELFCAL_CHANGES_SIZE(nodes, axes) : 0U))
 
 /* -------------------------------------------------------------------------------------------------------- telemetry */
@@ -599,8 +600,8 @@ struct selfcal_telemetry {
     const selfcal_module_t *module;
     const selfcal_sent_coefficient_t *coefficient; /* [regressors of the model], or NULL */
     const selfcal_judgement_t *judgement;          /* of the axis of the report, or NULL */
-    uint16_t first_id;                 /* of the node */
-    uint8_t message[SELFCAL_AXES_MAX]; /* which axis message each axis has */
+    uint16_t first_id;                             /* of the node */
+    uint8_t message[SELFCAL_AXES_MAX];             /* which axis message each axis has */
     /* of the frames under way */
     uint8_t source;
     uint8_t part; /* of a report */
@@ -613,9 +614,9 @@ struct selfcal_telemetry {
     uint32_t report_number;
     uint32_t time_ms;
     selfcal_state_t state;
-    uint8_t item;  /* to look at next */
-    uint8_t items; /* past the last one: 0 with nothing under way */
-    uint8_t made;  /* frames of this report or status */
+    uint8_t item;    /* to look at next */
+    uint8_t items;   /* past the last one: 0 with nothing under way */
+    uint8_t made;    /* frames of this report or status */
     uint32_t frames; /* made since selfcal_telemetry_init() */
 };
 

@@ -301,7 +301,7 @@ typedef struct selfcal_gate selfcal_gate_t;
 
 struct selfcal_gate_config {
     uint8_t axes;
-    uint32_t window;   /* samples, 2 or more; a divisor of the bank's block, see selfcal_push_moving() */
+    uint32_t window; /* samples, 2 or more; a divisor of the bank's block, see selfcal_push_moving() */
     /* probability that a window of rest is taken for motion, up to 0.1; 0: never, to measure noise */
     float false_alarm;
     /* windows in a row, after a first one, that must be quiet and on one level before motion is over; 1 or more */
@@ -409,7 +409,7 @@ typedef struct {
     uint32_t state_save_failures;
     uint32_t motion;
     uint32_t gate_alarm_count;
-    uint32_t retired; /* a bit for each axis of the model */
+    uint32_t retired;                          /* a bit for each axis of the model */
     selfcal_reason_t reason[SELFCAL_AXES_MAX]; /* why an axis has no calibration to rely on */
     uint32_t command_count;
     uint32_t command_refused_count;

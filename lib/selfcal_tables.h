@@ -66,12 +66,7 @@ typedef double selfcal_wide_t;
  * A law has at most three parameters: N, the drift parameter, and a second one.
  * The drift parameter is K if a term is a walk, else sigma_m (B for flicker).
  * The second one is alpha, which scales the bandwidths that are not stated, or a ratio. No law has both. */
-typedef enum {
-    SELFCAL_WALK = 0,
-    SELFCAL_MARKOV = 1,
-    SELFCAL_OSCILLATION = 2,
-    SELFCAL_DAMPING = 3
-} selfcal_term_kind_t;
+typedef enum { SELFCAL_WALK = 0, SELFCAL_MARKOV = 1, SELFCAL_OSCILLATION = 2, SELFCAL_DAMPING = 3 } selfcal_term_kind_t;
 
 typedef struct {
     selfcal_term_kind_t kind;
@@ -89,7 +84,7 @@ typedef struct {
  * low frequency. The law's ratio is (1 + theta) / (1 - theta), its prior within 1e-3 to 1e3. */
 #define SELFCAL_LAW_TERMS 3
 typedef struct {
-    uint8_t terms;       /* those used; with coloured noise 1 or 2 */
+    uint8_t terms; /* those used; with coloured noise 1 or 2 */
     bool coloured_noise;
     selfcal_term_t term[SELFCAL_LAW_TERMS];
 } selfcal_law_t;
@@ -183,13 +178,13 @@ extern const selfcal_states_code_t selfcal_states_code;
  * With SELFCAL_FIXED the bank then runs in software floating point. */
 typedef struct {
     const selfcal_regressors_code_t *code; /* &selfcal_regressors_code */
-    uint8_t count;               /* 1 to SELFCAL_REGRESSORS_MAX */
-    const float *reference;      /* [count] value at which x0 alone is the bias */
+    uint8_t count;                         /* 1 to SELFCAL_REGRESSORS_MAX */
+    const float *reference;                /* [count] value at which x0 alone is the bias */
     /* [axes][count] prior N(mean, sd^2), unit per unit of the regressor; sd 0: not for this axis; no means: all 0 */
     const float *coefficient_sd;
     const selfcal_source_t *source; /* [count] for selfcal_form(); NULL: the application makes the values by itself */
-    const float *ln_odds;          /* [axes][count] ln of the prior odds that it is in use; a cosine: 0 */
-    const float *coefficient_mean; /* [axes][count] or NULL */
+    const float *ln_odds;           /* [axes][count] ln of the prior odds that it is in use; a cosine: 0 */
+    const float *coefficient_mean;  /* [axes][count] or NULL */
 } selfcal_regressors_t;
 
 /* For parts whose parameters change. Each bank sample's weight halves every half_life_s. So does the penalty that the
@@ -199,7 +194,7 @@ typedef struct {
  * O(axes) for each node and batch. */
 typedef struct {
     const selfcal_forgetting_code_t *code; /* &selfcal_forgetting_code */
-    float half_life_s; /* at least SELFCAL_BATCH dt_s */
+    float half_life_s;                     /* at least SELFCAL_BATCH dt_s */
 } selfcal_forgetting_t;
 
 /* What no model file can foresee and the module handles by itself. Outliers: selfcal_push(). Steps of the bias and
@@ -214,12 +209,12 @@ typedef struct {
 } selfcal_handling_t;
 
 typedef struct {
-    uint32_t id;        /* checksum of the tables: a snapshot or a monitor tells models apart by it */
-    float dt_s;         /* bank interval, 1e-6 to 1e6 */
-    uint32_t block;     /* samples averaged into one bank sample */
+    uint32_t id;    /* checksum of the tables: a snapshot or a monitor tells models apart by it */
+    float dt_s;     /* bank interval, 1e-6 to 1e6 */
+    uint32_t block; /* samples averaged into one bank sample */
     uint8_t axes;
     uint8_t hypotheses;
-    uint16_t nodes;     /* of all hypotheses together */
+    uint16_t nodes;                         /* of all hypotheses together */
     const selfcal_axis_t *axis;             /* [axes] */
     const selfcal_hypothesis_t *hypothesis; /* [hypotheses] */
     const selfcal_regressors_t *regressors; /* NULL: none, and none of their cost */

@@ -134,8 +134,8 @@ static void put(sink_t *sink, const uint8_t *bytes, size_t count) {
 }
 
 static void put_number(sink_t *sink, size_t size, uint32_t number) {
-    const uint8_t bytes[4] =
-        {(uint8_t)number, (uint8_t)(number >> 8), (uint8_t)(number >> 16), (uint8_t)(number >> 24)};
+    const uint8_t bytes[4] = {(uint8_t)number, (uint8_t)(number >> 8), (uint8_t)(number >> 16),
+                              (uint8_t)(number >> 24)};
     put(sink, bytes, size);
 }
 
@@ -196,8 +196,7 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     }
     if (bytes[10] != SELFCAL_ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
         number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id ||
-        number_at(bytes + 20, 4) != layout() ||
-        length != size_of(model)) {
+        number_at(bytes + 20, 4) != layout() || length != size_of(model)) {
         return SELFCAL_SNAPSHOT_FOREIGN;
     }
     return SELFCAL_OK;

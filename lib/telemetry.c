@@ -14,20 +14,20 @@ static const char *const axis_names[SELFCAL_FRAME_AXES] = SELFCAL_FRAME_AXIS_NAM
 /* Items of the places lie evenly, so that loops reach them. */
 SELFCAL_STATIC_ASSERT(places_are_even,
                       SELFCAL_HYPOTHESIS_P1_MEAN == SELFCAL_HYPOTHESIS_N_MEAN + SELFCAL_FRAME_STATISTICS &&
-                      SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
-                      SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
+                          SELFCAL_HYPOTHESIS_P2_MEAN == SELFCAL_HYPOTHESIS_P1_MEAN + SELFCAL_FRAME_STATISTICS &&
+                          SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
 SELFCAL_STATIC_ASSERT(judgement_is_as_on_the_wire,
                       (unsigned)SELFCAL_INADEQUATE == SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE &&
-                      (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_SUSPICION_MOTION &&
-                      (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_CHANGE_MOTION &&
-                      (unsigned)SELFCAL_REASON_STUCK == SELFCAL_ADEQUACY_REASON_STUCK);
-SELFCAL_STATIC_ASSERT(reasons_lie_alike, SELFCAL_STATUS_REASON_GX_SHIFT == SELFCAL_CORRECTED_REASON_GX_SHIFT &&
-                      SELFCAL_STATUS_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_GX_SHIFT + 5 * REASON_BITS &&
-                      SELFCAL_CORRECTED_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_AZ_SHIFT);
+                          (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_SUSPICION_MOTION &&
+                          (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_CHANGE_MOTION &&
+                          (unsigned)SELFCAL_REASON_STUCK == SELFCAL_ADEQUACY_REASON_STUCK);
+SELFCAL_STATIC_ASSERT(reasons_lie_alike,
+                      SELFCAL_STATUS_REASON_GX_SHIFT == SELFCAL_CORRECTED_REASON_GX_SHIFT &&
+                          SELFCAL_STATUS_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_GX_SHIFT + 5 * REASON_BITS &&
+                          SELFCAL_CORRECTED_REASON_AZ_SHIFT == SELFCAL_STATUS_REASON_AZ_SHIFT);
 enum { COLUMN_ITEMS = SELFCAL_COEFFICIENTS_C0_PROBABILITY + 1 };
 
-uint16_t selfcal_crc12(const uint8_t *data, size_t length)
-{
+uint16_t selfcal_crc12(const uint8_t *data, size_t length) {
     uint32_t crc = 0xFFFU;
     for (size_t i = 0; i < length; i++) {
         crc ^= (uint32_t)data[i] << 4;
@@ -40,8 +40,7 @@ uint16_t selfcal_crc12(const uint8_t *data, size_t length)
 }
 
 /* `value` in steps of 1 / `per_unit` as a 32-bit two's complement number, held at its ends. NaN: the lower end. */
-static uint32_t scaled_bits(selfcal_wide_t value, selfcal_wide_t per_unit)
-{
+static uint32_t scaled_bits(selfcal_wide_t value, selfcal_wide_t per_unit) {
     const selfcal_wide_t scaled = floor(value * per_unit + 0.5);
     int32_t held;
     if (scaled >= (selfcal_wide_t)INT32_MAX) {
@@ -54,14 +53,12 @@ static uint32_t scaled_bits(selfcal_wide_t value, selfcal_wide_t per_unit)
     return (uint32_t)held;
 }
 
-static uint32_t held_count(uint64_t count)
-{
+static uint32_t held_count(uint64_t count) {
     return count < UINT32_MAX ? (uint32_t)count : UINT32_MAX;
 }
 
 selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal_model_t *model,
-                                        const char *const axis_name[])
-{
+                                        const char *const axis_name[]) {
     if (self == NULL || model == NULL || axis_name == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -93,8 +90,7 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
     return SELFCAL_OK;
 }
 
-selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node)
-{
+selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node) {
     if (self == NULL || node >= SELFCAL_FRAME_NODES) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -105,27 +101,23 @@ selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node)
     return SELFCAL_OK;
 }
 
-void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[])
-{
+void selfcal_telemetry_coefficients(selfcal_telemetry_t *self, const selfcal_sent_coefficient_t column[]) {
     self->coefficient = column;
 }
 
-void selfcal_telemetry_adequacy(selfcal_telemetry_t *self, const selfcal_judgement_t *judgement)
-{
+void selfcal_telemetry_adequacy(selfcal_telemetry_t *self, const selfcal_judgement_t *judgement) {
     self->judgement = judgement;
 }
 
 /* Frames of the message that node 0 sends as `id` next, its items `first` to `last`. */
-static void begin_message(selfcal_telemetry_t *self, uint32_t id, uint32_t first, uint32_t last)
-{
+static void begin_message(selfcal_telemetry_t *self, uint32_t id, uint32_t first, uint32_t last) {
     self->id = (uint16_t)(id - SELFCAL_FRAME_STATUS_ID + self->first_id);
     self->item = (uint8_t)first;
     self->items = (uint8_t)(last + 1U);
 }
 
 /* Frames of `source` next, of one message; false while others are under way. */
-static bool begin(selfcal_telemetry_t *self, uint8_t source, uint32_t id, uint32_t last, uint32_t time_ms)
-{
+static bool begin(selfcal_telemetry_t *self, uint8_t source, uint32_t id, uint32_t last, uint32_t time_ms) {
     if (self->items != 0) {
         return false;
     }
@@ -138,15 +130,13 @@ static bool begin(selfcal_telemetry_t *self, uint8_t source, uint32_t id, uint32
 }
 
 /* Columns whose coefficients are sent. */
-static uint8_t columns(const selfcal_telemetry_t *self)
-{
+static uint8_t columns(const selfcal_telemetry_t *self) {
     return self->coefficient != NULL && self->model->regressors != NULL ? self->model->regressors->count : 0U;
 }
 
 /* A report is its opening, a part for each hypothesis, the coefficients, the adequacy and the end. Goes to the next
  * part. False after the last part, and in frames that are no report. */
-static bool next_part(selfcal_telemetry_t *self)
-{
+static bool next_part(selfcal_telemetry_t *self) {
     const uint32_t hypotheses = self->model->hypotheses;
     if (self->source != REPORT || self->part > hypotheses + 2U) {
         return false;
@@ -159,8 +149,9 @@ static bool next_part(selfcal_telemetry_t *self)
         begin_message(self, SELFCAL_FRAME_COEFFICIENTS_ID + axis, 0, COLUMN_ITEMS * columns(self) - 1U);
     } else if (k <= hypotheses + 1U && self->judgement != NULL) {
         self->part = (uint8_t)(hypotheses + 2U);
-        begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0, self->judgement->changes > 0U ?
-                      (uint8_t)SELFCAL_ADEQUACY_CHANGE_AGO : (uint8_t)SELFCAL_ADEQUACY_TEMPERATURE_SPAN);
+        begin_message(self, SELFCAL_FRAME_ADEQUACY_ID + axis, 0,
+                      self->judgement->changes > 0U ? (uint8_t)SELFCAL_ADEQUACY_CHANGE_AGO
+                                                    : (uint8_t)SELFCAL_ADEQUACY_TEMPERATURE_SPAN);
     } else {
         self->part = (uint8_t)(hypotheses + 3U);
         begin_message(self, SELFCAL_FRAME_AXIS_ID + axis, SELFCAL_AXIS_END_ITEMS, SELFCAL_AXIS_END_ITEMS);
@@ -169,8 +160,7 @@ static bool next_part(selfcal_telemetry_t *self)
 }
 
 selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfcal_report_t *report,
-                                          const selfcal_counters_t *counters, uint32_t time_ms)
-{
+                                          const selfcal_counters_t *counters, uint32_t time_ms) {
     if (self == NULL || report == NULL || counters == NULL || report->axis >= self->model->axes) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -188,14 +178,12 @@ selfcal_status_t selfcal_telemetry_report(selfcal_telemetry_t *self, const selfc
     return SELFCAL_OK;
 }
 
-void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module)
-{
+void selfcal_telemetry_module(selfcal_telemetry_t *self, const selfcal_module_t *module) {
     self->module = module;
 }
 
 selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfcal_counters_t *counters,
-                                          selfcal_state_t state, uint32_t report_number, uint32_t time_ms)
-{
+                                          selfcal_state_t state, uint32_t report_number, uint32_t time_ms) {
     if (self == NULL || counters == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -209,8 +197,7 @@ selfcal_status_t selfcal_telemetry_status(selfcal_telemetry_t *self, const selfc
 }
 
 selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const selfcal_corrected_t *corrected,
-                                             uint32_t time_ms)
-{
+                                             uint32_t time_ms) {
     if (self == NULL || corrected == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -221,8 +208,7 @@ selfcal_status_t selfcal_telemetry_corrected(selfcal_telemetry_t *self, const se
     return SELFCAL_OK;
 }
 
-selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t item, uint32_t value, uint32_t time_ms)
-{
+selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t item, uint32_t value, uint32_t time_ms) {
     if (self == NULL || item > SELFCAL_ANSWER_RESULT) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -235,8 +221,7 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
 }
 
 /* The parameter that a hypothesis has in a place of the wire, or NO_PARAMETER. */
-static unsigned parameter_at(const selfcal_hypothesis_t *hypothesis, unsigned place)
-{
+static unsigned parameter_at(const selfcal_hypothesis_t *hypothesis, unsigned place) {
     switch (place) {
     case 0: return SELFCAL_N;
     case 1: return hypothesis->rho == NULL ? NO_PARAMETER : (unsigned)drift_parameter(hypothesis->law);
@@ -245,8 +230,7 @@ static unsigned parameter_at(const selfcal_hypothesis_t *hypothesis, unsigned pl
 }
 
 /* The value of an item of hypothesis `k`; false if it has none. */
-static bool hypothesis_value(const selfcal_telemetry_t *self, uint8_t k, uint8_t item, uint32_t *value)
-{
+static bool hypothesis_value(const selfcal_telemetry_t *self, uint8_t k, uint8_t item, uint32_t *value) {
     const selfcal_hypothesis_t *hypothesis = &self->model->hypothesis[k];
     const selfcal_posterior_t *p = &self->report->hypothesis[k];
     if (item == SELFCAL_HYPOTHESIS_PROBABILITY) {
@@ -279,8 +263,7 @@ static bool hypothesis_value(const selfcal_telemetry_t *self, uint8_t k, uint8_t
 }
 
 /* The value of an item of the coefficients; false if nothing is known of its column. */
-static bool coefficient_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
-{
+static bool coefficient_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value) {
     const selfcal_sent_coefficient_t *column = &self->coefficient[item / COLUMN_ITEMS];
     const float number[] = {column->mean, column->sd, column->probability};
     *value = float_bits(number[item % COLUMN_ITEMS]);
@@ -288,8 +271,7 @@ static bool coefficient_value(const selfcal_telemetry_t *self, uint8_t item, uin
 }
 
 /* Columns of which something is known. */
-static uint32_t columns_told(const selfcal_telemetry_t *self)
-{
+static uint32_t columns_told(const selfcal_telemetry_t *self) {
     uint32_t told = 0;
     for (uint8_t column = 0; column < columns(self); column++) {
         told += isnan(self->coefficient[column].mean) ? 0U : 1U;
@@ -297,8 +279,7 @@ static uint32_t columns_told(const selfcal_telemetry_t *self)
     return told;
 }
 
-static uint32_t health_value(const selfcal_telemetry_t *self)
-{
+static uint32_t health_value(const selfcal_telemetry_t *self) {
     const selfcal_counters_t *c = self->counters;
     const uint8_t axis = self->report->axis;
     return (c->not_finite[axis] != 0 ? 1U << SELFCAL_AXIS_NOT_FINITE_SHIFT : 0U) |
@@ -311,8 +292,7 @@ static uint32_t health_value(const selfcal_telemetry_t *self)
            (uint32_t)c->outliers[axis] << SELFCAL_AXIS_OUTLIERS_SHIFT;
 }
 
-static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)
-{
+static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item) {
     const selfcal_report_t *r = self->report;
     switch (item) {
     case SELFCAL_AXIS_TIME_MS: return self->time_ms;
@@ -327,8 +307,7 @@ static uint32_t axis_value(const selfcal_telemetry_t *self, uint8_t item)
     }
 }
 
-static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item)
-{
+static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item) {
     switch (item) {
     case SELFCAL_ADEQUACY_ADEQUACY: return (uint32_t)self->judgement->state;
     case SELFCAL_ADEQUACY_SUSPICION: return (uint32_t)self->judgement->suspect;
@@ -344,8 +323,7 @@ static uint32_t adequacy_value(const selfcal_telemetry_t *self, uint8_t item)
 }
 
 /* The value of an item of the part of the report under way; false if it has none. */
-static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
-{
+static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value) {
     const uint8_t hypotheses = self->model->hypotheses;
     if (self->part > 0U && self->part <= hypotheses) {
         return hypothesis_value(self, (uint8_t)(self->part - 1U), item, value);
@@ -361,8 +339,7 @@ static bool report_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t
     return true;
 }
 
-static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t count[])
-{
+static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t count[]) {
     uint64_t sum = 0;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         sum += count[axis];
@@ -371,8 +348,7 @@ static uint32_t sum_of_axes(const selfcal_telemetry_t *self, const uint32_t coun
 }
 
 /* Offset of the axis that has message `message`, as a number; 0 if none has. */
-static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message)
-{
+static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message) {
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         if (self->message[axis] == message) {
             return float_bits(self->module->offset[axis]);
@@ -382,8 +358,7 @@ static uint32_t offset_value(const selfcal_telemetry_t *self, uint8_t message)
 }
 
 /* A reason by axis, above what else the item holds. */
-static uint32_t reason_bits(const selfcal_telemetry_t *self, const selfcal_reason_t reason[])
-{
+static uint32_t reason_bits(const selfcal_telemetry_t *self, const selfcal_reason_t reason[]) {
     uint32_t bits = 0;
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         bits |= (uint32_t)reason[axis] << (SELFCAL_STATUS_REASON_GX_SHIFT + REASON_BITS * self->message[axis]);
@@ -391,8 +366,7 @@ static uint32_t reason_bits(const selfcal_telemetry_t *self, const selfcal_reaso
     return bits;
 }
 
-static uint32_t retired_value(const selfcal_telemetry_t *self)
-{
+static uint32_t retired_value(const selfcal_telemetry_t *self) {
     uint32_t axes = reason_bits(self, self->module->reason);
     for (uint8_t axis = 0; axis < self->model->axes; axis++) {
         axes |= (self->module->retired >> axis & 1U) << self->message[axis];
@@ -400,8 +374,7 @@ static uint32_t retired_value(const selfcal_telemetry_t *self)
     return axes;
 }
 
-static uint32_t module_value(const selfcal_telemetry_t *self, uint8_t item)
-{
+static uint32_t module_value(const selfcal_telemetry_t *self, uint8_t item) {
     const selfcal_module_t *module = self->module;
     switch (item) {
     case SELFCAL_STATUS_RESET_CAUSE: return module->reset_cause;
@@ -431,8 +404,7 @@ static uint32_t module_value(const selfcal_telemetry_t *self, uint8_t item)
     }
 }
 
-static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
-{
+static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item) {
     const selfcal_counters_t *c = self->counters;
     switch (item) {
     case SELFCAL_STATUS_TIME_MS: return self->time_ms;
@@ -458,8 +430,7 @@ static uint32_t status_value(const selfcal_telemetry_t *self, uint8_t item)
 }
 
 /* The value of an item of the corrected sample; false if its axis has none. */
-static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value)
-{
+static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint32_t *value) {
     const selfcal_corrected_t *corrected = self->corrected;
     if (item == SELFCAL_CORRECTED_TIME_MS || item == SELFCAL_CORRECTED_MOTION) {
         *value = item == SELFCAL_CORRECTED_TIME_MS ? self->time_ms
@@ -478,8 +449,8 @@ static bool corrected_value(const selfcal_telemetry_t *self, uint8_t item, uint3
     return false;
 }
 
-static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t value, uint32_t counter, uint32_t time_ms)
-{
+static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t value, uint32_t counter,
+                 uint32_t time_ms) {
     uint64_t bits = value;
     bits |= (uint64_t)(item & SELFCAL_FRAME_ITEM_MASK) << SELFCAL_FRAME_ITEM_SHIFT;
     bits |= (uint64_t)(counter & SELFCAL_FRAME_COUNTER_MASK) << SELFCAL_FRAME_COUNTER_SHIFT;
@@ -497,8 +468,7 @@ static void pack(selfcal_frame_t *frame, uint16_t id, uint8_t item, uint32_t val
     }
 }
 
-bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame)
-{
+bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame) {
     if (self->items == 0) {
         return false;
     }

@@ -9,8 +9,7 @@ enum { SAMPLES_A_TURN = 64 };
  * second. After so long neither will ever come about. */
 #define PATIENCE_MS 300000U
 
-selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
-{
+selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms) {
     memset(app, 0, sizeof *app);
     app->port = port;
     app->period_ms = period_ms;
@@ -28,30 +27,25 @@ selfcal_status_t app_init(app_t *app, const port_t *port, uint32_t period_ms)
     return wire == SELFCAL_OK ? app_node(app, SELFCAL_NODE) : wire;
 }
 
-selfcal_status_t app_node(app_t *app, uint8_t node)
-{
+selfcal_status_t app_node(app_t *app, uint8_t node) {
     return selfcal_telemetry_node(&app->telemetry, node);
 }
 
-void app_power_on(app_t *app, uint64_t samples)
-{
+void app_power_on(app_t *app, uint64_t samples) {
     (void)selfcal_imu_power_on(&app->imu, samples);
 }
 
-bool app_gate(app_t *app)
-{
+bool app_gate(app_t *app) {
     return selfcal_imu_watch(&app->imu, true);
 }
 
-void app_module(app_t *app, const port_module_t *module)
-{
+void app_module(app_t *app, const port_module_t *module) {
     app->module = module;
     app_restore(app);
     app->saved_ms = app_now(app);
 }
 
-bool app_healthy(const app_t *app)
-{
+bool app_healthy(const app_t *app) {
     const uint32_t now = app_now(app);
     return !app->corrupt && (!app->imu.computing || now - app->begun_ms < PATIENCE_MS) &&
            (!app->refused || now - app->refused_ms < PATIENCE_MS);
@@ -59,8 +53,7 @@ bool app_healthy(const app_t *app)
 
 /* A corrected sample, if one is due, of a sample that none was sent of. After all else: on a wire too slow for
  * corrected samples one would always be due. */
-static bool begin_corrected(app_t *app)
-{
+static bool begin_corrected(app_t *app) {
 #if APP_CORRECTED_MS
     const uint32_t now = app_now(app);
     if (now - app->corrected_ms >= APP_CORRECTED_MS && !app->corrupt &&
@@ -74,8 +67,7 @@ static bool begin_corrected(app_t *app)
 }
 
 /* Takes the oldest waiting sample; false: there is none. `dear`: it took as long as a slice of a report. */
-static bool take_sample(app_t *app, bool *dear)
-{
+static bool take_sample(app_t *app, bool *dear) {
     float reading[SELFCAL_MODEL_AXES + SELFCAL_MODEL_CHANNELS + PORT_SIDE];
     uint32_t missing = 0;
     const port_sample_t came = app->port->sample(app->port->context, reading, &missing);
@@ -101,8 +93,7 @@ static bool take_sample(app_t *app, bool *dear)
     return true;
 }
 
-bool app_step(app_t *app)
-{
+bool app_step(app_t *app) {
     /* Samples go on during a report as long as there is room for them beside its sums. Then they wait in the port's
      * queue. On a slow core several come during one slice. */
     bool dear = false;

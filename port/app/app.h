@@ -52,32 +52,32 @@ typedef struct {
 typedef struct {
     const port_t *port;
     const port_module_t *module; /* NULL: none */
-    uint32_t period_ms, due_ms; /* between reports; when the next one is due */
-    uint32_t told_ms;           /* the last status */
+    uint32_t period_ms, due_ms;  /* between reports; when the next one is due */
+    uint32_t told_ms;            /* the last status */
     uint32_t report_number;
-    uint32_t absent_ms;     /* time up to which the samples before a restored state's first are in the bank */
+    uint32_t absent_ms; /* time up to which the samples before a restored state's first are in the bank */
     uint32_t refused_ms;
-    uint32_t saved_ms;  /* when the state was saved last, or the start */
-    uint8_t stage;    /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
-    bool worked_out;  /* an axis's report is, and waits for the wire */
-    bool fresh;       /* samples came in since the last report was begun */
-    bool ended;       /* no sample will follow */
-    bool restored;    /* a saved state was, and no sample has come since */
-    bool put_off;     /* the last turn left a slice of a report to this one */
-    bool waiting;     /* `frame` is made but not taken yet */
-    bool refused;     /* the port has refused it, since refused_ms */
-    bool finished;    /* no sample will follow, and the last status is on its way */
-    bool corrupt;     /* selfcal_check() failed: nothing is sent any more */
+    uint32_t saved_ms; /* when the state was saved last, or the start */
+    uint8_t stage;     /* of the report under way: 0 none, 1 status, 2.. the axes, then the end */
+    bool worked_out;   /* an axis's report is, and waits for the wire */
+    bool fresh;        /* samples came in since the last report was begun */
+    bool ended;        /* no sample will follow */
+    bool restored;     /* a saved state was, and no sample has come since */
+    bool put_off;      /* the last turn left a slice of a report to this one */
+    bool waiting;      /* `frame` is made but not taken yet */
+    bool refused;      /* the port has refused it, since refused_ms */
+    bool finished;     /* no sample will follow, and the last status is on its way */
+    bool corrupt;      /* selfcal_check() failed: nothing is sent any more */
 #if APP_COMMANDS
-    uint8_t ordered;    /* command that is obeyed between reports; 0: none */
-    bool restarting;    /* once the answer is out */
-    uint32_t argument;  /* of what is ordered */
+    uint8_t ordered;     /* command that is obeyed between reports; 0: none */
+    bool restarting;     /* once the answer is out */
+    uint32_t argument;   /* of what is ordered */
     uint32_t restart_ms; /* since when */
     command_t command;
     answer_t answer[ANSWERS];
 #endif
     selfcal_module_t told; /* filled in by `module` */
-    uint32_t begun_ms; /* start of the axis report under way */
+    uint32_t begun_ms;     /* start of the axis report under way */
 #if APP_CORRECTED_MS
     uint32_t corrected_ms; /* when a corrected sample was sent last */
     uint32_t reading_ms;   /* of the newest sample */

@@ -10,8 +10,7 @@ typedef char the_key_has_two_halves[sizeof command_key == 16U ? 1 : -1];
 enum { TELEMETRY_PERIOD_LEAST_MS = 100, AXIS_BITS = (1 << PORT_AXES) - 1 };
 #define RESTART_MS 3000U /* at most for the answer to leave: the 2 KB before it take 2.1 s at 9600 baud */
 
-static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result)
-{
+static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result) {
     app->told.command_count += result == SELFCAL_ANSWER_RESULT_DONE ? 1U : 0U;
     app->told.command_refused_count += result == SELFCAL_ANSWER_RESULT_DONE ? 0U : 1U;
     to->waiting = true;
@@ -20,15 +19,13 @@ static void answer(app_t *app, answer_t *to, uint8_t command, uint8_t result)
 }
 
 /* Bit of an axis of the model in a command. */
-static uint32_t axis_bit(uint8_t axis)
-{
+static uint32_t axis_bit(uint8_t axis) {
     return 1UL << port_axis(selfcal_model_axis_name[axis]);
 }
 
 /* Has the sensor take off the biases of `axes`, or, with none, take back all offsets. Everything learnt is kept. To
  * take offsets back is always possible: a sensor put in place of the one that was told may refuse it, and never run. */
-static uint8_t write_offsets(app_t *app, uint32_t axes)
-{
+static uint8_t write_offsets(app_t *app, uint32_t axes) {
     float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
     uint32_t found = 0;
     app_tell(app);
@@ -60,22 +57,19 @@ static uint8_t write_offsets(app_t *app, uint32_t axes)
     return SELFCAL_ANSWER_RESULT_DONE;
 }
 
-static uint8_t forget(app_t *app)
-{
+static uint8_t forget(app_t *app) {
     app->fresh = false;
     app->restored = false;
     return selfcal_imu_forget(&app->imu) == SELFCAL_OK ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
-static uint8_t saved(app_t *app, uint32_t now)
-{
+static uint8_t saved(app_t *app, uint32_t now) {
     const uint32_t before = app->told.state_saves;
     app_save(app, now);
     return app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
-static void obey(app_t *app, uint32_t now)
-{
+static void obey(app_t *app, uint32_t now) {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
     app->ordered = 0;
@@ -96,8 +90,7 @@ static void obey(app_t *app, uint32_t now)
     answer(app, &app->answer[OF_ORDER], command, result);
 }
 
-bool app_obey(app_t *app, uint32_t now)
-{
+bool app_obey(app_t *app, uint32_t now) {
     command_pass(&app->command, now);
     if (app->ordered != 0U && !app->answer[OF_ORDER].waiting && app->module != NULL) {
         obey(app, now);
@@ -106,8 +99,7 @@ bool app_obey(app_t *app, uint32_t now)
 }
 
 /* Checks a command's argument, and whether it can be obeyed now. */
-static uint8_t judge(const app_t *app, uint8_t command, uint32_t argument)
-{
+static uint8_t judge(const app_t *app, uint8_t command, uint32_t argument) {
     bool in_range;
     switch (command) {
     case SELFCAL_ANSWER_COMMAND_RESET: in_range = argument <= 1U; break;
@@ -123,8 +115,7 @@ static uint8_t judge(const app_t *app, uint8_t command, uint32_t argument)
     return now ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_NOT_NOW;
 }
 
-void app_command(app_t *app, const uint8_t data[8])
-{
+void app_command(app_t *app, const uint8_t data[8]) {
     const uint32_t now = app_now(app);
     const uint8_t command = data[0];
     const uint32_t argument = (uint32_t)data[1] | (uint32_t)data[2] << 8 | (uint32_t)data[3] << 16;
@@ -158,8 +149,7 @@ void app_command(app_t *app, const uint8_t data[8])
     app->argument = argument;
 }
 
-bool app_begin_answer(app_t *app, uint32_t now)
-{
+bool app_begin_answer(app_t *app, uint32_t now) {
     for (unsigned i = 0; i < ANSWERS; i++) {
         if (app->answer[i].waiting) {
             app->answer[i].waiting = false;

@@ -4,8 +4,7 @@
 /* Between statuses of a module, at most. */
 #define STATUS_MS 10000U
 
-bool app_send_frames(app_t *app)
-{
+bool app_send_frames(app_t *app) {
     bool sent = false;
     for (;;) {
         if (!app->waiting) {
@@ -27,8 +26,7 @@ bool app_send_frames(app_t *app)
     }
 }
 
-void app_tell(app_t *app)
-{
+void app_tell(app_t *app) {
     selfcal_module_t *told = &app->told;
     if (app->module != NULL) {
         app->module->tell(app->module->context, told);
@@ -42,15 +40,13 @@ void app_tell(app_t *app)
     }
 }
 
-void app_tell_status(app_t *app, uint32_t now)
-{
+void app_tell_status(app_t *app, uint32_t now) {
     app_tell(app);
     (void)selfcal_telemetry_status(&app->telemetry, selfcal_counters(&app->imu.bank), SELFCAL_RUNNING,
                                    app->report_number, now);
     app->told_ms = now;
 }
 
-bool app_status_due(const app_t *app, uint32_t now)
-{
+bool app_status_due(const app_t *app, uint32_t now) {
     return app->module != NULL && now - app->told_ms >= STATUS_MS;
 }

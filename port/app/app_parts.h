@@ -6,8 +6,7 @@
 
 #include "selfcal_frames.h"
 
-static inline uint32_t app_now(const app_t *app)
-{
+static inline uint32_t app_now(const app_t *app) {
     return app->port->time_ms(app->port->context);
 }
 
@@ -45,15 +44,13 @@ bool app_obey(app_t *app, uint32_t now);
 /* Begins an answer, or restarts the module once its answer has left; false: neither. Only with all frames out. */
 bool app_begin_answer(app_t *app, uint32_t now);
 #else
-static inline bool app_obey(app_t *app, uint32_t now)
-{
+static inline bool app_obey(app_t *app, uint32_t now) {
     (void)app;
     (void)now;
     return false;
 }
 
-static inline bool app_begin_answer(app_t *app, uint32_t now)
-{
+static inline bool app_begin_answer(app_t *app, uint32_t now) {
     (void)app;
     (void)now;
     return false;

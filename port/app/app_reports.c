@@ -1,8 +1,7 @@
 /* Reports: when one is due, each axis in turn, in slices. */
 #include "app_parts.h"
 
-void app_compute(app_t *app)
-{
+void app_compute(app_t *app) {
     const selfcal_status_t status = selfcal_imu_work(&app->imu);
     const uint8_t axis = app->imu.report.axis;
     app->worked_out = status == SELFCAL_OK;
@@ -12,8 +11,7 @@ void app_compute(app_t *app)
     }
 }
 
-bool app_begin_frames(app_t *app)
-{
+bool app_begin_frames(app_t *app) {
     const uint32_t now = app_now(app);
     if (app->worked_out) {
         app->worked_out = false;
@@ -32,8 +30,7 @@ bool app_begin_frames(app_t *app)
 }
 
 /* Between reports: saves, obeys, and begins the next report or a status if one is due. */
-static bool between_reports(app_t *app, uint32_t now)
-{
+static bool between_reports(app_t *app, uint32_t now) {
     const bool due = (int32_t)(now - app->due_ms) >= 0;
     if (app->module != NULL && now - app->saved_ms >= app->module->save_period_ms) {
         app_save(app, now);
@@ -65,8 +62,7 @@ static bool between_reports(app_t *app, uint32_t now)
     return false;
 }
 
-bool app_advance(app_t *app)
-{
+bool app_advance(app_t *app) {
     const uint32_t now = app_now(app);
     if (app->stage == STAGE_NONE) {
         const bool busy = between_reports(app, now);
@@ -87,4 +83,3 @@ bool app_advance(app_t *app)
     app->stage = (uint8_t)(app->stage < STAGE_END ? app->stage + 1 : STAGE_NONE);
     return true;
 }
-

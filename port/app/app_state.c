@@ -2,8 +2,7 @@
 #include "app_parts.h"
 
 /* Tells the sensor again the offsets that the bank knows of: it may have forgotten them. */
-static bool tell_sensor(app_t *app)
-{
+static bool tell_sensor(app_t *app) {
     float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
     bool any = false;
     for (uint8_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
@@ -13,8 +12,7 @@ static bool tell_sensor(app_t *app)
     return !any || app->module->write_offsets(app->module->context, wanted, got);
 }
 
-void app_restore(app_t *app)
-{
+void app_restore(app_t *app) {
     const port_module_t *module = app->module;
     for (int older = 0; older < 2; older++) {
         size_t length = 0;
@@ -38,16 +36,14 @@ void app_restore(app_t *app)
     }
 }
 
-uint32_t app_absent(app_t *app)
-{
+uint32_t app_absent(app_t *app) {
     const uint32_t now = app_now(app);
     const double passed = 1e-3 * (double)(now - app->absent_ms) * (double)SELFCAL_MODEL_RATE_HZ;
     app->absent_ms = now;
     return (uint32_t)passed;
 }
 
-void app_save(app_t *app, uint32_t now)
-{
+void app_save(app_t *app, uint32_t now) {
     const port_module_t *module = app->module;
     if (app->restored) {
         selfcal_imu_skip(&app->imu, app_absent(app));
@@ -63,4 +59,3 @@ void app_save(app_t *app, uint32_t now)
         app->told.state_save_failures++;
     }
 }
-

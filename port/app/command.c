@@ -1,12 +1,10 @@
 #include "command.h"
 
-static uint64_t rotate(uint64_t x, unsigned by)
-{
+static uint64_t rotate(uint64_t x, unsigned by) {
     return x << by | x >> (64U - by);
 }
 
-static void rounds(uint64_t v[4], int count)
-{
+static void rounds(uint64_t v[4], int count) {
     for (int i = 0; i < count; i++) {
         v[0] += v[1];
         v[1] = rotate(v[1], 13) ^ v[0];
@@ -21,8 +19,7 @@ static void rounds(uint64_t v[4], int count)
     }
 }
 
-uint64_t command_siphash(const uint64_t key[2], uint64_t message)
-{
+uint64_t command_siphash(const uint64_t key[2], uint64_t message) {
     const uint64_t word[2] = {message, 8ULL << 56}; /* the last word: no bytes are left, and the length */
     uint64_t v[4] = {key[0] ^ 0x736F6D6570736575ULL, key[1] ^ 0x646F72616E646F6DULL, key[0] ^ 0x6C7967656E657261ULL,
                      key[1] ^ 0x7465646279746573ULL};
@@ -36,25 +33,21 @@ uint64_t command_siphash(const uint64_t key[2], uint64_t message)
     return v[0] ^ v[1] ^ v[2] ^ v[3];
 }
 
-static void pause(command_t *self, uint32_t now_ms)
-{
+static void pause(command_t *self, uint32_t now_ms) {
     self->paused = true;
     self->paused_ms = now_ms;
 }
 
-static bool stands(const command_t *self, uint32_t now_ms)
-{
+static bool stands(const command_t *self, uint32_t now_ms) {
     return self->open && now_ms - self->opened_ms <= COMMAND_CHALLENGE_MS;
 }
 
-void command_pass(command_t *self, uint32_t now_ms)
-{
+void command_pass(command_t *self, uint32_t now_ms) {
     self->open = stands(self, now_ms);
     self->paused = self->paused && now_ms - self->paused_ms < COMMAND_PAUSE_MS;
 }
 
-bool command_open(command_t *self, uint32_t number, uint32_t now_ms)
-{
+bool command_open(command_t *self, uint32_t number, uint32_t now_ms) {
     command_pass(self, now_ms);
     if (self->open) {
         return true;
@@ -69,13 +62,11 @@ bool command_open(command_t *self, uint32_t number, uint32_t now_ms)
     return true;
 }
 
-static uint32_t little32(const uint8_t bytes[4])
-{
+static uint32_t little32(const uint8_t bytes[4]) {
     return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
 }
 
-uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms)
-{
+uint8_t command_check(command_t *self, const uint64_t key[2], const uint8_t data[8], uint32_t now_ms) {
     const bool stood = stands(self, now_ms);
     self->open = false;
     if (!stood) {

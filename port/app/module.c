@@ -22,20 +22,17 @@ static const module_board_t *board;
 
 /* ------------------------------------------------------------------------------------------------------------- port */
 
-static uint32_t port_time_ms(void *context)
-{
+static uint32_t port_time_ms(void *context) {
     (void)context;
     return board->time_ms();
 }
 
-static bool port_send(void *context, const selfcal_frame_t *frame)
-{
+static bool port_send(void *context, const selfcal_frame_t *frame) {
     (void)context;
     return board->send(frame);
 }
 
-static void port_idle(void *context)
-{
+static void port_idle(void *context) {
     (void)context;
     board->sleep();
 }
@@ -44,63 +41,64 @@ static const port_t port = {NULL, port_time_ms, readings_sample, port_send, port
 
 /* ----------------------------------------------------------------------------------------------------------- module */
 
-static void module_tell(void *context, selfcal_module_t *told)
-{
+static void module_tell(void *context, selfcal_module_t *told) {
     (void)context;
     board->tell(told);
     readings_tell(told);
 }
 
 /* Flash at work holds the processor up, and with it the interrupts that stamp samples: none is taken meanwhile. */
-static bool module_save_begin(void *context, bool keep_older)
-{
+static bool module_save_begin(void *context, bool keep_older) {
     board->feed();
     readings_pause(true);
     return slots_begin(context, keep_older);
 }
 
-static bool module_save_end(void *context, bool whole)
-{
+static bool module_save_end(void *context, bool whole) {
     const bool saved = slots_end(context, whole);
     readings_pause(false);
     return saved;
 }
 
-static bool module_random(void *context, uint32_t *number)
-{
+static bool module_random(void *context, uint32_t *number) {
     (void)context;
     return board->random(number);
 }
 
-static bool module_sent(void *context)
-{
+static bool module_sent(void *context) {
     (void)context;
     return board->sent();
 }
 
-static void module_restart(void *context)
-{
+static void module_restart(void *context) {
     (void)context;
     board->restart();
 }
 
 #if APP_COMMANDS
-void module_command(const uint8_t data[8])
-{
+void module_command(const uint8_t data[8]) {
     app_command(&app, data);
 }
 #endif
 
 static const port_module_t module = {
-    &slots, module_tell, slots_stored, module_save_begin, slots_put, module_save_end, readings_write_offsets,
-    module_random, module_sent, module_restart,
-    BOARD_SAVE_PERIOD_S * 1000U, (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
+    &slots,
+    module_tell,
+    slots_stored,
+    module_save_begin,
+    slots_put,
+    module_save_end,
+    readings_write_offsets,
+    module_random,
+    module_sent,
+    module_restart,
+    BOARD_SAVE_PERIOD_S * 1000U,
+    (uint64_t)((double)BOARD_SAVE_PERIOD_S * (double)SELFCAL_MODEL_RATE_HZ),
 };
 
 /* Fed once in 100 ms at most, and only if the application is healthy and the ticks go on: a main loop that turns
  * without its interrupts is not healthy. */
-static void feed(void)
-{
+static void feed(void) {
     static uint32_t fed;
     const uint32_t now = board->ticks();
     if (now - fed >= 100U && app_healthy(&app)) {
@@ -109,8 +107,7 @@ static void feed(void)
     }
 }
 
-void module_run(const module_board_t *its_board)
-{
+void module_run(const module_board_t *its_board) {
     board = its_board;
     slots.memory = board->memory;
     if (!readings_init(board->bus) || app_init(&app, &port, board->report_ms) != SELFCAL_OK) {

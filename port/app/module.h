@@ -14,23 +14,23 @@ typedef enum {
     RESET_PIN = 2,
     RESET_SOFTWARE = 3,
     RESET_WATCHDOG = 4,
-    RESET_FAULT = 5,    /* software reset after a fault of the processor */
+    RESET_FAULT = 5, /* software reset after a fault of the processor */
     RESET_LOW_POWER = 6
 } reset_cause_t;
 
 typedef struct {
     const sensor_bus_t *bus;
     const slots_memory_t *memory;
-    uint32_t report_ms;                     /* between reports of all axes */
-    uint32_t (*time_ms)(void);              /* since start, modulo 2^32 */
-    uint32_t (*ticks)(void);                /* goes up each millisecond that interrupts are served */
+    uint32_t report_ms;                         /* between reports of all axes */
+    uint32_t (*time_ms)(void);                  /* since start, modulo 2^32 */
+    uint32_t (*ticks)(void);                    /* goes up each millisecond that interrupts are served */
     bool (*send)(const selfcal_frame_t *frame); /* as port_t's */
-    bool (*sent)(void);                     /* all frames that it took have left */
-    void (*poll)(void);                     /* takes what came by the wire, and gives commands to module_command() */
-    void (*sleep)(void);                    /* until an interrupt of the sensor or the wire, or the next millisecond */
-    void (*feed)(void);                     /* the watchdog, whose time is longer than an erase of the memory takes */
-    void (*tell)(selfcal_module_t *told);   /* reset cause, fault address, clock, counters of the wire */
-    bool (*random)(uint32_t *number);       /* for commands */
+    bool (*sent)(void);                         /* all frames that it took have left */
+    void (*poll)(void);                   /* takes what came by the wire, and gives commands to module_command() */
+    void (*sleep)(void);                  /* until an interrupt of the sensor or the wire, or the next millisecond */
+    void (*feed)(void);                   /* the watchdog, whose time is longer than an erase of the memory takes */
+    void (*tell)(selfcal_module_t *told); /* reset cause, fault address, clock, counters of the wire */
+    bool (*random)(uint32_t *number);     /* for commands */
     void (*restart)(void);
 } module_board_t;
 

@@ -16,13 +16,12 @@
 static const int the_sensor_makes_the_rate = 1 / OF(SENSOR, has_rate)(SELFCAL_MODEL_RATE_HZ);
 enum { CHANNELS_KNOWN = SELFCAL_MODEL_CHANNELS_READ && (OF(SENSOR, has_supply) || !SELFCAL_MODEL_SUPPLY_READ) };
 typedef char the_sensor_has_the_channels[CHANNELS_KNOWN ? 1 : -1];
-typedef char the_axes_and_channels_are_the_ports[PORT_AXES == (int)SENSOR_AXES && PORT_SIDE == (int)SENSOR_SIDE &&
-                                                 PORT_SUPPLY == (int)SENSOR_SUPPLY ? 1 : -1];
+typedef char the_axes_and_channels_are_the_ports
+    [PORT_AXES == (int)SENSOR_AXES && PORT_SIDE == (int)SENSOR_SIDE && PORT_SUPPLY == (int)SENSOR_SUPPLY ? 1 : -1];
 
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 
-bool readings_init(const sensor_bus_t *bus)
-{
+bool readings_init(const sensor_bus_t *bus) {
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         const unsigned at = port_axis(selfcal_model_axis_name[axis]);
         if (at == PORT_AXES) {
@@ -33,35 +32,30 @@ bool readings_init(const sensor_bus_t *bus)
     return the_sensor_makes_the_rate != 0 && sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
 }
 
-void readings_ready(void)
-{
+void readings_ready(void) {
     if (SENSOR.ready != NULL) {
         SENSOR.ready(SENSOR.state);
     }
 }
 
-void readings_done(bool whole)
-{
+void readings_done(bool whole) {
     if (SENSOR.done != NULL) {
         SENSOR.done(SENSOR.state, whole);
     }
 }
 
-void readings_poll(void)
-{
+void readings_poll(void) {
     sensor_poll(&SENSOR);
 }
 
-void readings_pause(bool on)
-{
+void readings_pause(bool on) {
     if (SENSOR.pause != NULL) {
         SENSOR.pause(SENSOR.state, on);
     }
 }
 
 /* Channels of the model from the sensor's. NOLINTNEXTLINE(readability-non-const-parameter): a model may read none */
-static void take_channels(const float side[PORT_SIDE], float channels[])
-{
+static void take_channels(const float side[PORT_SIDE], float channels[]) {
 #if SELFCAL_MODEL_CHANNELS > 0
     for (size_t i = 0; i < SELFCAL_MODEL_CHANNELS; i++) {
         channels[i] = side[strcmp(selfcal_model_channel_name[i], "supply") == 0 ? PORT_SUPPLY : PORT_TEMPERATURE];
@@ -71,8 +65,7 @@ static void take_channels(const float side[PORT_SIDE], float channels[])
     (void)channels;
 }
 
-port_sample_t readings_sample(void *context, float reading[], uint32_t *missing)
-{
+port_sample_t readings_sample(void *context, float reading[], uint32_t *missing) {
     (void)context;
     float all[SENSOR_AXES];
     if (!sensor_read(&SENSOR, all, missing)) {
@@ -89,8 +82,7 @@ port_sample_t readings_sample(void *context, float reading[], uint32_t *missing)
     return PORT_SAMPLE;
 }
 
-bool readings_write_offsets(void *context, const float wanted[], float got[])
-{
+bool readings_write_offsets(void *context, const float wanted[], float got[]) {
     (void)context;
     float all[SENSOR_AXES] = {0.0F}, added[SENSOR_AXES];
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
@@ -103,8 +95,7 @@ bool readings_write_offsets(void *context, const float wanted[], float got[])
     return written;
 }
 
-void readings_tell(selfcal_module_t *told)
-{
+void readings_tell(selfcal_module_t *told) {
     const sensor_state_t *state = SENSOR.state;
     told->sensor_state = (uint32_t)state->condition;
     told->sensor_fault = (uint32_t)state->fault;

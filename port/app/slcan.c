@@ -10,13 +10,11 @@
 #define LF '\n'
 #define BEL '\a'
 
-void slcan_init(slcan_t *self)
-{
+void slcan_init(slcan_t *self) {
     memset(self, 0, sizeof *self);
 }
 
-static size_t reply(char answer[SLCAN_ANSWER_BYTES], const char *text)
-{
+static size_t reply(char answer[SLCAN_ANSWER_BYTES], const char *text) {
     size_t length = 0;
     for (; text[length] != '\0'; length++) {
         answer[length] = text[length];
@@ -26,8 +24,7 @@ static size_t reply(char answer[SLCAN_ANSWER_BYTES], const char *text)
 
 #ifdef APP_COMMAND_KEY
 /* -1: none. */
-static int digit_value(char digit)
-{
+static int digit_value(char digit) {
     return digit >= '0' && digit <= '9'   ? digit - '0'
            : digit >= 'A' && digit <= 'F' ? digit - 'A' + 10
            : digit >= 'a' && digit <= 'f' ? digit - 'a' + 10
@@ -35,8 +32,7 @@ static int digit_value(char digit)
 }
 
 /* Takes a line that is a COMMAND message of 8 bytes. */
-static bool take_command(slcan_t *self)
-{
+static bool take_command(slcan_t *self) {
     uint32_t head = 0;
     uint8_t data[8] = {0};
     if (!self->open || self->listening_only || self->length != SLCAN_LINE_BYTES || self->line[0] != 't') {
@@ -62,8 +58,7 @@ static bool take_command(slcan_t *self)
 }
 #endif
 
-static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
-{
+static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES]) {
     const char first = self->line[0];
     if (self->length == 0) {
         return reply(answer, "\r");
@@ -94,8 +89,7 @@ static size_t command(slcan_t *self, char answer[SLCAN_ANSWER_BYTES])
     return 1;
 }
 
-size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES])
-{
+size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES]) {
     if (byte == LF && self->length == 0U) { /* of hosts that end a line with both */
         return 0;
     }
@@ -113,8 +107,7 @@ size_t slcan_receive(slcan_t *self, uint8_t byte, char answer[SLCAN_ANSWER_BYTES
     return 0;
 }
 
-void slcan_encode(const selfcal_frame_t *frame, char line[SLCAN_FRAME_BYTES])
-{
+void slcan_encode(const selfcal_frame_t *frame, char line[SLCAN_FRAME_BYTES]) {
     static const char digit[] = "0123456789ABCDEF";
     size_t at = 0;
     line[at++] = 't';

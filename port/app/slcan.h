@@ -20,12 +20,12 @@
 #endif
 
 typedef struct {
-    bool open;       /* frames may be sent */
+    bool open;           /* frames may be sent */
     bool listening_only; /* ... and none is taken */
-    uint8_t length;  /* of the line so far; one more than `line` stands for any that is longer */
+    uint8_t length;      /* of the line so far; one more than `line` stands for any that is longer */
     char line[SLCAN_LINE_BYTES];
 #ifdef APP_COMMAND_KEY
-    bool came;       /* a COMMAND message, its bytes in `data`: the caller's to take */
+    bool came; /* a COMMAND message, its bytes in `data`: the caller's to take */
     uint8_t data[8];
 #endif
 } slcan_t;

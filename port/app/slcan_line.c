@@ -1,7 +1,6 @@
 #include "slcan_line.h"
 
-static bool put(byte_ring_t *ring, const char *bytes, uint32_t count)
-{
+static bool put(byte_ring_t *ring, const char *bytes, uint32_t count) {
     const uint32_t head = ring->head;
     if (ring->size - (head - ring->tail) < count) {
         return false;
@@ -13,8 +12,7 @@ static bool put(byte_ring_t *ring, const char *bytes, uint32_t count)
     return true;
 }
 
-static bool take(byte_ring_t *ring, uint8_t *byte)
-{
+static bool take(byte_ring_t *ring, uint8_t *byte) {
     const uint32_t tail = ring->tail;
     if (tail == ring->head) {
         return false;
@@ -24,8 +22,7 @@ static bool take(byte_ring_t *ring, uint8_t *byte)
     return true;
 }
 
-bool slcan_line_send(slcan_line_t *line, const selfcal_frame_t *frame)
-{
+bool slcan_line_send(slcan_line_t *line, const selfcal_frame_t *frame) {
     if (!line->slcan.open) {
         line->dropped++;
         return true;
@@ -35,8 +32,7 @@ bool slcan_line_send(slcan_line_t *line, const selfcal_frame_t *frame)
     return put(&line->out, text, sizeof text);
 }
 
-bool slcan_line_poll(slcan_line_t *line)
-{
+bool slcan_line_poll(slcan_line_t *line) {
     uint8_t byte;
     while (take(&line->in, &byte)) {
         char answer[SLCAN_ANSWER_BYTES];
@@ -52,13 +48,11 @@ bool slcan_line_poll(slcan_line_t *line)
     return false;
 }
 
-bool slcan_line_empty(const slcan_line_t *line)
-{
+bool slcan_line_empty(const slcan_line_t *line) {
     return line->out.tail == line->out.head;
 }
 
-void slcan_line_received(slcan_line_t *line, uint8_t byte)
-{
+void slcan_line_received(slcan_line_t *line, uint8_t byte) {
     const uint32_t head = line->in.head;
     if (head - line->in.tail < line->in.size) {
         line->in.byte[head % line->in.size] = byte;
@@ -68,7 +62,6 @@ void slcan_line_received(slcan_line_t *line, uint8_t byte)
     }
 }
 
-bool slcan_line_next(slcan_line_t *line, uint8_t *byte)
-{
+bool slcan_line_next(slcan_line_t *line, uint8_t *byte) {
     return take(&line->out, byte);
 }

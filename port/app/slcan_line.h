@@ -24,8 +24,10 @@ typedef struct {
 } slcan_line_t;
 
 /* Over arrays of the board; all else is zero. */
-#define SLCAN_LINE(out_bytes, in_bytes) {.out = {.byte = (out_bytes), .size = sizeof(out_bytes)}, \
-                                         .in = {.byte = (in_bytes), .size = sizeof(in_bytes)}}
+#define SLCAN_LINE(out_bytes, in_bytes)                                                                                \
+    {                                                                                                                  \
+        .out = {.byte = (out_bytes), .size = sizeof(out_bytes)}, .in = {.byte = (in_bytes), .size = sizeof(in_bytes) } \
+    }
 
 /* Takes a frame, or drops it on a closed channel. False: no room, offer it again. */
 bool slcan_line_send(slcan_line_t *line, const selfcal_frame_t *frame);

@@ -9,8 +9,7 @@ typedef struct {
     uint32_t magic, sequence, length, payload_crc, reserved[3], header_crc;
 } header_t;
 
-static uint32_t crc32(uint32_t crc, const void *bytes, size_t count)
-{
+static uint32_t crc32(uint32_t crc, const void *bytes, size_t count) {
     const uint8_t *byte = bytes;
     for (size_t i = 0; i < count; i++) {
         crc ^= byte[i];
@@ -21,40 +20,34 @@ static uint32_t crc32(uint32_t crc, const void *bytes, size_t count)
     return crc;
 }
 
-static uint32_t crc_of(const void *bytes, size_t count)
-{
+static uint32_t crc_of(const void *bytes, size_t count) {
     return ~crc32(UINT32_MAX, bytes, count);
 }
 
-static const uint8_t *start_of(const slots_t *self, uint32_t slot)
-{
+static const uint8_t *start_of(const slots_t *self, uint32_t slot) {
     return self->memory->base + (size_t)slot * self->memory->stride;
 }
 
-static header_t header_of(const slots_t *self, uint32_t slot)
-{
+static header_t header_of(const slots_t *self, uint32_t slot) {
     header_t header;
     memcpy(&header, start_of(self, slot), sizeof header);
     return header;
 }
 
 /* A save that reached its end wrote this header. */
-static bool headed(const slots_t *self, uint32_t slot)
-{
+static bool headed(const slots_t *self, uint32_t slot) {
     const header_t header = header_of(self, slot);
     return header.magic == MAGIC && header.header_crc == crc_of(&header, offsetof(header_t, header_crc)) &&
            header.length <= self->memory->stride - SLOTS_HEADER_BYTES;
 }
 
-static bool whole_slot(const slots_t *self, uint32_t slot)
-{
+static bool whole_slot(const slots_t *self, uint32_t slot) {
     const header_t header = header_of(self, slot);
     return headed(self, slot) && header.payload_crc == crc_of(start_of(self, slot) + SLOTS_HEADER_BYTES, header.length);
 }
 
 /* The slot with the newest state, or the one before it; NONE. */
-static uint32_t find(const slots_t *self, bool older)
-{
+static uint32_t find(const slots_t *self, bool older) {
     const bool good[SLOTS] = {headed(self, 0), headed(self, 1)};
     if (good[0] && good[1]) {
         /* modulo 2^32 */
@@ -68,8 +61,7 @@ static uint32_t find(const slots_t *self, bool older)
 }
 
 /* Nothing was written there since the last erase. */
-static bool blank(const slots_t *self, uint32_t slot)
-{
+static bool blank(const slots_t *self, uint32_t slot) {
     const uint8_t *byte = start_of(self, slot);
     size_t erased = 0;
     while (erased < SLOTS_HEADER_BYTES && byte[erased] == 0xFFU) {
@@ -80,8 +72,7 @@ static bool blank(const slots_t *self, uint32_t slot)
 
 /* Where no slot has a header and one has what is left of it, that is a state of no bytes: to be refused, not to be
  * passed over. */
-const void *slots_stored(void *context, bool older, size_t *length)
-{
+const void *slots_stored(void *context, bool older, size_t *length) {
     const slots_t *self = context;
     const uint32_t slot = find(self, older);
     if (slot == NONE) {
@@ -92,8 +83,7 @@ const void *slots_stored(void *context, bool older, size_t *length)
     return start_of(self, slot) + SLOTS_HEADER_BYTES;
 }
 
-bool slots_begin(void *context, bool keep_older)
-{
+bool slots_begin(void *context, bool keep_older) {
     slots_t *self = context;
     const uint32_t newest = find(self, false), older = find(self, true);
     const uint32_t kept = older != NONE && (keep_older || !whole_slot(self, newest)) ? older : newest;
@@ -107,8 +97,7 @@ bool slots_begin(void *context, bool keep_older)
     return !self->failed;
 }
 
-static void program_word(slots_t *self)
-{
+static void program_word(slots_t *self) {
     self->failed = self->failed || self->at + 4U > self->memory->stride ||
                    !self->memory->program(start_of(self, self->slot) + self->at, self->word);
     self->at += 4U;
@@ -116,8 +105,7 @@ static void program_word(slots_t *self)
     self->filled = 0;
 }
 
-bool slots_put(void *context, const void *bytes, size_t count)
-{
+bool slots_put(void *context, const void *bytes, size_t count) {
     slots_t *self = context;
     const uint8_t *byte = bytes;
     for (size_t i = 0; i < count && !self->failed; i++) {
@@ -131,8 +119,7 @@ bool slots_put(void *context, const void *bytes, size_t count)
     return !self->failed;
 }
 
-bool slots_end(void *context, bool whole)
-{
+bool slots_end(void *context, bool whole) {
     slots_t *self = context;
     if (!whole || self->failed) {
         return false;

@@ -5,8 +5,7 @@ enum { TICK_US = 1000, WATCHDOG_S = 8, LFCLK_HZ = 32768, CRYSTAL_TURNS = 100000 
 
 static volatile uint32_t milliseconds;
 
-void clock_init(void)
-{
+void clock_init(void) {
     CLOCK_HFCLKSTARTED = 0U;
     CLOCK_HFCLKSTART = 1U;
     for (uint32_t turn = 0; turn < CRYSTAL_TURNS && CLOCK_HFCLKSTARTED == 0U; turn++) {
@@ -27,8 +26,7 @@ void clock_init(void)
 }
 
 /* Late when the flash was at work: then several ticks are due, or one more by the time that the next is set. */
-void clock_handler(void)
-{
+void clock_handler(void) {
     TIMER0_COMPARE1 = 0U;
     while ((int32_t)(clock_us32() - TIMER0_CC1) >= 0) {
         TIMER0_CC1 += TICK_US;
@@ -36,33 +34,28 @@ void clock_handler(void)
     }
 }
 
-uint32_t clock_ms(void)
-{
+uint32_t clock_ms(void) {
     return milliseconds;
 }
 
 /* A handler that captures in between makes the main loop's answer later, never wrong. */
-uint32_t clock_us32(void)
-{
+uint32_t clock_us32(void) {
     TIMER0_CAPTURE0 = 1U;
     return TIMER0_CC0;
 }
 
 /* Called from the main loop at least once in 71 minutes. */
-uint64_t clock_us(void)
-{
+uint64_t clock_us(void) {
     static uint64_t now;
     now += clock_us32() - (uint32_t)now;
     return now;
 }
 
-void clock_spin_us(uint32_t us)
-{
+void clock_spin_us(uint32_t us) {
     uint32_t turns = us * 11U / 2U + 1U; /* of 4 cycles, or of 3: never less than 16 cycles a microsecond */
     __asm__ volatile(".syntax unified\n1: subs %0, #1\n bne 1b" : "+l"(turns) : : "cc");
 }
 
-void watchdog_feed(void)
-{
+void watchdog_feed(void) {
     WDT_RR0 = WDT_RELOAD;
 }

@@ -14,8 +14,7 @@ enum {
 };
 typedef char the_state_fits_its_slot[SLOT_PAGES * NVMC_PAGE_BYTES <= SLOT_STRIDE ? 1 : -1];
 
-static bool await_ready(void)
-{
+static bool await_ready(void) {
     const uint32_t start = clock_us32();
     while ((NVMC_READY & 1U) == 0U) {
         if (clock_us32() - start > 100000U) {
@@ -25,8 +24,7 @@ static bool await_ready(void)
     return true;
 }
 
-static bool erase(uint32_t slot)
-{
+static bool erase(uint32_t slot) {
     const uint32_t start = SLOT_BASE + slot * SLOT_STRIDE;
     bool done = await_ready();
     NVMC_CONFIG = NVMC_CONFIG_ERASE;
@@ -38,8 +36,7 @@ static bool erase(uint32_t slot)
     return done;
 }
 
-static bool program(const uint8_t *place, uint32_t word)
-{
+static bool program(const uint8_t *place, uint32_t word) {
     volatile uint32_t *const to = (volatile uint32_t *)(uintptr_t)place;
     NVMC_CONFIG = NVMC_CONFIG_WRITE;
     *to = word;

@@ -16,25 +16,22 @@
 
 static reset_cause_t reset_cause;
 
-static void board_sleep(void)
-{
+static void board_sleep(void) {
     __asm__ volatile("wfi" : : : "memory");
 }
 
-static void board_tell(selfcal_module_t *told)
-{
+static void board_tell(selfcal_module_t *told) {
     told->reset_cause = (uint32_t)reset_cause;
     told->clock = (CLOCK_HFCLKSTAT & CLOCK_HFCLKSTAT_CRYSTAL) != 0U ? 1U : 2U;
     uart_tell(told);
 }
 
 static const module_board_t board_calls = {
-    &spi_bus,    &flash_memory, BOARD_REPORT_MS, clock_ms,   clock_ms,    uart_send, uart_sent,
-    uart_poll,   board_sleep,   watchdog_feed,   board_tell, rng_number,  board_reset,
+    &spi_bus,  &flash_memory, BOARD_REPORT_MS, clock_ms,   clock_ms,   uart_send,   uart_sent,
+    uart_poll, board_sleep,   watchdog_feed,   board_tell, rng_number, board_reset,
 };
 
-int main(void)
-{
+int main(void) {
     reset_cause = board_reset_cause();
     clock_init();
     irq_on();

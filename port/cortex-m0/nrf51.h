@@ -97,7 +97,7 @@ enum { NVMC_PAGE_BYTES = 1024 };
 #define SPI0_FREQUENCY REG32(0x40003524U)
 #define SPI0_FREQUENCY_K125 0x02000000U /* twice the value is twice the frequency, up to 8 MHz */
 #define SPI0_CONFIG REG32(0x40003554U)
-#define SPI0_CONFIG_MODE(mode) (((mode)&1U) << 1 | ((mode)&2U) << 1)
+#define SPI0_CONFIG_MODE(mode) (((mode) & 1U) << 1 | ((mode) & 2U) << 1)
 
 /* UART */
 #define UART0_STARTRX REG32(0x40002000U)
@@ -121,18 +121,15 @@ enum { NVMC_PAGE_BYTES = 1024 };
 
 enum { IRQ_UART0 = 2, IRQ_SPI0 = 3, IRQ_GPIOTE = 6, IRQ_TIMER0 = 8, IRQ_COUNT = 26 };
 
-static inline void irq_enable(uint32_t number)
-{
+static inline void irq_enable(uint32_t number) {
     NVIC_ISER = BIT(number);
 }
 
-static inline void irq_off(void)
-{
+static inline void irq_off(void) {
     __asm__ volatile("cpsid i" : : : "memory");
 }
 
-static inline void irq_on(void)
-{
+static inline void irq_on(void) {
     __asm__ volatile("cpsie i" : : : "memory");
 }
 

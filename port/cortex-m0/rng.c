@@ -4,8 +4,7 @@
 
 enum { BYTE_US = 5000 };
 
-bool rng_number(uint32_t *number)
-{
+bool rng_number(uint32_t *number) {
     uint32_t all = 0;
     RNG_CONFIG = RNG_CONFIG_UNBIASED;
     RNG_VALRDY = 0U;

@@ -13,8 +13,7 @@ static uint8_t *coming_in;
 static volatile uint16_t to_go, sent, received;
 static uint8_t stall_us;
 
-static void select_sensor(bool on)
-{
+static void select_sensor(bool on) {
     if (on) {
         GPIO_OUTCLR = BIT(PIN_CS);
     } else {
@@ -22,14 +21,12 @@ static void select_sensor(bool on)
     }
 }
 
-static void let_go(void)
-{
+static void let_go(void) {
     select_sensor(false);
     clock_spin_us(stall_us);
 }
 
-static void reset_line(bool low)
-{
+static void reset_line(bool low) {
     if (low) {
         GPIO_OUTCLR = BIT(PIN_RESET);
     } else {
@@ -37,8 +34,7 @@ static void reset_line(bool low)
     }
 }
 
-static void open(const sensor_wire_t *wire)
-{
+static void open(const sensor_wire_t *wire) {
     stall_us = (uint8_t)wire->stall_us;
     uint32_t doublings = 0;
     while (doublings < SCK_DOUBLINGS && SCK_LEAST_HZ << (doublings + 1U) <= wire->sck_max_hz) {
@@ -68,8 +64,7 @@ static void open(const sensor_wire_t *wire)
     irq_enable(IRQ_SPI0);
 }
 
-static bool exchange_byte(uint8_t out, uint8_t *in)
-{
+static bool exchange_byte(uint8_t out, uint8_t *in) {
     SPI0_READY = 0U;
     SPI0_TXD = out;
     const uint32_t start = clock_us32();
@@ -85,8 +80,7 @@ static bool exchange_byte(uint8_t out, uint8_t *in)
 }
 
 /* Breaks off a transfer under way. */
-static void stop_transfer(void)
-{
+static void stop_transfer(void) {
     SPI0_INTENCLR = SPI0_INTEN_READY;
     select_sensor(false);
     SPI0_ENABLE = 0U; /* forgets the byte in waiting */
@@ -94,8 +88,7 @@ static void stop_transfer(void)
     SPI0_ENABLE = 1U;
 }
 
-static bool exchange(const uint8_t *out, uint8_t *in, size_t count)
-{
+static bool exchange(const uint8_t *out, uint8_t *in, size_t count) {
     stop_transfer();
     select_sensor(true);
     bool done = true;
@@ -106,16 +99,14 @@ static bool exchange(const uint8_t *out, uint8_t *in, size_t count)
     return done;
 }
 
-static void send_next(void)
-{
+static void send_next(void) {
     if (sent < to_go) {
         SPI0_TXD = going_out[sent];
         sent++;
     }
 }
 
-static bool begin(const uint8_t *out, uint8_t *in, size_t count)
-{
+static bool begin(const uint8_t *out, uint8_t *in, size_t count) {
     stop_transfer();
     going_out = out;
     coming_in = in;
@@ -130,8 +121,7 @@ static bool begin(const uint8_t *out, uint8_t *in, size_t count)
 
 const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line};
 
-void spi_handler(void)
-{
+void spi_handler(void) {
     if (SPI0_READY == 0U) {
         return; /* still pending from a transfer that stop_transfer() broke off */
     }
@@ -147,8 +137,7 @@ void spi_handler(void)
     }
 }
 
-void ready_handler(void)
-{
+void ready_handler(void) {
     GPIOTE_IN0 = 0U;
     readings_ready();
 }

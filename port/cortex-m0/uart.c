@@ -7,8 +7,7 @@ static volatile uint8_t out[256], in[64];
 static slcan_line_t line = SLCAN_LINE(out, in);
 static volatile bool sending;
 
-void uart_init(void)
-{
+void uart_init(void) {
     GPIO_OUTSET = BIT(PIN_TX);
     GPIO_PIN_CNF(PIN_TX) = GPIO_OUTPUT;
     GPIO_PIN_CNF(PIN_RX) = GPIO_INPUT | GPIO_PULL_UP; /* an open line is idle */
@@ -23,8 +22,7 @@ void uart_init(void)
 }
 
 /* The next byte into the transmitter, if there is one. With the UART's interrupt kept out. */
-static void send_next(void)
-{
+static void send_next(void) {
     uint8_t byte;
     sending = slcan_line_next(&line, &byte);
     if (sending) {
@@ -32,8 +30,7 @@ static void send_next(void)
     }
 }
 
-static void start(void)
-{
+static void start(void) {
     irq_off();
     if (!sending) {
         send_next();
@@ -41,15 +38,13 @@ static void start(void)
     irq_on();
 }
 
-bool uart_send(const selfcal_frame_t *frame)
-{
+bool uart_send(const selfcal_frame_t *frame) {
     const bool taken = slcan_line_send(&line, frame);
     start();
     return taken;
 }
 
-void uart_poll(void)
-{
+void uart_poll(void) {
     while (slcan_line_poll(&line)) {
 #ifdef APP_COMMAND_KEY
         module_command(line.slcan.data);
@@ -58,19 +53,16 @@ void uart_poll(void)
     start();
 }
 
-bool uart_sent(void)
-{
+bool uart_sent(void) {
     return !sending;
 }
 
-void uart_tell(selfcal_module_t *told)
-{
+void uart_tell(selfcal_module_t *told) {
     told->frames_dropped = line.dropped;
     told->bus_off_count = line.lost;
 }
 
-void uart_handler(void)
-{
+void uart_handler(void) {
     if (UART0_ERROR != 0U) {
         UART0_ERROR = 0U;
         UART0_ERRORSRC = UART0_ERRORSRC; /* ones clear it */

@@ -22,8 +22,7 @@
 /* 135 bits at 500 kbit/s: a frame of 8 bytes with every stuff bit, and the gap after it. */
 enum { FRAME_NS = 270000, SLACK_NS = 1000000, SECOND_NS = 1000000000 };
 
-static const char *open_group(can_t *can, const char *group, const char *port)
-{
+static const char *open_group(can_t *can, const char *group, const char *port) {
     struct sockaddr_in to = {.sin_family = AF_INET};
     char *end;
     const long number = strtol(port, &end, 10);
@@ -42,8 +41,7 @@ static const char *open_group(can_t *can, const char *group, const char *port)
     return NULL;
 }
 
-static const char *open_device(can_t *can, const char *name)
-{
+static const char *open_device(can_t *can, const char *name) {
 #ifdef __linux__
     struct ifreq device;
     memset(&device, 0, sizeof device);
@@ -70,8 +68,7 @@ static const char *open_device(can_t *can, const char *name)
 #endif
 }
 
-const char *can_open(can_t *can, const char *bus, int timeout_ms)
-{
+const char *can_open(can_t *can, const char *bus, int timeout_ms) {
     char group[sizeof "255.255.255.255"];
     memset(can, 0, sizeof *can);
     can->timeout_ms = timeout_ms;
@@ -90,8 +87,7 @@ const char *can_open(can_t *can, const char *bus, int timeout_ms)
 }
 
 /* Nanoseconds from `from` to `to`; a second at most either way. */
-static long between(const struct timespec *from, const struct timespec *to)
-{
+static long between(const struct timespec *from, const struct timespec *to) {
     const long long seconds = (long long)to->tv_sec - (long long)from->tv_sec;
     return seconds > 1    ? SECOND_NS
            : seconds < -1 ? -SECOND_NS
@@ -99,8 +95,7 @@ static long between(const struct timespec *from, const struct timespec *to)
 }
 
 /* Waits until the frames before have passed, give or take a millisecond: sleeps are coarser than frames. */
-static void await_bus(can_t *can)
-{
+static void await_bus(can_t *can) {
     struct timespec now;
     (void)clock_gettime(CLOCK_MONOTONIC, &now);
     const long ahead = between(&now, &can->due);
@@ -118,10 +113,11 @@ static void await_bus(can_t *can)
 }
 
 /* As python-can's udp_multicast packs a frame: a msgpack map of its fields. */
-static size_t pack(const selfcal_frame_t *frame, unsigned char bytes[64])
-{
+static size_t pack(const selfcal_frame_t *frame, unsigned char bytes[64]) {
+    /* clang-format off */
     static const unsigned char head[] = "\x84\xAE" "arbitration_id" "\xCD";
     static const unsigned char body[] = "\xAE" "is_extended_id" "\xC2\xA3" "dlc" "\x08\xA4" "data" "\xC4\x08";
+    /* clang-format on */
     size_t at = sizeof head - 1U;
     memcpy(bytes, head, at);
     bytes[at++] = (unsigned char)(frame->id >> 8);
@@ -132,8 +128,7 @@ static size_t pack(const selfcal_frame_t *frame, unsigned char bytes[64])
     return at + sizeof frame->data;
 }
 
-void can_send(can_t *can, const selfcal_frame_t *frame)
-{
+void can_send(can_t *can, const selfcal_frame_t *frame) {
     unsigned char packed[64];
     const void *bytes = packed;
     size_t length = 0;

@@ -38,7 +38,7 @@ enum { ROWS_BETWEEN_POLLS = 1024 };
 typedef struct {
     FILE *file;
     replay_t replay;
-    double speed;     /* times real time; 0: as fast as it goes */
+    double speed;          /* times real time; 0: as fast as it goes */
     struct timespec start; /* when the channel was opened, and what had passed then */
     uint64_t passed_at_start;
     uint32_t unpolled;
@@ -48,26 +48,22 @@ typedef struct {
     can_t can;
 } host_t;
 
-static bool host_read(void *context, void *bytes, size_t count)
-{
+static bool host_read(void *context, void *bytes, size_t count) {
     const host_t *host = context;
     return fread(bytes, count, 1, host->file) == 1;
 }
 
-static uint32_t host_time_ms(void *context)
-{
+static uint32_t host_time_ms(void *context) {
     const host_t *host = context;
     return host->replay.time_ms;
 }
 
-static port_sample_t host_sample(void *context, float reading[], uint32_t *missing)
-{
+static port_sample_t host_sample(void *context, float reading[], uint32_t *missing) {
     host_t *host = context;
     return replay_sample(&host->replay, reading, missing);
 }
 
-static bool host_send(void *context, const selfcal_frame_t *frame)
-{
+static bool host_send(void *context, const selfcal_frame_t *frame) {
     host_t *host = context;
     if (host->on_can) {
         can_send(&host->can, frame);
@@ -78,8 +74,7 @@ static bool host_send(void *context, const selfcal_frame_t *frame)
 }
 
 /* Milliseconds until the recording's clock is due on the wall. */
-static int wall_wait_ms(const host_t *host)
-{
+static int wall_wait_ms(const host_t *host) {
     struct timespec now;
     (void)clock_gettime(CLOCK_MONOTONIC, &now);
     const double wall = (double)(now.tv_sec - host->start.tv_sec) + 1e-9 * (double)(now.tv_nsec - host->start.tv_nsec);
@@ -89,14 +84,12 @@ static int wall_wait_ms(const host_t *host)
 }
 
 /* Why the wire is of no more use; NULL while it works. */
-static const char *wire_error(const host_t *host)
-{
+static const char *wire_error(const host_t *host) {
     return host->on_can ? host->can.error : host->pty.error;
 }
 
 /* Waits, on a pseudo-terminal for commands. */
-static void wait_on_wire(host_t *host, int wait_ms)
-{
+static void wait_on_wire(host_t *host, int wait_ms) {
     if (host->on_can) {
         (void)poll(NULL, 0, wait_ms);
     } else {
@@ -105,8 +98,7 @@ static void wait_on_wire(host_t *host, int wait_ms)
 }
 
 /* The application has nothing to do: time goes on by one row. */
-static void host_idle(void *context)
-{
+static void host_idle(void *context) {
     host_t *host = context;
     if (!host->on_can && (host->pty.pending > 0 || ++host->unpolled >= ROWS_BETWEEN_POLLS)) {
         host->unpolled = 0;
@@ -124,8 +116,7 @@ static void host_idle(void *context)
     }
 }
 
-static const char *open_recording(host_t *host, const char *path)
-{
+static const char *open_recording(host_t *host, const char *path) {
     host->file = fopen(path, "rb");
     if (host->file == NULL) {
         return strerror(errno);
@@ -135,15 +126,13 @@ static const char *open_recording(host_t *host, const char *path)
     return replay_open(&host->replay);
 }
 
-static void start_clock(host_t *host)
-{
+static void start_clock(host_t *host) {
     (void)clock_gettime(CLOCK_MONOTONIC, &host->start);
     host->passed_at_start = host->replay.passed;
 }
 
 /* Waits until the channel is open, or closed; false if the host went away or let the timeout pass. */
-static bool await_channel(host_t *host, bool open)
-{
+static bool await_channel(host_t *host, bool open) {
     while (host->pty.error == NULL && host->pty.slcan.open != open) {
         if (!pty_receive(&host->pty, host->pty.timeout_ms)) {
             host->pty.error = open ? "the host did not open the channel" : "the host did not close the channel";
@@ -154,22 +143,19 @@ static bool await_channel(host_t *host, bool open)
     return host->pty.error == NULL;
 }
 
-static bool positive(const char *text, double *value)
-{
+static bool positive(const char *text, double *value) {
     char *end;
     *value = strtod(text, &end);
     return end != text && *end == '\0' && *value > 0.0 && *value < 1e6;
 }
 
-static bool node_number(const char *text, long *node)
-{
+static bool node_number(const char *text, long *node) {
     char *end;
     *node = strtol(text, &end, 10);
     return end != text && *end == '\0' && *node >= 0 && *node < (long)SELFCAL_FRAME_NODES;
 }
 
-static int fail(int code, const char *subject, const char *what)
-{
+static int fail(int code, const char *subject, const char *what) {
     (void)fprintf(stderr, "selfcal-posix: %s: %s\n", subject, what);
     return code;
 }
@@ -183,8 +169,7 @@ typedef struct {
 } options_t;
 
 /* 0, or the exit code after a complaint. */
-static int parse(options_t *options, int argc, char **argv)
-{
+static int parse(options_t *options, int argc, char **argv) {
     for (int i = 1; i < argc; i++) {
         double *number = strcmp(argv[i], "--report-every") == 0 ? &options->report_every_s
                          : strcmp(argv[i], "--realtime") == 0   ? &options->speed
@@ -218,8 +203,7 @@ static int parse(options_t *options, int argc, char **argv)
 }
 
 /* Waits for the end of the standard input, whatever the program waits for meanwhile. */
-static void *hold_leash(void *unused)
-{
+static void *hold_leash(void *unused) {
     char byte;
     ssize_t got = 0;
     do {
@@ -229,8 +213,7 @@ static void *hold_leash(void *unused)
     return unused;
 }
 
-static int run_on_can(host_t *host, app_t *app, const options_t *options)
-{
+static int run_on_can(host_t *host, app_t *app, const options_t *options) {
     bool more = true;
     host->on_can = true;
     const char *error = can_open(&host->can, options->bus, (int)(options->timeout_s * 1000.0));
@@ -249,8 +232,7 @@ static int run_on_can(host_t *host, app_t *app, const options_t *options)
     return host->can.error != NULL ? fail(1, options->bus, host->can.error) : 0;
 }
 
-static int run_on_pty(host_t *host, app_t *app, const options_t *options)
-{
+static int run_on_pty(host_t *host, app_t *app, const options_t *options) {
     bool more = true;
     const char *device = pty_open(&host->pty, (int)(options->timeout_s * 1000.0), options->stay);
     if (device == NULL) {
@@ -272,8 +254,7 @@ static int run_on_pty(host_t *host, app_t *app, const options_t *options)
     return await_channel(host, false) || host->pty.hung_up ? 0 : fail(1, device, host->pty.error);
 }
 
-int main(int argc, char **argv)
-{
+int main(int argc, char **argv) {
     static host_t host;
     static app_t app;
     const port_t port = {&host, host_time_ms, host_sample, host_send, host_idle};

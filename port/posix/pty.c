@@ -12,8 +12,7 @@
 #include <unistd.h>
 
 /* Opens the slave, raw, for the program itself; false with errno set. */
-static bool hold(pty_t *pty)
-{
+static bool hold(pty_t *pty) {
     struct termios mode;
     pty->slave = open(pty->path, O_RDWR | O_NOCTTY);
     if (pty->slave < 0 || tcgetattr(pty->slave, &mode) != 0) {
@@ -23,8 +22,7 @@ static bool hold(pty_t *pty)
     return tcsetattr(pty->slave, TCSANOW, &mode) == 0;
 }
 
-const char *pty_open(pty_t *pty, int timeout_ms, bool stay)
-{
+const char *pty_open(pty_t *pty, int timeout_ms, bool stay) {
     memset(pty, 0, sizeof *pty);
     pty->timeout_ms = timeout_ms;
     pty->stay = stay;
@@ -41,8 +39,7 @@ const char *pty_open(pty_t *pty, int timeout_ms, bool stay)
     return hold(pty) && fcntl(pty->master, F_SETFL, O_NONBLOCK) == 0 ? pty->path : NULL;
 }
 
-static void hang_up(pty_t *pty)
-{
+static void hang_up(pty_t *pty) {
     if (pty->stay) {
         slcan_init(&pty->slcan);
         pty->pending = 0;
@@ -53,8 +50,7 @@ static void hang_up(pty_t *pty)
     pty->error = "the host hung up";
 }
 
-static void read_commands(pty_t *pty)
-{
+static void read_commands(pty_t *pty) {
     unsigned char bytes[256];
     const ssize_t got = read(pty->master, bytes, sizeof bytes);
     if (got < 0 && (errno == EAGAIN || errno == EINTR)) {
@@ -79,8 +75,7 @@ static void read_commands(pty_t *pty)
 }
 
 /* Waits for input, or for room to write; false on a timeout. */
-static bool wait_line(pty_t *pty, short events, int wait_ms)
-{
+static bool wait_line(pty_t *pty, short events, int wait_ms) {
     struct pollfd line = {.fd = pty->master, .events = events, .revents = 0};
     const int ready = poll(&line, 1, wait_ms);
     if (ready < 0) {
@@ -97,8 +92,7 @@ static bool wait_line(pty_t *pty, short events, int wait_ms)
     return ready > 0;
 }
 
-void pty_flush(pty_t *pty)
-{
+void pty_flush(pty_t *pty) {
     while (pty->pending > 0 && pty->error == NULL) {
         const ssize_t written = write(pty->master, pty->out, pty->pending);
         if (written > 0) {
@@ -112,15 +106,13 @@ void pty_flush(pty_t *pty)
     }
 }
 
-bool pty_receive(pty_t *pty, int wait_ms)
-{
+bool pty_receive(pty_t *pty, int wait_ms) {
     const bool came = wait_line(pty, POLLIN, wait_ms);
     pty_flush(pty);
     return came;
 }
 
-void pty_send(pty_t *pty, const selfcal_frame_t *frame)
-{
+void pty_send(pty_t *pty, const selfcal_frame_t *frame) {
     if (!pty->slcan.open) {
         return;
     }

@@ -30,8 +30,7 @@ typedef struct {
 static board_t board;
 static app_t app;
 
-static bool board_read(void *context, void *bytes, size_t count)
-{
+static bool board_read(void *context, void *bytes, size_t count) {
     board_t *self = context;
     unsigned char *to = bytes;
     while (count > 0U) {
@@ -52,20 +51,17 @@ static bool board_read(void *context, void *bytes, size_t count)
     return true;
 }
 
-static uint32_t board_time_ms(void *context)
-{
+static uint32_t board_time_ms(void *context) {
     const board_t *self = context;
     return self->replay.time_ms;
 }
 
-static port_sample_t board_sample(void *context, float reading[], uint32_t *missing)
-{
+static port_sample_t board_sample(void *context, float reading[], uint32_t *missing) {
     board_t *self = context;
     return replay_sample(&self->replay, reading, missing);
 }
 
-static bool board_send(void *context, const selfcal_frame_t *frame)
-{
+static bool board_send(void *context, const selfcal_frame_t *frame) {
     const board_t *self = context;
     if (self->slcan.open) {
         char line[SLCAN_FRAME_BYTES];
@@ -75,8 +71,7 @@ static bool board_send(void *context, const selfcal_frame_t *frame)
     return true;
 }
 
-static void answer_host(board_t *self)
-{
+static void answer_host(board_t *self) {
     uint8_t byte;
     while (uart_receive(&byte)) {
         char answer[SLCAN_ANSWER_BYTES];
@@ -85,8 +80,7 @@ static void answer_host(board_t *self)
 }
 
 /* The application has nothing to do: time goes on by one row. */
-static void board_idle(void *context)
-{
+static void board_idle(void *context) {
     board_t *self = context;
     if (++self->unpolled >= ROWS_BETWEEN_POLLS) {
         self->unpolled = 0;
@@ -98,8 +92,7 @@ static void board_idle(void *context)
 }
 
 /* False if the host lets TIMEOUT_S of wall time pass. */
-static bool await_channel(board_t *self, bool open)
-{
+static bool await_channel(board_t *self, bool open) {
     if (self->slcan.open != open) {
         const uint32_t start = semihost_wall_s();
         do {
@@ -110,8 +103,7 @@ static bool await_channel(board_t *self, bool open)
 }
 
 /* The recording's path and the period out of the command line; false if they are not there. */
-static bool arguments(char *line, const char **path, uint32_t *period_ms, bool *gate)
-{
+static bool arguments(char *line, const char **path, uint32_t *period_ms, bool *gate) {
     char *const file = strchr(line, ' ');
     char *const period = file != NULL ? strchr(file + 1, ' ') : NULL;
     if (period == NULL) {
@@ -128,8 +120,7 @@ static bool arguments(char *line, const char **path, uint32_t *period_ms, bool *
     return *period_ms > 0U && (*gate || *digit == '\0');
 }
 
-static int fail(int code, const char *subject, const char *what)
-{
+static int fail(int code, const char *subject, const char *what) {
     semihost_print(subject);
     semihost_print(": ");
     semihost_print(what);
@@ -137,8 +128,7 @@ static int fail(int code, const char *subject, const char *what)
     return code;
 }
 
-int main(void)
-{
+int main(void) {
     static char line[256];
     const port_t port = {&board, board_time_ms, board_sample, board_send, board_idle};
     const char *path = NULL;

@@ -5,8 +5,7 @@ extern uint32_t link_stack[], link_data_load[], link_data[], link_data_end[], li
 
 int main(void);
 
-static void unexpected(void)
-{
+static void unexpected(void) {
     semihost_print("the processor faulted\n");
     semihost_exit(3U);
 }
@@ -15,8 +14,7 @@ static void unexpected(void)
 /* How deep the stack went, said at the end: what the bound from the call graph is held against. */
 #define UNTOUCHED 0x5AFE57ACU
 
-static void print_stack(uint32_t bytes)
-{
+static void print_stack(uint32_t bytes) {
     char text[] = "stack 0000\n";
     for (int at = 9; at >= 6; at--) {
         text[at] = (char)('0' + (int)(bytes % 10U));
@@ -27,8 +25,7 @@ static void print_stack(uint32_t bytes)
 #endif
 
 void startup(void);
-void startup(void)
-{
+void startup(void) {
 #ifdef __ARM_FP
     volatile uint32_t *const cpacr = (volatile uint32_t *)0xE000ED88U;
     *cpacr |= 0xFU << 20; /* the FPU, before anything may touch it */
@@ -62,9 +59,11 @@ typedef union {
     void (*call)(void);
 } vector_t;
 
+/* clang-format off */
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16] = {
     {.stack = link_stack},  {.call = startup},      {.call = unexpected},   {.call = unexpected},
     {.call = unexpected},   {.call = unexpected},   {.call = unexpected},   {.stack = 0},
     {.stack = 0},           {.stack = 0},           {.stack = 0},           {.call = unexpected},
     {.call = unexpected},   {.stack = 0},           {.call = unexpected},   {.call = unexpected},
 };
+/* clang-format on */

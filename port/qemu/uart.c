@@ -15,13 +15,11 @@
 #define USART_CR1_TE BIT(3)
 #define USART_CR1_UE BIT(13)
 
-void uart_start(void)
-{
+void uart_start(void) {
     USART1_CR1 = USART_CR1_UE | USART_CR1_TE | USART_CR1_RE;
 }
 
-bool uart_receive(uint8_t *byte)
-{
+bool uart_receive(uint8_t *byte) {
     if ((USART1_SR & USART_SR_RXNE) == 0U) {
         return false;
     }
@@ -29,8 +27,7 @@ bool uart_receive(uint8_t *byte)
     return true;
 }
 
-static void send_byte(uint8_t byte)
-{
+static void send_byte(uint8_t byte) {
     while ((USART1_SR & USART_SR_TXE) == 0U) {
     }
     USART1_DR = byte;
@@ -48,15 +45,13 @@ static void send_byte(uint8_t byte)
 #define UART_TXD REG32(0x4000251CU)
 #define UART_ENABLED 4U
 
-void uart_start(void)
-{
+void uart_start(void) {
     UART_ENABLE = UART_ENABLED;
     UART_STARTTX = 1U;
     UART_STARTRX = 1U;
 }
 
-bool uart_receive(uint8_t *byte)
-{
+bool uart_receive(uint8_t *byte) {
     if (UART_RXDRDY == 0U) {
         return false;
     }
@@ -65,8 +60,7 @@ bool uart_receive(uint8_t *byte)
     return true;
 }
 
-static void send_byte(uint8_t byte)
-{
+static void send_byte(uint8_t byte) {
     UART_TXDRDY = 0U;
     UART_TXD = byte;
     while (UART_TXDRDY == 0U) {
@@ -77,8 +71,7 @@ static void send_byte(uint8_t byte)
 #error "no emulated board chosen"
 #endif
 
-void uart_send(const char *bytes, size_t count)
-{
+void uart_send(const char *bytes, size_t count) {
     for (size_t i = 0; i < count; i++) {
         send_byte((uint8_t)bytes[i]);
     }

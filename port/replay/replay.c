@@ -4,18 +4,15 @@
 
 enum { HEADER_BYTES = 40 };
 
-static uint32_t little32(const unsigned char *bytes)
-{
+static uint32_t little32(const unsigned char *bytes) {
     return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
 }
 
-static uint64_t little64(const unsigned char *bytes)
-{
+static uint64_t little64(const unsigned char *bytes) {
     return little32(bytes) | (uint64_t)little32(bytes + 4) << 32;
 }
 
-const char *replay_open(replay_t *replay)
-{
+const char *replay_open(replay_t *replay) {
     unsigned char header[HEADER_BYTES];
     if (!replay->read(replay->context, header, sizeof header) || memcmp(header, "SELFCAL2", 8) != 0) {
         return "not a recording for this program";
@@ -37,8 +34,7 @@ const char *replay_open(replay_t *replay)
     return NULL;
 }
 
-const char *replay_next(replay_t *replay)
-{
+const char *replay_next(replay_t *replay) {
     if (replay->waiting || replay->rows == 0) {
         return NULL;
     }
@@ -52,8 +48,7 @@ const char *replay_next(replay_t *replay)
     return NULL;
 }
 
-port_sample_t replay_sample(replay_t *replay, float reading[], uint32_t *missing)
-{
+port_sample_t replay_sample(replay_t *replay, float reading[], uint32_t *missing) {
     if (!replay->waiting) {
         return replay->rows == 0 ? PORT_END : PORT_EMPTY;
     }

@@ -22,11 +22,11 @@ typedef struct {
     bool (*read)(void *context, void *bytes, size_t count); /* exactly `count` bytes; false: there are not so many */
     void *context;
     double rate_hz;
-    uint64_t rows;     /* still to read */
-    uint64_t powered;  /* samples from power-on to the first row */
-    uint64_t passed;   /* samples since the start of the recording, missing ones too: its clock */
-    uint32_t time_ms;  /* the same, modulo 2^32 */
-    bool waiting;      /* `row` is read and due */
+    uint64_t rows;    /* still to read */
+    uint64_t powered; /* samples from power-on to the first row */
+    uint64_t passed;  /* samples since the start of the recording, missing ones too: its clock */
+    uint32_t time_ms; /* the same, modulo 2^32 */
+    bool waiting;     /* `row` is read and due */
     unsigned char row[REPLAY_ROW_BYTES];
 } replay_t;
 

@@ -49,7 +49,7 @@ enum { EXCUSES = 100, MARKS_REFUSED = 5 };
 
 enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor that is stuck still gives none */
 #define RESET_PULSE_US 1000U
-#define START_US 300000U      /* the data sheet: 220 ms from power, 170 ms from a reset */
+#define START_US 300000U /* the data sheet: 220 ms from power, 170 ms from a reset */
 #define SELF_TEST_US 200000U
 /* Samples further apart than this and 1.5 periods, or closer than 3/4 of one: something else may have reset the
  * sensor, which takes 170 ms and leaves a rate of its own. What follows is taken once the settings have been found
@@ -61,7 +61,7 @@ enum { CHANGES_ASKED = 2 }; /* after a start, before a sample is taken: a sensor
 #define CHECK_US 10000000U
 #define CHECK_ROOM_US 250U
 enum { CHECKS_TRIED = 3 };
-#define DIAGNOSIS_US 100000U  /* between readings of DIAG_STAT, at least */
+#define DIAGNOSIS_US 100000U /* between readings of DIAG_STAT, at least */
 /* Readings in a row that may be an eighth of a period or more from where the rate that was set has one. Further ones
  * are not taken: the sensor's clock is another. After a start none is taken before one that is in its place. Steps
  * beyond two periods and a half tell nothing: the 5 % that the clock may be off add up. */
@@ -93,19 +93,19 @@ typedef struct {
     uint32_t period_q8;        /* sample period, us / 256 */
     uint32_t nominal_q8;
     volatile bool diagnosis_wanted;
-    uint64_t diagnosis_us;     /* when DIAG_STAT was read last */
+    uint64_t diagnosis_us; /* when DIAG_STAT was read last */
     /* main loop, of the samples */
-    uint64_t seen_us;          /* stamp of the last reading taken from the queue */
-    uint64_t checked_us;       /* when the settings were read last */
-    uint64_t last_us;          /* stamp of the last sample delivered */
-    bool doubtful;             /* none is delivered until the settings have been found to stand */
+    uint64_t seen_us;    /* stamp of the last reading taken from the queue */
+    uint64_t checked_us; /* when the settings were read last */
+    uint64_t last_us;    /* stamp of the last sample delivered */
+    bool doubtful;       /* none is delivered until the settings have been found to stand */
     bool anchored;
-    uint64_t anchored_us;      /* stamp of `common.last` */
-    uint8_t unsure;            /* readings in a row that could be negative ones less their sign */
-    uint8_t excuses;           /* readings of DIAG_STAT in a row that say over-range */
-    uint8_t marks;             /* resets that left MARK */
-    bool based;                /* `base` is known */
-    uint32_t off_rate;         /* readings in a row that came no whole number of periods after the one before */
+    uint64_t anchored_us; /* stamp of `common.last` */
+    uint8_t unsure;       /* readings in a row that could be negative ones less their sign */
+    uint8_t excuses;      /* readings of DIAG_STAT in a row that say over-range */
+    uint8_t marks;        /* resets that left MARK */
+    bool based;           /* `base` is known */
+    uint32_t off_rate;    /* readings in a row that came no whole number of periods after the one before */
     uint8_t unproven;
     volatile uint16_t side[SENSOR_SIDE]; /* as read; 0: none yet */
     /* shared with the interrupt handlers */
@@ -121,13 +121,11 @@ typedef struct {
     } queue[SENSOR_QUEUE];
 } adis16405_t;
 
-static adis16405_t *of(sensor_state_t *state)
-{
+static adis16405_t *of(sensor_state_t *state) {
     return (adis16405_t *)(void *)state;
 }
 
-static bool word(adis16405_t *self, uint8_t high, uint8_t low, uint16_t *value)
-{
+static bool word(adis16405_t *self, uint8_t high, uint8_t low, uint16_t *value) {
     const uint8_t out[2] = {high, low};
     uint8_t in[2] = {0};
     const bool done = self->common.bus->exchange(out, in, sizeof out);
@@ -135,26 +133,22 @@ static bool word(adis16405_t *self, uint8_t high, uint8_t low, uint16_t *value)
     return done;
 }
 
-static bool read_register(adis16405_t *self, uint8_t address, uint16_t *value)
-{
+static bool read_register(adis16405_t *self, uint8_t address, uint16_t *value) {
     return word(self, address, 0U, value) && word(self, 0U, 0U, value);
 }
 
 /* Twice, and alike: a register has no checksum either. */
-static bool read_surely(adis16405_t *self, uint8_t address, uint16_t *value)
-{
+static bool read_surely(adis16405_t *self, uint8_t address, uint16_t *value) {
     uint16_t again;
     return read_register(self, address, value) && read_register(self, address, &again) && *value == again;
 }
 
-static bool write_byte(adis16405_t *self, uint8_t address, uint16_t value)
-{
+static bool write_byte(adis16405_t *self, uint8_t address, uint16_t value) {
     uint16_t ignored;
     return word(self, WRITE | address, (uint8_t)value, &ignored);
 }
 
-static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
-{
+static bool write_register(adis16405_t *self, uint8_t address, uint16_t value) {
     uint16_t found;
     return write_byte(self, address, value) && write_byte(self, (uint8_t)(address + 1U), (uint16_t)(value >> 8)) &&
            read_surely(self, address, &found) && found == value;
@@ -162,16 +156,14 @@ static bool write_register(adis16405_t *self, uint8_t address, uint16_t value)
 
 /* Bits of an offset register: 13 of 0.0125 deg/s, 12 of 3.33 mg, two's complement. */
 enum { GYRO_OFFSET_LIMIT = 4096, ACCEL_OFFSET_LIMIT = 2048 };
-static int32_t offset_limit(size_t channel)
-{
+static int32_t offset_limit(size_t channel) {
     return channel < 3U ? GYRO_OFFSET_LIMIT : ACCEL_OFFSET_LIMIT;
 }
 
 /* Whether the settings are those of the start: GOOD if so, ALTERED if one read twice alike is not. */
 typedef enum { UNSURE, GOOD, ALTERED } settings_t;
 
-static settings_t settings(adis16405_t *self)
-{
+static settings_t settings(adis16405_t *self) {
     static const uint8_t address[] = {SMPL_PRD, SENS_AVG, MSC_CTRL, ALM_MAG1};
     enum { COUNT = sizeof address };
     const uint16_t wanted[COUNT] = {self->sample_period, FILTER, MSC_CTRL_READY, MARK};
@@ -195,14 +187,12 @@ static settings_t settings(adis16405_t *self)
 }
 
 /* As a signed number; the bits above are not used. */
-static int16_t offset_value(size_t channel, uint16_t word)
-{
+static int16_t offset_value(size_t channel, uint16_t word) {
     const int32_t limit = offset_limit(channel), value = (int32_t)(word & (2U * (uint32_t)limit - 1U));
     return (int16_t)(value >= limit ? value - 2 * limit : value);
 }
 
-static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
-{
+static bool write_offset(adis16405_t *self, size_t channel, int32_t value) {
     const uint8_t address = (uint8_t)(XGYRO_OFF + 2U * channel);
     const uint16_t word = (uint16_t)(value & 0xFFFF);
     uint16_t found;
@@ -214,8 +204,7 @@ static bool write_offset(adis16405_t *self, size_t channel, int32_t value)
  * (the anomaly): it is taken for 0, and the bank finds so much more bias. With MARK the reset did not come about,
  * and the registers hold what was added before; a part with MARK in its own flash, improbable as it is, must not be
  * refused for ever. */
-static bool restore_offsets(adis16405_t *self)
-{
+static bool restore_offsets(adis16405_t *self) {
     uint16_t word;
     if (!read_surely(self, ALM_MAG1, &word)) {
         return false;
@@ -254,8 +243,7 @@ static bool restore_offsets(adis16405_t *self)
     return true;
 }
 
-static bool init(sensor_state_t *state, float rate_hz, sensor_wire_t *wire)
-{
+static bool init(sensor_state_t *state, float rate_hz, sensor_wire_t *wire) {
     adis16405_t *self = of(state);
     if (!adis16405_has_rate(rate_hz)) {
         return false;
@@ -270,8 +258,7 @@ static bool init(sensor_state_t *state, float rate_hz, sensor_wire_t *wire)
     return true;
 }
 
-static void stop(sensor_state_t *state)
-{
+static void stop(sensor_state_t *state) {
     adis16405_t *self = of(state);
     self->listening = false;
     self->tail = self->head; /* what waits may be of a sensor that was no longer set up */
@@ -279,16 +266,14 @@ static void stop(sensor_state_t *state)
 
 /* ----------------------------------------------------------------------------------------------- interrupt handlers */
 
-static void start_burst(adis16405_t *self)
-{
+static void start_burst(adis16405_t *self) {
     self->reading = self->common.bus->begin(burst_out, self->burst_in, sizeof burst_out);
     if (!self->reading) {
         self->common.counters.damaged++;
     }
 }
 
-static void ready(sensor_state_t *state)
-{
+static void ready(sensor_state_t *state) {
     adis16405_t *self = of(state);
     const uint32_t now = state->bus->time_us32();
     state->signs++;
@@ -307,8 +292,7 @@ static void ready(sensor_state_t *state)
 }
 
 /* Whether the words of the first reading are a new sample. */
-static bool fresh(adis16405_t *self, const uint16_t words[])
-{
+static bool fresh(adis16405_t *self, const uint16_t words[]) {
     uint16_t all = 0xFFFFU, any = 0;
     for (size_t i = 0; i < SENSOR_AXES; i++) {
         all &= words[FIRST_CHANNEL + i];
@@ -326,8 +310,7 @@ static bool fresh(adis16405_t *self, const uint16_t words[])
     return true;
 }
 
-static void done(sensor_state_t *state, bool whole)
-{
+static void done(sensor_state_t *state, bool whole) {
     adis16405_t *self = of(state);
     if (!self->reading) {
         return;
@@ -381,8 +364,7 @@ static void done(sensor_state_t *state, bool whole)
 
 /* Either has 12 bits. Temperature: two's complement, 0.14 degC each, 0 at 25 degC. Supply: 2.418 mV each. If the two
  * readings of a burst differ, the value before stands. */
-static float side(const sensor_state_t *state, unsigned channel)
-{
+static float side(const sensor_state_t *state, unsigned channel) {
     const uint32_t read = ((const adis16405_t *)(const void *)state)->side[channel];
     const uint32_t value = read & 0xFFFU;
     if ((read & SIDE_READ) == 0U) {
@@ -396,8 +378,7 @@ static float side(const sensor_state_t *state, unsigned channel)
 
 /* Stops listening and waits for a reading under way, two bursts of 1.4 ms at most (slow mode); a burst that has died
  * is left. */
-static void hold(adis16405_t *self)
-{
+static void hold(adis16405_t *self) {
     const uint32_t start = self->common.bus->time_us32();
     self->listening = false;
     while (self->reading && self->common.bus->time_us32() - start < 4000U) {
@@ -405,14 +386,12 @@ static void hold(adis16405_t *self)
     self->reading = false;
 }
 
-static void listen(adis16405_t *self)
-{
+static void listen(adis16405_t *self) {
     self->second = false;
     self->listening = true;
 }
 
-static void pause(sensor_state_t *state, bool on)
-{
+static void pause(sensor_state_t *state, bool on) {
     adis16405_t *self = of(state);
     if (state->condition != SENSOR_RUNNING) {
         return;
@@ -429,8 +408,7 @@ static sensor_fault_t self_tested(sensor_state_t *state);
 
 /* With a negative XGYRO_OFF the part loses the sign bit of negative x rates (the anomaly above): it is refused. So a
  * positive x bias stays. */
-static bool offsets(sensor_state_t *state, const int16_t added[SENSOR_AXES])
-{
+static bool offsets(sensor_state_t *state, const int16_t added[SENSOR_AXES]) {
     adis16405_t *self = of(state);
     if (state->condition == SENSOR_STARTING && state->sensor->start[state->step].act == self_tested) {
         return false; /* the registers have been written for this start */
@@ -461,8 +439,7 @@ static bool offsets(sensor_state_t *state, const int16_t added[SENSOR_AXES])
 }
 
 /* Reads DIAG_STAT, which clears it; false: not readable. */
-static bool diagnose(adis16405_t *self, uint16_t *bits)
-{
+static bool diagnose(adis16405_t *self, uint16_t *bits) {
     if (!read_register(self, DIAG_STAT, bits) || *bits == 0xFFFFU) { /* floating lines */
         return false;
     }
@@ -472,27 +449,23 @@ static bool diagnose(adis16405_t *self, uint16_t *bits)
     return true;
 }
 
-static sensor_fault_t reset(sensor_state_t *state)
-{
+static sensor_fault_t reset(sensor_state_t *state) {
     (void)write_byte(of(state), GLOB_CMD, GLOB_CMD_RESET);
     state->bus->reset_line(true);
     return SENSOR_NO_FAULT;
 }
 
-static sensor_fault_t let_go(sensor_state_t *state)
-{
+static sensor_fault_t let_go(sensor_state_t *state) {
     state->bus->reset_line(false);
     return SENSOR_NO_FAULT;
 }
 
-static sensor_fault_t probe(sensor_state_t *state)
-{
+static sensor_fault_t probe(sensor_state_t *state) {
     uint16_t value;
     return read_surely(of(state), PRODUCT_ID, &value) && value == PRODUCT ? SENSOR_NO_FAULT : SENSOR_ABSENT;
 }
 
-static sensor_fault_t set_up(sensor_state_t *state)
-{
+static sensor_fault_t set_up(sensor_state_t *state) {
     adis16405_t *self = of(state);
     uint16_t ignored;
     if (!write_register(self, SMPL_PRD, self->sample_period) || !write_register(self, SENS_AVG, FILTER) ||
@@ -504,8 +477,7 @@ static sensor_fault_t set_up(sensor_state_t *state)
     return begun ? SENSOR_NO_FAULT : SENSOR_SELF_TEST;
 }
 
-static sensor_fault_t self_tested(sensor_state_t *state)
-{
+static sensor_fault_t self_tested(sensor_state_t *state) {
     adis16405_t *self = of(state);
     const uint64_t now = state->bus->time_us();
     uint16_t value;
@@ -539,8 +511,7 @@ static sensor_fault_t self_tested(sensor_state_t *state)
 }
 
 /* Looks after the settings; false: they have been altered, and the sensor is set up anew. */
-static bool look_after(adis16405_t *self, uint64_t now)
-{
+static bool look_after(adis16405_t *self, uint64_t now) {
     hold(self);
     const settings_t found = settings(self);
     listen(self);
@@ -552,8 +523,7 @@ static bool look_after(adis16405_t *self, uint64_t now)
     return found != ALTERED;
 }
 
-static void watch(sensor_state_t *state, uint64_t now)
-{
+static void watch(sensor_state_t *state, uint64_t now) {
     adis16405_t *self = of(state);
     const uint64_t unchecked = now - self->checked_us;
     const uint32_t period = state->period_us;
@@ -577,14 +547,12 @@ static void watch(sensor_state_t *state, uint64_t now)
     }
 }
 
-static bool waits(sensor_state_t *state)
-{
+static bool waits(sensor_state_t *state) {
     return of(state)->head != of(state)->tail;
 }
 
 /* XGYRO_OUT less its sign bit, judged by what went before. */
-static bool sign_lost(adis16405_t *self, int32_t x)
-{
+static bool sign_lost(adis16405_t *self, int32_t x) {
     if (self->anchored) {
         return x - self->common.last[0] >= SIGN_STEP;
     }
@@ -600,8 +568,7 @@ static bool sign_lost(adis16405_t *self, int32_t x)
 }
 
 /* Periods since the last sample, and the period itself tracked over samples that follow each other. */
-static uint32_t periods(adis16405_t *self, uint64_t stamp)
-{
+static uint32_t periods(adis16405_t *self, uint64_t stamp) {
     const uint64_t passed_q8 = (stamp - self->last_us) << 8;
     const uint64_t count = (passed_q8 + self->period_q8 / 2U) / self->period_q8;
     if (count == 1U) {
@@ -615,14 +582,12 @@ static uint32_t periods(adis16405_t *self, uint64_t stamp)
 }
 
 /* Whether `step` is an eighth of a period or more from one and from two of them. */
-static bool off_grid(uint64_t step, uint64_t period)
-{
+static bool off_grid(uint64_t step, uint64_t period) {
     const uint64_t right = 2U * step < 3U * period ? period : 2U * period;
     return 8U * (step < right ? right - step : step - right) >= period;
 }
 
-static bool read_sample(sensor_state_t *state, int32_t raw[SENSOR_AXES], uint32_t *missing)
-{
+static bool read_sample(sensor_state_t *state, int32_t raw[SENSOR_AXES], uint32_t *missing) {
     adis16405_t *self = of(state);
     while (self->tail != self->head) {
         const uint32_t tail = self->tail;

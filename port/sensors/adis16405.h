@@ -25,8 +25,8 @@
 /* True if 1638.4 / n Hz, n = 2 .. 128, make the rate to 0.1 %. Constant where the rate is. (Two bursts, 634 us, must
  * fit a sample period: no n = 1.) */
 #define ADIS16405_OFF(rate_hz) (1638.4F / (rate_hz) - (float)(uint32_t)(1638.4F / (rate_hz) + 0.5F))
-#define adis16405_has_rate(rate_hz) \
-    (1638.4F / (rate_hz) >= 1.5F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) && \
+#define adis16405_has_rate(rate_hz)                                                                                    \
+    (1638.4F / (rate_hz) >= 1.5F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) &&   \
      ADIS16405_OFF(rate_hz) >= -1.6384F / (rate_hz))
 #define adis16405_has_supply 1
 

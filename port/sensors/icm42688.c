@@ -24,13 +24,13 @@ enum { GYRO_ST_DATA = 0x5F, ACCEL_ST_DATA = 0x3B, OFFSET_USER0 = 0x77 }; /* bank
 #define READ 0x80U
 #define IDENTITY 0x47U
 #define RESET 0x01U
-#define STREAM 0x40U               /* FIFO: the oldest packet gives way */
+#define STREAM 0x40U /* FIFO: the oldest packet gives way */
 #define FLUSH 0x02U
-#define BIG_ENDIAN_NO_I2C 0x33U    /* counts in bytes */
+#define BIG_ENDIAN_NO_I2C 0x33U /* counts in bytes */
 #define BOTH_LOW_NOISE 0x0FU
-#define TIMESTAMPS 0x21U           /* 1 us, no delta, no FSYNC */
+#define TIMESTAMPS 0x21U /* 1 us, no delta, no FSYNC */
 #define PACKETS_OF_16 0x0FU
-#define PACKETS_OF_20 0x5FU        /* and a FIFO that is read in parts */
+#define PACKETS_OF_20 0x5FU /* and a FIFO that is read in parts */
 #define RATE_1KHZ 0x06U
 #define GYRO_250 (3U << 5)
 #define ACCEL_4G (2U << 5)
@@ -51,27 +51,27 @@ enum { PACKET = 20, CHUNK = 8, SHORT_PACKET = 16, FIFO_BYTES = 2048, FIFO_PACKET
 #define ACCEL_LSB_PER_G (32768.0F / 4.0F)
 #define GYRO_RESPONSE 2620.0F /* LSB of code 1; each further one 1 % more */
 #define ACCEL_RESPONSE 1310.0F
-enum { TEST_SAMPLES = 32 };   /* at least */
+enum { TEST_SAMPLES = 32 }; /* at least */
 
-#define RESET_US 2000U        /* the data sheet: 1 ms */
-#define SPIN_US 60000U        /* the data sheet: 45 ms from power-on of the gyro */
-#define STRAIN_US 200000U     /* the self-test's deflection settles */
+#define RESET_US 2000U    /* the data sheet: 1 ms */
+#define SPIN_US 60000U    /* the data sheet: 45 ms from power-on of the gyro */
+#define STRAIN_US 200000U /* the self-test's deflection settles */
 #define GATHER_US 70000U
-#define CHECK_US 10000000U    /* between readings of the settings */
-#define BLIND_US 1000000U     /* from here on the processor's clock counts: a timestamp's turns are unsure */
-enum { LEARNING = 64 };       /* samples that the period is learned from, before it is followed slowly */
+#define CHECK_US 10000000U /* between readings of the settings */
+#define BLIND_US 1000000U  /* from here on the processor's clock counts: a timestamp's turns are unsure */
+enum { LEARNING = 64 };    /* samples that the period is learned from, before it is followed slowly */
 /* Timestamps out of place in a row: the packets do not follow each other after all. */
 enum { MISMATCHES = 4 };
 
 typedef struct {
     sensor_state_t common;
-    uint64_t checked_us;        /* when the settings were read last */
-    uint64_t last_us;           /* of the last sample */
-    uint64_t read_us;           /* of the chunk */
-    uint32_t ticks_q16;         /* of a period, in timestamps / 65536 */
-    uint32_t dropped;           /* packets since the last sample, none of them good */
-    float level[SENSOR_AXES];   /* readings before the self-test */
-    int16_t temperature;        /* INT16_MIN: none yet */
+    uint64_t checked_us;      /* when the settings were read last */
+    uint64_t last_us;         /* of the last sample */
+    uint64_t read_us;         /* of the chunk */
+    uint32_t ticks_q16;       /* of a period, in timestamps / 65536 */
+    uint32_t dropped;         /* packets since the last sample, none of them good */
+    float level[SENSOR_AXES]; /* readings before the self-test */
+    int16_t temperature;      /* INT16_MIN: none yet */
     uint16_t last_stamp;
     bool anchored;              /* `last_us` is of a sample */
     bool continuous;            /* the next packet follows the last */
@@ -260,8 +260,7 @@ static bool mean(icm42688_t *self, float result[SENSOR_AXES]) {
 static sensor_fault_t prepare_test(sensor_state_t *state) {
     icm42688_t *self = of(state);
     const bool prepared =
-        read_bank(self, 1U, GYRO_ST_DATA, self->codes, 3U) &&
-        read_bank(self, 2U, ACCEL_ST_DATA, self->codes + 3, 3U) &&
+        read_bank(self, 1U, GYRO_ST_DATA, self->codes, 3U) && read_bank(self, 2U, ACCEL_ST_DATA, self->codes + 3, 3U) &&
         write_register(self, INTF_CONFIG0, BIG_ENDIAN_NO_I2C) && write_register(self, TMST_CONFIG, TIMESTAMPS) &&
         write_register(self, GYRO_CONFIG0, GYRO_250 | RATE_1KHZ) &&
         write_register(self, ACCEL_CONFIG0, ACCEL_4G | RATE_1KHZ) &&
@@ -310,11 +309,11 @@ static sensor_fault_t judge(sensor_state_t *state) {
 
 static sensor_fault_t set_up(sensor_state_t *state) {
     icm42688_t *self = of(state);
-    const bool done =
-        write_register(self, SELF_TEST_CONFIG, 0U) && write_register(self, FIFO_CONFIG, 0U) &&
-        write_register(self, GYRO_CONFIG0, self->rate) && write_register(self, ACCEL_CONFIG0, self->rate) &&
-        write_register(self, FIFO_CONFIG1, PACKETS_OF_20) && write_offsets(self, state->added) &&
-        write_register(self, FIFO_CONFIG, STREAM);
+    const bool done = write_register(self, SELF_TEST_CONFIG, 0U) && write_register(self, FIFO_CONFIG, 0U) &&
+                      write_register(self, GYRO_CONFIG0, self->rate) &&
+                      write_register(self, ACCEL_CONFIG0, self->rate) &&
+                      write_register(self, FIFO_CONFIG1, PACKETS_OF_20) && write_offsets(self, state->added) &&
+                      write_register(self, FIFO_CONFIG, STREAM);
     return done ? SENSOR_NO_FAULT : SENSOR_SET_UP;
 }
 
@@ -333,8 +332,8 @@ static sensor_fault_t relaxed(sensor_state_t *state) {
 static bool altered(icm42688_t *self) {
     const struct {
         uint8_t address, value;
-    } wanted[] = {{PWR_MGMT0, BOTH_LOW_NOISE}, {GYRO_CONFIG0, self->rate},      {ACCEL_CONFIG0, self->rate},
-                  {FIFO_CONFIG, STREAM},       {FIFO_CONFIG1, PACKETS_OF_20},   {TMST_CONFIG, TIMESTAMPS},
+    } wanted[] = {{PWR_MGMT0, BOTH_LOW_NOISE}, {GYRO_CONFIG0, self->rate},        {ACCEL_CONFIG0, self->rate},
+                  {FIFO_CONFIG, STREAM},       {FIFO_CONFIG1, PACKETS_OF_20},     {TMST_CONFIG, TIMESTAMPS},
                   {SELF_TEST_CONFIG, 0U},      {INTF_CONFIG0, BIG_ENDIAN_NO_I2C}, {BANK_SEL, 0U}};
     for (size_t i = 0; i < sizeof wanted / sizeof wanted[0]; i++) {
         uint8_t found, again;
@@ -511,6 +510,7 @@ static float side(const sensor_state_t *state, unsigned channel) {
     return known ? 25.0F + (float)temperature / 132.48F : NAN;
 }
 
+/* clang-format off */
 static const sensor_step_t icm42688_steps[] = {
     {0, reset},
     {RESET_US, probe},
@@ -522,6 +522,7 @@ static const sensor_step_t icm42688_steps[] = {
     {0, set_up},
     {STRAIN_US, relaxed},
 };
+/* clang-format on */
 static icm42688_t sensor;
 
 const sensor_t icm42688 = {

@@ -15,8 +15,8 @@
 
 /* True for 25, 50, 100, 200, 500 and 1000 Hz, to 0.1 %. Constant where the rate is. */
 #define ICM42688_NEAR(rate_hz, nominal) ((rate_hz) >= 0.999F * (nominal) && (rate_hz) <= 1.001F * (nominal))
-#define icm42688_has_rate(rate_hz) \
-    (ICM42688_NEAR(rate_hz, 25.0F) || ICM42688_NEAR(rate_hz, 50.0F) || ICM42688_NEAR(rate_hz, 100.0F) || \
+#define icm42688_has_rate(rate_hz)                                                                                     \
+    (ICM42688_NEAR(rate_hz, 25.0F) || ICM42688_NEAR(rate_hz, 50.0F) || ICM42688_NEAR(rate_hz, 100.0F) ||               \
      ICM42688_NEAR(rate_hz, 200.0F) || ICM42688_NEAR(rate_hz, 500.0F) || ICM42688_NEAR(rate_hz, 1000.0F))
 #define icm42688_has_supply 0
 

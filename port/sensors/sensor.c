@@ -3,8 +3,8 @@
 #include <string.h>
 
 enum { REPEATS_TAKEN = 2, REPEATS_STUCK = 16, PROVEN_SAMPLES = 1000 };
-enum { SIGNS = 3 };         /* one data-ready may come from plugging */
-#define SILENCE_US 150000U  /* without a sample; at least 10 periods as well */
+enum { SIGNS = 3 };        /* one data-ready may come from plugging */
+#define SILENCE_US 150000U /* without a sample; at least 10 periods as well */
 #define BACKOFF_MIN_US 100000U
 #define BACKOFF_MAX_US 10000000U
 

@@ -90,9 +90,9 @@ typedef struct {
     const struct sensor *sensor;
     const sensor_bus_t *bus;
     sensor_condition_t condition;
-    sensor_fault_t fault;  /* the last one */
-    uint8_t step;          /* of the start */
-    uint64_t step_us;      /* when it was entered, or the fault state */
+    sensor_fault_t fault; /* the last one */
+    uint8_t step;         /* of the start */
+    uint64_t step_us;     /* when it was entered, or the fault state */
     uint32_t backoff_us;
     uint64_t progress_us;  /* when a sample was delivered last, or the run began */
     uint32_t signs_before; /* `signs` then */

@@ -60,7 +60,7 @@ void sensor_done_handler(void);
 #ifndef BOARD_CAN_KBITPS
 #define BOARD_CAN_KBITPS 500
 #endif
-#if BOARD_CAN_KBITPS != 0 && (BOARD_CAN_KBITPS < 125 || BOARD_CAN_KBITPS > 1000 || 42000 % BOARD_CAN_KBITPS != 0 || \
+#if BOARD_CAN_KBITPS != 0 && (BOARD_CAN_KBITPS < 125 || BOARD_CAN_KBITPS > 1000 || 42000 % BOARD_CAN_KBITPS != 0 ||    \
                               BOARD_CAN_KBITPS == 240 || BOARD_CAN_KBITPS == 336)
 #error "BOARD_CAN_KBITPS: 125 to 1000, and a whole part of 42 MHz with 8 to 20 quanta in a bit; or 0"
 #endif

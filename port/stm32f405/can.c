@@ -16,8 +16,7 @@ static uint32_t dropped, refused_since_ms;
 static bool refused;
 static volatile uint32_t aborted, bus_offs;
 
-uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s)
-{
+uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s) {
     uint32_t best = 0, best_error = UINT32_MAX;
     for (uint32_t quanta = 25; quanta >= 8U; quanta--) { /* 1 + TS1 + TS2, section 32.7.7 */
         if (bit_per_s == 0U || pclk_hz % (bit_per_s * quanta) != 0U) {
@@ -39,8 +38,7 @@ uint32_t can_bit_timing(uint32_t pclk_hz, uint32_t bit_per_s)
     return best;
 }
 
-static bool await_initialisation(bool on)
-{
+static bool await_initialisation(bool on) {
     const uint32_t start = clock_us32();
     while (((CAN_MSR & CAN_MSR_INAK) != 0U) != on) {
         if (clock_us32() - start > 20000U) { /* leaving waits for 11 recessive bits: 88 us at 125 kbit/s */
@@ -50,8 +48,7 @@ static bool await_initialisation(bool on)
     return true;
 }
 
-bool can_init(uint32_t bit_per_s)
-{
+bool can_init(uint32_t bit_per_s) {
     const uint32_t timing = can_bit_timing(board_clock.pclk1_hz, bit_per_s);
     if (timing == 0U) {
         return false;
@@ -89,8 +86,7 @@ bool can_init(uint32_t bit_per_s)
     return true;
 }
 
-bool can_send(const selfcal_frame_t *frame)
-{
+bool can_send(const selfcal_frame_t *frame) {
     if (!working) {
         dropped++;
         return true;
@@ -117,13 +113,11 @@ bool can_send(const selfcal_frame_t *frame)
     return true;
 }
 
-bool can_sent(void)
-{
+bool can_sent(void) {
     return !working || (CAN_TSR >> CAN_TSR_TME_POS & 0x7U) == 0x7U;
 }
 
-void can_poll(void)
-{
+void can_poll(void) {
 #ifdef APP_COMMAND_KEY
     if ((CAN_RF0R & CAN_RF0R_FMP) == 0U) {
         return;
@@ -143,8 +137,7 @@ void can_poll(void)
 
 /* Wakes the main loop, which fills the mailbox. A request that ends without TXOK was aborted; one that was on the
  * bus then may still have been heard (section 32.7.1). */
-void can_tx_handler(void)
-{
+void can_tx_handler(void) {
     const uint32_t ended = CAN_TSR;
     uint32_t clear = 0;
     for (uint32_t mailbox = 0; mailbox < MAILBOXES; mailbox++) {
@@ -156,16 +149,14 @@ void can_tx_handler(void)
     CAN_TSR = clear;
 }
 
-void can_error_handler(void)
-{
+void can_error_handler(void) {
     if ((CAN_ESR & CAN_ESR_BOFF) != 0U) {
         bus_offs++;
     }
     CAN_MSR = BIT(2); /* ERRI, section 32.9.2: cleared by writing 1 */
 }
 
-void can_counters(wire_counters_t *counters)
-{
+void can_counters(wire_counters_t *counters) {
     counters->dropped = dropped + aborted;
     counters->bus_offs = bus_offs;
 }

@@ -18,8 +18,7 @@ static volatile uint32_t ticks;
 
 /* Bounded: HSE starts within 2 ms (data sheet), the PLL locks within 0.3 ms; a turn takes 5 or more cycles of 16
  * MHz. */
-static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
-{
+static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value) {
     for (uint32_t turn = 0; turn < 60000U; turn++) {
         if ((*reg & mask) == value) {
             return true;
@@ -29,16 +28,14 @@ static bool await(const volatile uint32_t *reg, uint32_t mask, uint32_t value)
 }
 
 /* VCO = input / M * N with input / M = 1 MHz, N = 336; P = 2, Q = 7 (section 7.3.2). */
-static bool pll_start(uint32_t source_hz, uint32_t source)
-{
-    RCC_PLLCFGR = source_hz / 1000000U | 336U << RCC_PLLCFGR_N_POS | 0U << RCC_PLLCFGR_P_POS | source |
-                  7U << RCC_PLLCFGR_Q_POS;
+static bool pll_start(uint32_t source_hz, uint32_t source) {
+    RCC_PLLCFGR =
+        source_hz / 1000000U | 336U << RCC_PLLCFGR_N_POS | 0U << RCC_PLLCFGR_P_POS | source | 7U << RCC_PLLCFGR_Q_POS;
     RCC_CR |= RCC_CR_PLLON;
     return await(&RCC_CR, RCC_CR_PLLRDY, RCC_CR_PLLRDY);
 }
 
-void clock_init(void)
-{
+void clock_init(void) {
     RCC_APB1ENR |= RCC_APB1ENR_PWR | RCC_APB1ENR_TIM2;
     (void)RCC_APB1ENR; /* errata sheet ES0182: a peripheral answers two cycles after its clock is on */
     PWR_CR |= PWR_CR_VOS;
@@ -73,37 +70,31 @@ void clock_init(void)
     SYST_CSR = SYST_CSR_RUN;
 }
 
-void systick_handler(void)
-{
+void systick_handler(void) {
     ticks++;
 }
 
-uint32_t clock_ticks(void)
-{
+uint32_t clock_ticks(void) {
     return ticks;
 }
 
 /* Not from the ticks, which an erase of the flash keeps from being counted. */
-uint32_t clock_ms(void)
-{
+uint32_t clock_ms(void) {
     return (uint32_t)(clock_us() / 1000U);
 }
 
-uint32_t clock_us32(void)
-{
+uint32_t clock_us32(void) {
     return TIM2_CNT;
 }
 
 /* Called from the main loop at least once in 71 minutes. */
-uint64_t clock_us(void)
-{
+uint64_t clock_us(void) {
     static uint64_t now;
     now += TIM2_CNT - (uint32_t)now;
     return now;
 }
 
-void clock_spin_us(uint32_t us)
-{
+void clock_spin_us(uint32_t us) {
     /* 2 to 4 cycles a turn */
     uint32_t turns = us * (board_clock.hclk_hz / 2000000U) + 1U;
     __asm__ volatile(".syntax unified\n1: subs %0, #1\n bne 1b" : "+r"(turns) : : "cc");

@@ -7,8 +7,7 @@ enum { FIRST_SECTOR = 10, SLOT_STRIDE = 0x20000 };
 #define SLOT_BASE 0x080C0000U
 
 /* Erasing takes 2 s at most, a word 100 us (data sheet, at x32). */
-static bool await_idle(void)
-{
+static bool await_idle(void) {
     const uint32_t start = clock_us32();
     while ((FLASH_SR & FLASH_SR_BSY) != 0U) {
         if (clock_us32() - start > 4000000U) {
@@ -21,21 +20,18 @@ static bool await_idle(void)
     return errors == 0U;
 }
 
-static void unlock(void)
-{
+static void unlock(void) {
     if ((FLASH_CR & FLASH_CR_LOCK) != 0U) {
         FLASH_KEYR = FLASH_KEY1;
         FLASH_KEYR = FLASH_KEY2;
     }
 }
 
-static void lock(void)
-{
+static void lock(void) {
     FLASH_CR = FLASH_CR_LOCK;
 }
 
-static bool erase(uint32_t slot)
-{
+static bool erase(uint32_t slot) {
     unlock();
     bool done = await_idle();
     FLASH_CR = FLASH_CR_PSIZE_X32 | FLASH_CR_SER | (FIRST_SECTOR + slot) << FLASH_CR_SNB_POS;
@@ -51,8 +47,7 @@ static bool erase(uint32_t slot)
     return done;
 }
 
-static bool program(const uint8_t *place, uint32_t word)
-{
+static bool program(const uint8_t *place, uint32_t word) {
     volatile uint32_t *const to = (volatile uint32_t *)(uintptr_t)place;
     unlock();
     FLASH_CR = FLASH_CR_PSIZE_X32 | FLASH_CR_PG;

@@ -13,13 +13,11 @@
 static reset_cause_t reset_cause;
 static board_fault_t last_fault;
 
-static void board_sleep(void)
-{
+static void board_sleep(void) {
     __asm__ volatile("wfi" : : : "memory");
 }
 
-static void board_tell(selfcal_module_t *told)
-{
+static void board_tell(selfcal_module_t *told) {
     told->reset_cause = (uint32_t)reset_cause;
     told->fault_address = last_fault.pc;
     told->clock = board_clock.crystal ? 1U : 2U;
@@ -34,13 +32,22 @@ static void board_tell(selfcal_module_t *told)
 }
 
 static const module_board_t board_calls = {
-    &spi_bus, &flash_memory, BOARD_REPORT_MS, clock_ms, clock_ticks, BOARD_CAN_KBITPS > 0 ? can_send : usart_send,
-    BOARD_CAN_KBITPS > 0 ? can_sent : usart_sent, BOARD_CAN_KBITPS > 0 ? can_poll : usart_poll, board_sleep,
-    watchdog_feed, board_tell, rng_number, board_reset,
+    &spi_bus,
+    &flash_memory,
+    BOARD_REPORT_MS,
+    clock_ms,
+    clock_ticks,
+    BOARD_CAN_KBITPS > 0 ? can_send : usart_send,
+    BOARD_CAN_KBITPS > 0 ? can_sent : usart_sent,
+    BOARD_CAN_KBITPS > 0 ? can_poll : usart_poll,
+    board_sleep,
+    watchdog_feed,
+    board_tell,
+    rng_number,
+    board_reset,
 };
 
-int main(void)
-{
+int main(void) {
     watchdog_start();
     reset_cause = watchdog_reset_cause();
     if (board_last_fault(&last_fault) && reset_cause == RESET_SOFTWARE) {

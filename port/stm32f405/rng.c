@@ -2,8 +2,7 @@
 #include "board.h"
 #include "stm32f405.h"
 
-static bool next(uint32_t *number)
-{
+static bool next(uint32_t *number) {
     const uint32_t start = clock_us32();
     while ((RNG_SR & RNG_SR_DRDY) == 0U) {
         /* A number takes 40 periods of the clock. */
@@ -15,8 +14,7 @@ static bool next(uint32_t *number)
     return true;
 }
 
-bool rng_number(uint32_t *number)
-{
+bool rng_number(uint32_t *number) {
     uint32_t before = 0;
     RCC_AHB2ENR |= RCC_AHB2ENR_RNG;
     (void)RCC_AHB2ENR;

@@ -13,8 +13,7 @@ static struct {
     board_fault_t fault;
 } kept __attribute__((section(".kept")));
 
-bool board_last_fault(board_fault_t *fault)
-{
+bool board_last_fault(board_fault_t *fault) {
     const bool found = kept.magic == FAULT_MAGIC;
     if (found) {
         *fault = kept.fault;
@@ -23,8 +22,7 @@ bool board_last_fault(board_fault_t *fault)
     return found;
 }
 
-void board_reset(void)
-{
+void board_reset(void) {
     __asm__ volatile("dsb" : : : "memory");
     SCB_AIRCR = SCB_AIRCR_SYSRESETREQ;
     for (;;) { /* the watchdog ends it if the reset does not come */
@@ -34,8 +32,7 @@ void board_reset(void)
 /* `frame`: what the processor pushed on entry (PM0214 2.3.7). With the stack itself gone it may lie outside the
  * memory; then only the vector and CFSR are told. */
 void fault_record(const uint32_t *frame, uint32_t vector);
-void fault_record(const uint32_t *frame, uint32_t vector)
-{
+void fault_record(const uint32_t *frame, uint32_t vector) {
     const uintptr_t at = (uintptr_t)frame;
     const bool readable = at >= 0x20000000U && at <= 0x20020000U - 32U;
     kept.fault.vector = vector;
@@ -48,8 +45,7 @@ void fault_record(const uint32_t *frame, uint32_t vector)
 
 /* Every exception and interrupt without a handler of its own. The stack pointer is put back to its start first,
  * because it may be what is broken. */
-__attribute__((naked)) static void unexpected(void)
-{
+__attribute__((naked)) static void unexpected(void) {
     __asm__ volatile("mov r0, sp\n"
                      "mrs r1, ipsr\n"
                      "ldr r2, =link_stack\n"
@@ -61,8 +57,7 @@ __attribute__((naked)) static void unexpected(void)
 int main(void);
 
 __attribute__((noreturn)) void startup(void);
-void startup(void)
-{
+void startup(void) {
     SCB_CPACR |= SCB_CPACR_FPU; /* before anything may touch the FPU */
     __asm__ volatile("dsb\n isb" : : : "memory");
     const uint32_t *from = link_data_load;
@@ -89,6 +84,7 @@ typedef union {
 #define X {.call = unexpected}
 #define X4 X, X, X, X
 #define X12 X4, X4, X4
+/* clang-format off */
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16 + IRQ_COUNT] = {
     {.stack = link_stack}, {.call = startup},
     X12, X, {.call = systick_handler},                /* exceptions 2 to 15, PM0214 2.3.2 */
@@ -99,3 +95,4 @@ __attribute__((section(".vectors"), used)) static const vector_t vectors[16 + IR
     X12, X4, X, X, {.call = sensor_done_handler},     /* to 56 DMA2_Stream0 */
     X12, X12, X,                                      /* to 81 FPU */
 };
+/* clang-format on */

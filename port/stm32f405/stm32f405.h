@@ -117,7 +117,7 @@
 #define DMA_SCR_CHSEL_POS 25U
 #define DMA_LISR_TEIF0 BIT(3)
 #define DMA_LISR_TCIF0 BIT(5)
-#define DMA_LISR_STREAM0 0x3DU       /* every flag of stream 0 ... */
+#define DMA_LISR_STREAM0 0x3DU         /* every flag of stream 0 ... */
 #define DMA_LISR_STREAM3 (0x3DU << 22) /* ... and of stream 3 */
 
 /* -------------------------------------------------------------------------------- TIM2 to TIM5, RM0090 section 18.4 */
@@ -249,33 +249,22 @@
 #define SCB_CPACR_FPU (0xFU << 20)
 
 /* Interrupt numbers, RM0090 table 62. */
-enum {
-    IRQ_EXTI0 = 6,
-    IRQ_CAN1_TX = 19,
-    IRQ_CAN1_SCE = 22,
-    IRQ_USART1 = 37,
-    IRQ_DMA2_STREAM0 = 56,
-    IRQ_COUNT = 82
-};
+enum { IRQ_EXTI0 = 6, IRQ_CAN1_TX = 19, IRQ_CAN1_SCE = 22, IRQ_USART1 = 37, IRQ_DMA2_STREAM0 = 56, IRQ_COUNT = 82 };
 
-static inline void irq_enable(uint32_t number)
-{
+static inline void irq_enable(uint32_t number) {
     NVIC_ISER(number / 32U) = BIT(number % 32U);
 }
 
 /* Its handler is broken into by those of interrupts that do not give way (priority 1 of 0 to 15, PM0214 4.3.7). */
-static inline void irq_give_way(uint32_t number)
-{
+static inline void irq_give_way(uint32_t number) {
     NVIC_IPR(number / 4U) |= 0x10U << 8U * (number % 4U);
 }
 
-static inline void irq_off(void)
-{
+static inline void irq_off(void) {
     __asm__ volatile("cpsid i" : : : "memory");
 }
 
-static inline void irq_on(void)
-{
+static inline void irq_on(void) {
     __asm__ volatile("cpsie i" : : : "memory");
 }
 

@@ -4,8 +4,7 @@
 
 enum { RELOAD = 999 }; /* 1000 counts of 32 kHz / 256: 8 s */
 
-reset_cause_t watchdog_reset_cause(void)
-{
+reset_cause_t watchdog_reset_cause(void) {
     const uint32_t flags = RCC_CSR;
     RCC_CSR |= RCC_CSR_RMVF;
     /* Several are set at once: every reset pulls the pin too, and power-on sets brown-out. */
@@ -17,8 +16,7 @@ reset_cause_t watchdog_reset_cause(void)
                                                                               : RESET_UNKNOWN;
 }
 
-void watchdog_start(void)
-{
+void watchdog_start(void) {
     IWDG_KR = IWDG_KR_START; /* starts LSI, which the other two registers need */
     IWDG_KR = IWDG_KR_ACCESS;
     IWDG_PR = IWDG_PR_DIV256;
@@ -28,7 +26,6 @@ void watchdog_start(void)
     watchdog_feed();
 }
 
-void watchdog_feed(void)
-{
+void watchdog_feed(void) {
     IWDG_KR = IWDG_KR_RELOAD;
 }

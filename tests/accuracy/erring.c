@@ -91,7 +91,7 @@ static void compare(const selfcal_report_t *true_one, const selfcal_report_t *ot
  * noise. */
 static void push_record(unsigned n) {
     static const float steps[AXES] = {0.0F, 1e-3F, 0.02F, 5e-4F, 4e-3F, 0.0F},
-        holds[AXES] = {1.0F, 1.0F, 1.0F, 0.999F, 0.98F, 1.0F};
+                       holds[AXES] = {1.0F, 1.0F, 1.0F, 0.999F, 0.98F, 1.0F};
     float drift[AXES] = {0};
     state = 12345U;
     for (unsigned i = 0; i < n; i++) {

@@ -66,14 +66,12 @@ typedef struct {
 /* Wider than any argument in lib/: ln of 1e-38 to 1e38 for the logarithms, exponentials that neither overflow nor
  * become denormal. */
 static const single_t singles[] = {
-    {expf, -87.0F, -1e-9F},     {expf, 1e-9F, 88.0F},      {expm1f, -87.0F, -1e-9F}, {expm1f, 1e-9F, 88.0F},
-        {logf, 1.2e-38F, 3e38F},
-    {log1pf, -0.9999F, -1e-9F}, {log1pf, 1e-9F, 3e38F},    {sqrtf, 1.2e-38F, 3e38F},
+    {expf, -87.0F, -1e-9F},  {expf, 1e-9F, 88.0F},       {expm1f, -87.0F, -1e-9F}, {expm1f, 1e-9F, 88.0F},
+    {logf, 1.2e-38F, 3e38F}, {log1pf, -0.9999F, -1e-9F}, {log1pf, 1e-9F, 3e38F},   {sqrtf, 1.2e-38F, 3e38F},
 };
 static const double_t_ doubles[] = {
-    {exp, -700.0, -1e-17},      {exp, 1e-17, 700.0},       {expm1, -700.0, -1e-17},  {expm1, 1e-17, 700.0},
-        {log, 1e-300, 1e300},
-    {log1p, -0.9999999, -1e-17}, {log1p, 1e-17, 1e300},    {sqrt, 1e-300, 1e300},
+    {exp, -700.0, -1e-17}, {exp, 1e-17, 700.0},         {expm1, -700.0, -1e-17}, {expm1, 1e-17, 700.0},
+    {log, 1e-300, 1e300},  {log1p, -0.9999999, -1e-17}, {log1p, 1e-17, 1e300},   {sqrt, 1e-300, 1e300},
 };
 
 /* COUNT bit patterns of `size` bytes from `from` on, each with what a function makes of it. */

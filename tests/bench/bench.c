@@ -266,8 +266,8 @@ static void paper_init(paper_filter_t *f, const selfcal_node_view_t *node, selfc
         q = p_first * -expm1(-2.0 * alpha_dt);
     }
     const selfcal_wide_t r = sigma_v * sigma_v;
-    const paper_filter_t start = {(float)phi, (float)(q * r), (float)r, 0.0F, 0.0F, (float)(p_first * r), 0.0F,
-                                  (float)(bias_sd * bias_sd), 0.0F};
+    const paper_filter_t start = {
+        (float)phi, (float)(q * r), (float)r, 0.0F, 0.0F, (float)(p_first * r), 0.0F, (float)(bias_sd * bias_sd), 0.0F};
     *f = start;
 }
 
@@ -284,8 +284,8 @@ static void measure_paper(void) {
         for (unsigned k = 0; k < PAPER_SIGMAS; k++) {
             const unsigned j = i * PAPER_SIGMAS + k;
             paper_init(&paper[j], &node, paper_sigma(k));
-            count_require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k),
-                                                 &ln_likelihood[j]) == SELFCAL_OK,
+            count_require(selfcal_log_likelihood(&bank, 0U, paper_node(i), paper_sigma(k), &ln_likelihood[j]) ==
+                              SELFCAL_OK,
                           "likelihood");
         }
     }

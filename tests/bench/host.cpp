@@ -66,11 +66,12 @@ int main() {
     volatile double ln_p = 0.0; // kept, so that nothing is left out
     for (int round = 0; round < rounds; ++round) {
         library = std::min(library, nanoseconds([&] { push(again); }));
-        textbook = std::min(textbook, nanoseconds([&] {
-            for (std::size_t j = 0; j < filters; ++j) {
-                ln_p = run_filter(one_axis, gauss_markov, {0, 0.01 * static_cast<double>(j + 1), 0.01, 0.04}).ln_p;
-            }
-        }));
+        textbook = std::min(
+            textbook, nanoseconds([&] {
+                for (std::size_t j = 0; j < filters; ++j) {
+                    ln_p = run_filter(one_axis, gauss_markov, {0, 0.01 * static_cast<double>(j + 1), 0.01, 0.04}).ln_p;
+                }
+            }));
     }
     std::printf("library %.4f\ntextbook %.4f\n", library / static_cast<double>(samples * model.nodes * axes),
                 textbook / static_cast<double>(samples * filters));

@@ -105,6 +105,6 @@ void reset(void) {
 
 typedef void (*vector_t)(void);
 __attribute__((section(".vectors"), used)) static const vector_t vectors[16] = {
-    image_stack, reset, fault, fault, fault, fault, fault, NULL, NULL, NULL, NULL, fault, fault, NULL, fault,
-        count_round,
+    image_stack, reset, fault, fault, fault, fault, fault, NULL,
+    NULL,        NULL,  NULL,  fault, fault, NULL,  fault, count_round,
 };

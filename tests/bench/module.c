@@ -28,8 +28,8 @@
 
 static record_t record;
 static float ring[RING][AXES];
-static uint32_t made;     /* samples put into the ring */
-static uint32_t samples;  /* taken */
+static uint32_t made;      /* samples put into the ring */
+static uint32_t samples;   /* taken */
 static uint64_t now_ticks; /* idle time too */
 static uint32_t most_waiting;
 static app_t app;

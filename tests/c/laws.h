@@ -17,8 +17,9 @@ static const selfcal_law_t named_law[NAMED_LAWS] = {
                   {SELFCAL_MARKOV, 0.96F, 16.0F, false, false}}},
     [MOVING_AVERAGE] = {1U, true, {{SELFCAL_WALK, 1.0F, 0.0F, false, false}}},
     /* a correlation time of 100 s */
-    [WALK_AND_MARKOV] = {2U, false,
-        {{SELFCAL_WALK, 1.0F, 0.0F, false, false}, {SELFCAL_MARKOV, 1.0F, 0.01F, true, true}}},
+    [WALK_AND_MARKOV] = {2U,
+                         false,
+                         {{SELFCAL_WALK, 1.0F, 0.0F, false, false}, {SELFCAL_MARKOV, 1.0F, 0.01F, true, true}}},
 };
 
 #endif

@@ -9,8 +9,7 @@
 /* fdlibm's split of ln 2 */
 static const double LN2_HIGH = 0.693147180369123816490, LN2_LOW = 1.90821492927058770002e-10;
 
-static double scaled(double value, int exponent)
-{
+static double scaled(double value, int exponent) {
     for (; exponent > 1000; exponent -= 1000) {
         value *= 0x1p1000;
     }
@@ -24,8 +23,7 @@ static double scaled(double value, int exponent)
 }
 
 /* e^r - 1 for |r| < 0.35 */
-static double expm1_small(double r)
-{
+static double expm1_small(double r) {
     double sum = 0.0;
     for (int n = 16; n >= 1; n--) {
         sum = (sum + 1.0) * r / n;
@@ -33,8 +31,7 @@ static double expm1_small(double r)
     return sum;
 }
 
-double exp(double x)
-{
+double exp(double x) {
     if (x != x) {
         return x;
     }
@@ -48,13 +45,11 @@ double exp(double x)
     return scaled(1.0 + expm1_small(x - k * LN2_HIGH - k * LN2_LOW), k);
 }
 
-double expm1(double x)
-{
+double expm1(double x) {
     return x > -0.3 && x < 0.3 ? expm1_small(x) : exp(x) - 1.0;
 }
 
-double log(double x)
-{
+double log(double x) {
     if (!(x > 0.0)) {
         return x == 0.0 ? (double)-INFINITY : (double)NAN;
     }
@@ -83,35 +78,29 @@ double log(double x)
     return k * LN2_HIGH + (k * LN2_LOW + 2.0 * z * sum);
 }
 
-double log1p(double x)
-{
+double log1p(double x) {
     const double u = 1.0 + x;
     return u == 1.0 ? x : u > 1e300 || !(u > 0.0) ? log(u) : log(u) * (x / (u - 1.0));
 }
 
-float expf(float x)
-{
+float expf(float x) {
     return (float)exp((double)x);
 }
 
-float expm1f(float x)
-{
+float expm1f(float x) {
     return (float)expm1((double)x);
 }
 
-float logf(float x)
-{
+float logf(float x) {
     return (float)log((double)x);
 }
 
-float log1pf(float x)
-{
+float log1pf(float x) {
     return (float)log1p((double)x);
 }
 
 #ifdef SAME_FMAF
-float fmaf(float x, float y, float z)
-{
+float fmaf(float x, float y, float z) {
     return (float)((double)x * (double)y + (double)z);
 }
 #endif

@@ -37,32 +37,27 @@ static uint32_t random32(void) /* xorshift32, Marsaglia 2003 */
 }
 
 /* Any sign, 1e-30 to 1e30. */
-static float random_float(void)
-{
+static float random_float(void) {
     const float sign = (random32() & 1U) != 0U ? -1.0F : 1.0F;
     return sign * powf(10.0F, (float)random32() / 4294967296.0F * 60.0F - 30.0F);
 }
 
 /* Of axes_retired, as the DBC words it. */
-static unsigned retired_bit(const char *name)
-{
+static unsigned retired_bit(const char *name) {
     return (unsigned)(name[1] - 'x') + (name[0] == 'a' ? 3U : 0U);
 }
 
-static float told(const char *message, const char *signal, float number)
-{
+static float told(const char *message, const char *signal, float number) {
     (void)printf("V %s %s %.17g\n", message, signal, (double)number);
     return number;
 }
 
-static uint32_t told_count(const char *message, const char *signal, uint32_t number)
-{
+static uint32_t told_count(const char *message, const char *signal, uint32_t number) {
     (void)printf("V %s %s %lu\n", message, signal, (unsigned long)number);
     return number;
 }
 
-static void random_posterior(selfcal_posterior_t *p, const char *message, int k)
-{
+static void random_posterior(selfcal_posterior_t *p, const char *message, int k) {
     char signal[64];
     (void)snprintf(signal, sizeof signal, "h%d_probability", k);
     p->probability = told(message, signal, (float)random32() / 4294967296.0F);
@@ -85,8 +80,7 @@ static void random_posterior(selfcal_posterior_t *p, const char *message, int k)
     }
 }
 
-static void send_all(selfcal_telemetry_t *telemetry)
-{
+static void send_all(selfcal_telemetry_t *telemetry) {
     selfcal_frame_t frame;
     while (selfcal_telemetry_next(telemetry, &frame)) {
         char line[SLCAN_FRAME_BYTES];
@@ -95,16 +89,14 @@ static void send_all(selfcal_telemetry_t *telemetry)
     }
 }
 
-static void require(selfcal_status_t status)
-{
+static void require(selfcal_status_t status) {
     if (status != SELFCAL_OK) {
         (void)fprintf(stderr, "telemetry refused: %d\n", (int)status);
         exit(1);
     }
 }
 
-int main(int argc, char **argv)
-{
+int main(int argc, char **argv) {
     static const char *const axis_name[AXES] = {"az", "gx", "ay", "gz", "ax", "gy"};
     static const char *const message[AXES] = {"AZ", "GX", "AY", "GZ", "AX", "GY"};
     if (argc != 7) {

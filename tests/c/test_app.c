@@ -13,14 +13,12 @@ static uint64_t time_samples;
 static bool gaps; /* while a report is worked out: a whole bank interval is missing, before one sample of 300 */
 static unsigned frames[PORT_AXES + 1], most_in_a_report, in_a_report; /* in_a_report: samples since it began */
 
-static uint32_t time_ms(void *context)
-{
+static uint32_t time_ms(void *context) {
     (void)context;
     return (uint32_t)((double)time_samples * 1e3 / (double)SELFCAL_MODEL_RATE_HZ);
 }
 
-static port_sample_t sample(void *context, float reading[], uint32_t *missing)
-{
+static port_sample_t sample(void *context, float reading[], uint32_t *missing) {
     (void)context;
     for (unsigned axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         reading[axis] = 0.1F * noise();
@@ -34,8 +32,7 @@ static port_sample_t sample(void *context, float reading[], uint32_t *missing)
     return PORT_SAMPLE;
 }
 
-static bool take_frame(void *context, const selfcal_frame_t *frame)
-{
+static bool take_frame(void *context, const selfcal_frame_t *frame) {
     (void)context;
     if (frame->id > SELFCAL_FRAME_STATUS_ID && frame->id <= SELFCAL_FRAME_STATUS_ID + PORT_AXES) {
         frames[frame->id - SELFCAL_FRAME_STATUS_ID]++;
@@ -43,15 +40,13 @@ static bool take_frame(void *context, const selfcal_frame_t *frame)
     return true;
 }
 
-static void idle(void *context)
-{
+static void idle(void *context) {
     (void)context;
 }
 
 static const port_t port = {NULL, time_ms, sample, take_frame, idle};
 
-void setUp(void)
-{
+void setUp(void) {
     state = 20260408U;
     time_samples = 0;
     most_in_a_report = 0;
@@ -62,8 +57,7 @@ void setUp(void)
 void tearDown(void) {}
 
 /* The truth is the rule at selfcal_room(): while it is kept each axis has its report. */
-static void each_axis_has_its_report(void)
-{
+static void each_axis_has_its_report(void) {
     while (app.report_number == 0U || app.stage != 0U || app.imu.computing || app.worked_out) {
         if (!app.imu.computing) {
             in_a_report = 0;
@@ -77,8 +71,7 @@ static void each_axis_has_its_report(void)
 }
 
 /* Room for 15 bank intervals, and half of the next; the first of them may have begun. */
-static void test_samples_go_on_in_a_report_as_long_as_there_is_room(void)
-{
+static void test_samples_go_on_in_a_report_as_long_as_there_is_room(void) {
     gaps = false;
     each_axis_has_its_report();
     TEST_ASSERT_GREATER_OR_EQUAL(14U * app.imu.bank.block + app.imu.bank.block / 2U - 1U, most_in_a_report);
@@ -86,14 +79,12 @@ static void test_samples_go_on_in_a_report_as_long_as_there_is_room(void)
 }
 
 /* A gap ends an interval with what it has, which would be the one sample too many in the second half of the last. */
-static void test_gaps_do_not_overtake_a_report(void)
-{
+static void test_gaps_do_not_overtake_a_report(void) {
     gaps = true;
     each_axis_has_its_report();
 }
 
-int main(void)
-{
+int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_samples_go_on_in_a_report_as_long_as_there_is_room);
     RUN_TEST(test_gaps_do_not_overtake_a_report);

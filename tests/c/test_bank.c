@@ -123,10 +123,10 @@ static void models_that_contradict_themselves_are_refused(void) {
         bad.dt_s = intervals[i];
         TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
     }
-    static const selfcal_prior_t priors[] = {
-        {-47.0F, 0.0F, false, false}, {0.0F, 47.0F, false, false}, {1.0F, 1.0F, false, false},
-        {NAN, 1.0F, false, false}, {0.0F, NAN, false, false}, {-INFINITY, 0.0F, true, false},
-        {0.0F, INFINITY, true, false}};
+    static const selfcal_prior_t priors[] = {{-47.0F, 0.0F, false, false}, {0.0F, 47.0F, false, false},
+                                             {1.0F, 1.0F, false, false},   {NAN, 1.0F, false, false},
+                                             {0.0F, NAN, false, false},    {-INFINITY, 0.0F, true, false},
+                                             {0.0F, INFINITY, true, false}};
     for (unsigned i = 0; i < sizeof priors / sizeof priors[0]; i++) {
         selfcal_axis_t axis[AXES];
         memcpy(axis, model.axis, sizeof axis);
@@ -183,8 +183,8 @@ static void the_constant_law_sums_the_data(void) {
             first = sample[0];
         }
         sum += (selfcal_wide_t)sample[0] - (selfcal_wide_t)first;
-        square += ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first) *
-            ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first);
+        square +=
+            ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first) * ((selfcal_wide_t)sample[0] - (selfcal_wide_t)first);
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
     }
     selfcal_node_view_t view;
@@ -214,11 +214,10 @@ static void the_likelihood_of_the_constant_law_is_the_normal_density(void) {
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_push(&bank, sample));
     }
     const selfcal_wide_t sigma = 0.05,
-        p0 = (selfcal_wide_t)model.axis[0].bias_sd * (selfcal_wide_t)model.axis[0].bias_sd;
+                         p0 = (selfcal_wide_t)model.axis[0].bias_sd * (selfcal_wide_t)model.axis[0].bias_sd;
     const selfcal_wide_t var = sigma * sigma;
-    const selfcal_wide_t expected =
-        -0.5 * (N * log(2.0 * 3.14159265358979324 * var) + log(1.0 + N * p0 / var) + square / var -
-                                            p0 * sum * sum / (var * (var + N * p0)));
+    const selfcal_wide_t expected = -0.5 * (N * log(2.0 * 3.14159265358979324 * var) + log(1.0 + N * p0 / var) +
+                                            square / var - p0 * sum * sum / (var * (var + N * p0)));
     selfcal_wide_t ln_p = 0.0;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_log_likelihood(&bank, 0, 0, sigma, &ln_p));
     TEST_ASSERT_TRUE(fabs(ln_p - expected) < 1e-4); /* float sums: 64 roundings of 6e-8 on some 50 nats */

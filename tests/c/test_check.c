@@ -126,11 +126,11 @@ static void mend(void) {
 }
 
 /* Breaks one thing, looks, mends it. */
-#define BROKEN(statement)                                        \
-    do {                                                         \
-        statement;                                               \
-        TEST_ASSERT_EQUAL(SELFCAL_CORRUPT, selfcal_check(&bank)); \
-        mend();                                                  \
+#define BROKEN(statement)                                                                                              \
+    do {                                                                                                               \
+        statement;                                                                                                     \
+        TEST_ASSERT_EQUAL(SELFCAL_CORRUPT, selfcal_check(&bank));                                                      \
+        mend();                                                                                                        \
     } while (0)
 
 static void each_broken_invariant_is_seen(void) {

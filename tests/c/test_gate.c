@@ -10,8 +10,13 @@ static selfcal_gate_t gate;
 static selfcal_gate_config_t config;
 
 void setUp(void) {
-    const selfcal_gate_config_t two = {.axes = 2, .window = 10, .false_alarm = 1e-3F, .hold = 1, .memory = 10,
-                                       .sigma = {1.0F, 1.0F}, .is_rate = {true, false}};
+    const selfcal_gate_config_t two = {.axes = 2,
+                                       .window = 10,
+                                       .false_alarm = 1e-3F,
+                                       .hold = 1,
+                                       .memory = 10,
+                                       .sigma = {1.0F, 1.0F},
+                                       .is_rate = {true, false}};
     config = two;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_gate_init(&gate, &config));
 }

@@ -34,8 +34,7 @@ static const selfcal_regressors_t regressors = {
     &selfcal_regressors_code, 1U, reference, coefficient_sd, source, ln_odds, NULL,
 };
 
-void setUp(void)
-{
+void setUp(void) {
     state = 20261126U;
     gate_config = selfcal_model_gate;
     gate_config.window = WINDOW;
@@ -51,8 +50,7 @@ void setUp(void)
 void tearDown(void) {}
 
 /* A record with gaps, a motion, and samples that are no numbers. */
-static uint32_t draw_sample(uint32_t at, float reading[])
-{
+static uint32_t draw_sample(uint32_t at, float reading[]) {
     for (unsigned axis = 0; axis < AXES; axis++) {
         reading[axis] = 0.1F * (float)axis + (axis < 3U ? 0.4F : 0.05F) * noise();
         reading[axis] += at > 8000U && at < 8200U ? 20.0F * noise() : 0.0F;
@@ -63,8 +61,7 @@ static uint32_t draw_sample(uint32_t at, float reading[])
     return draw() % 500U == 0U ? draw() % 40U : 0U;
 }
 
-static void begin(void)
-{
+static void begin(void) {
     memset(&parts, 0, sizeof parts);
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
     selfcal_imu_keep(&imu, &kept);
@@ -77,8 +74,7 @@ static void begin(void)
     }
 }
 
-static void learn(void)
-{
+static void learn(void) {
     if (parts.gate.measured == 0U) {
         parts.learn_at = SELFCAL_GATE_MEASURED_MIN;
     }
@@ -94,8 +90,7 @@ static void learn(void)
 }
 
 /* By the rules at selfcal_push_moving(), selfcal_form() and selfcal_adequacy_push(). */
-static void take_by_hand(uint32_t missing, const float reading[], const float side[])
-{
+static void take_by_hand(uint32_t missing, const float reading[], const float side[]) {
     float values[1] = {0.0F};
     const bool columns = model.regressors != NULL;
     if (missing > 0U) {
@@ -118,16 +113,14 @@ static void take_by_hand(uint32_t missing, const float reading[], const float si
     selfcal_adequacy_push(&parts.adequacy, &parts.bank, side, columns ? values : NULL);
 }
 
-static void assert_same_banks(void)
-{
+static void assert_same_banks(void) {
     const size_t after = offsetof(selfcal_t, n); /* pointers come first */
     TEST_ASSERT_EQUAL_MEMORY((const char *)&parts.bank + after, (const char *)&imu.bank + after,
                              sizeof imu.bank - after);
     TEST_ASSERT_EQUAL_MEMORY(memory[1], imu.memory, SELFCAL_SIZE(model.nodes, model.axes));
 }
 
-static void assert_same_reports(void)
-{
+static void assert_same_reports(void) {
     while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
     }
     for (uint8_t axis = 0; axis < AXES; axis++) {
@@ -150,8 +143,7 @@ static void assert_same_reports(void)
     }
 }
 
-static void run_both(float trend)
-{
+static void run_both(float trend) {
     uint32_t passed = 0; /* the missing ones too */
     begin();
     for (uint32_t at = 0; at < SAMPLES; at++) {
@@ -173,14 +165,12 @@ static void run_both(float trend)
     TEST_ASSERT_GREATER_THAN(500U, selfcal_count(&imu.bank));
 }
 
-static void test_it_is_what_its_parts_are(void)
-{
+static void test_it_is_what_its_parts_are(void) {
     run_both(0.0F);
 }
 
 /* Where an axis has a trend its report with the column counts, and no other axis's does. */
-static void test_the_likelier_report_counts(void)
-{
+static void test_the_likelier_report_counts(void) {
     model.regressors = &regressors;
     pipe.columns = &selfcal_columns_code;
     const float per_s = 4e-3F;
@@ -192,8 +182,7 @@ static void test_the_likelier_report_counts(void)
     TEST_ASSERT_TRUE(isnan(selfcal_imu_coefficients(&imu, 3)->mean)); /* the column is not for it */
 }
 
-static void test_a_corrected_sample_is_the_reading_less_the_predicted_bias(void)
-{
+static void test_a_corrected_sample_is_the_reading_less_the_predicted_bias(void) {
     run_both(0.0F);
     float reading[AXES], bias = 0.0F, sd = 0.0F;
     selfcal_corrected_t corrected;
@@ -213,16 +202,14 @@ static void test_a_corrected_sample_is_the_reading_less_the_predicted_bias(void)
 static unsigned char saved[sizeof memory[0] + sizeof imu];
 static size_t saved_bytes;
 
-static bool put(void *context, const void *bytes, size_t count)
-{
+static bool put(void *context, const void *bytes, size_t count) {
     (void)context;
     memcpy(saved + saved_bytes, bytes, count);
     saved_bytes += count;
     return true;
 }
 
-static void test_a_restored_pipe_goes_on_at_the_start_of_an_interval(void)
-{
+static void test_a_restored_pipe_goes_on_at_the_start_of_an_interval(void) {
     run_both(0.0F);
     const uint64_t before = selfcal_counters(&imu.bank)->samples;
     saved_bytes = 0;
@@ -238,8 +225,7 @@ static void test_a_restored_pipe_goes_on_at_the_start_of_an_interval(void)
 }
 
 /* An amount that the sensor adds moves bias, report and readings alike, and is kept when all else is forgotten. */
-static void test_what_the_sensor_adds_moves_with_it(void)
-{
+static void test_what_the_sensor_adds_moves_with_it(void) {
     run_both(0.0F);
     const float bias = selfcal_imu_bias(&imu, 1), report = selfcal_imu_report(&imu, 1)->bias_mean;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_shift(&imu, 1, 0.5F));
@@ -252,8 +238,7 @@ static void test_what_the_sensor_adds_moves_with_it(void)
     TEST_ASSERT_TRUE(isnan(selfcal_imu_bias(&imu, 1)));
 }
 
-static void test_what_does_not_go_together_is_refused(void)
-{
+static void test_what_does_not_go_together_is_refused(void) {
     const size_t least = SELFCAL_MODEL_IMU_BYTES;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], least));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &pipe, memory[0], least - 8U));
@@ -272,8 +257,7 @@ static void test_what_does_not_go_together_is_refused(void)
 }
 
 /* The bank alone: nothing is watched or judged. */
-static void test_a_pipe_without_parts_is_a_bank(void)
-{
+static void test_a_pipe_without_parts_is_a_bank(void) {
     pipe = (selfcal_pipe_t){.model = &model, .rate_hz = (float)BLOCK};
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], SELFCAL_MODEL_BYTES));
     TEST_ASSERT_FALSE(selfcal_imu_watch(&imu, true));
@@ -291,12 +275,11 @@ static void test_a_pipe_without_parts_is_a_bank(void)
     TEST_ASSERT_NULL(selfcal_imu_judgement(&imu, 2));
     TEST_ASSERT_NULL(selfcal_imu_coefficients(&imu, 2));
     TEST_ASSERT_EQUAL(SELFCAL_STATUS_MOTION_NOT_WATCHED, selfcal_imu_motion(&imu));
-    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_work(&imu)); /* nothing is due */
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_work(&imu));            /* nothing is due */
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_ask(&imu, 1U << AXES)); /* no such axis */
 }
 
-int main(void)
-{
+int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_it_is_what_its_parts_are);
     RUN_TEST(test_the_likelier_report_counts);

@@ -481,9 +481,9 @@ static void a_change_of_rate_changes_the_weight_alone(void) {
     }
     TEST_ASSERT_EQUAL(2, selfcal_count(&bank));
     const selfcal_node_view_t view = constant();
-    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 1.5F, (float)view.a);               /* 1 + 1/2 */
-    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.0F, (float)view.c);               /* 0 + 4/2 */
-    TEST_ASSERT_FLOAT_WITHIN(1e-6F, logf(2.0F), (float)view.ln_s);      /* ln 1 + ln 2 */
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 1.5F, (float)view.a);          /* 1 + 1/2 */
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, 2.0F, (float)view.c);          /* 0 + 4/2 */
+    TEST_ASSERT_FLOAT_WITHIN(1e-6F, logf(2.0F), (float)view.ln_s); /* ln 1 + ln 2 */
     /* the density stays: whole blocks weigh as ever */
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_rate(&bank, 4U * BLOCK, 1.0F));
     for (unsigned i = 0; i < 4U * BLOCK; i++) {

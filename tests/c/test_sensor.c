@@ -53,8 +53,7 @@ void setUp(void) {
     TEST_ASSERT_TRUE(sensor_open(&toy, &bus, 200.0F));
 }
 
-void tearDown(void) {
-}
+void tearDown(void) {}
 
 /* The part's next sample. */
 static void make(int number) {

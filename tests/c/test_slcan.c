@@ -6,16 +6,14 @@
 
 static slcan_t slcan;
 
-void setUp(void)
-{
+void setUp(void) {
     slcan_init(&slcan);
 }
 
 void tearDown(void) {}
 
 /* Feeds a text and gathers all answers. */
-static const char *answers(const char *text)
-{
+static const char *answers(const char *text) {
     static char all[256];
     size_t length = 0;
     for (; *text != '\0'; text++) {
@@ -29,8 +27,7 @@ static const char *answers(const char *text)
     return all;
 }
 
-static void test_frame_is_a_lawicel_line(void)
-{
+static void test_frame_is_a_lawicel_line(void) {
     const selfcal_frame_t frame = {0x2A1, 8, {0x01, 0x23, 0x45, 0x67, 0x89, 0xAB, 0xCD, 0xEF}};
     char line[SLCAN_FRAME_BYTES];
     slcan_encode(&frame, line);
@@ -38,44 +35,38 @@ static void test_frame_is_a_lawicel_line(void)
 }
 
 /* The bytes python-can 4.6 writes when it opens and closes the channel at 500 kbit/s. */
-static void test_python_can_opens_and_closes(void)
-{
+static void test_python_can_opens_and_closes(void) {
     TEST_ASSERT_EQUAL_STRING("\r\r\r\r\r", answers("C\rS6\r\rO\rO\r"));
     TEST_ASSERT_TRUE(slcan.open);
     TEST_ASSERT_EQUAL_STRING("\r", answers("C\r"));
     TEST_ASSERT_FALSE(slcan.open);
 }
 
-static void test_listen_only_opens_too(void)
-{
+static void test_listen_only_opens_too(void) {
     TEST_ASSERT_EQUAL_STRING("\r\r", answers("L\rL\r"));
     TEST_ASSERT_TRUE(slcan.open);
 }
 
-static void test_lines_may_end_in_both(void)
-{
+static void test_lines_may_end_in_both(void) {
     TEST_ASSERT_EQUAL_STRING("\r\rV0101\r\r", answers("C\r\nO\r\nV\r\n\r\n"));
     TEST_ASSERT_TRUE(slcan.open);
 }
 
-static void test_identification(void)
-{
+static void test_identification(void) {
     TEST_ASSERT_EQUAL_STRING("V0101\rv0101\rNSCAL\r", answers("V\rv\rN\r"));
     TEST_ASSERT_FALSE(slcan.open);
 }
 
-static void test_anything_else_is_refused(void)
-{
-    static const char *const line[] = {"S\r",  "S9\r", "S66\r", "s0000\r", "o\r", "OO\r", "O\nO\r", "t1000\r", "Z1\r",
-                                       "VV\r", " \r",  "C\n\r", "\x80\r",  "\a\r"};
+static void test_anything_else_is_refused(void) {
+    static const char *const line[] = {"S\r",     "S9\r", "S66\r", "s0000\r", "o\r",   "OO\r",   "O\nO\r",
+                                       "t1000\r", "Z1\r", "VV\r",  " \r",     "C\n\r", "\x80\r", "\a\r"};
     for (size_t i = 0; i < sizeof line / sizeof line[0]; i++) {
         TEST_ASSERT_EQUAL_STRING_MESSAGE("\a", answers(line[i]), line[i]);
         TEST_ASSERT_FALSE_MESSAGE(slcan.open, line[i]);
     }
 }
 
-static void test_overlong_line_is_refused_and_forgotten(void)
-{
+static void test_overlong_line_is_refused_and_forgotten(void) {
     char answer[SLCAN_ANSWER_BYTES];
     for (int i = 0; i < 1000000; i++) {
         TEST_ASSERT_EQUAL_size_t(0, slcan_receive(&slcan, 'O', answer));
@@ -85,14 +76,14 @@ static void test_overlong_line_is_refused_and_forgotten(void)
 }
 
 /* What the rules say of a whole line: a second formulation, over the line as a string. */
-static const char *expected(const char *line, size_t length, bool *open)
-{
+static const char *expected(const char *line, size_t length, bool *open) {
     static const char *const accepted[] = {"", "S0", "S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "C", "O", "L"};
     if (strlen(line) == length) { /* no zero byte inside */
         for (size_t i = 0; i < sizeof accepted / sizeof accepted[0]; i++) {
             if (strcmp(line, accepted[i]) == 0) {
-                *open = strcmp(line, "C") == 0 ? false : strcmp(line, "O") == 0 ||
-                    strcmp(line, "L") == 0 ? true : *open;
+                *open = strcmp(line, "C") == 0                             ? false
+                        : strcmp(line, "O") == 0 || strcmp(line, "L") == 0 ? true
+                                                                           : *open;
                 return "\r";
             }
         }
@@ -103,8 +94,7 @@ static const char *expected(const char *line, size_t length, bool *open)
     return "\a";
 }
 
-static void test_two_million_random_bytes(void)
-{
+static void test_two_million_random_bytes(void) {
     static const char likely[] = "\r\r\r\rCOLSSVvN0123456789\nt\a";
     uint32_t random = 12345;
     char line[64];
@@ -138,8 +128,7 @@ static void test_two_million_random_bytes(void)
     TEST_ASSERT_GREATER_THAN(1000, opened); /* the fuzz reached the open state */
 }
 
-int main(void)
-{
+int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_frame_is_a_lawicel_line);
     RUN_TEST(test_python_can_opens_and_closes);

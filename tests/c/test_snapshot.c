@@ -19,8 +19,15 @@
 enum { AXES = 2, BLOCK = 3, SAMPLES = 420 };
 #define MEMORY_BYTES SELFCAL_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES)
 #define BYTES_MAX SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES)
-enum { OFFSET_LENGTH = 4, OFFSET_VERSION = 8, OFFSET_REAL = 10, OFFSET_AXES = 11, OFFSET_NODES = 12, OFFSET_ID = 16,
-    OFFSET_N = 24 };
+enum {
+    OFFSET_LENGTH = 4,
+    OFFSET_VERSION = 8,
+    OFFSET_REAL = 10,
+    OFFSET_AXES = 11,
+    OFFSET_NODES = 12,
+    OFFSET_ID = 16,
+    OFFSET_N = 24
+};
 
 typedef struct {
     selfcal_t self;
@@ -219,7 +226,7 @@ static void every_byte_of_the_bank_comes_back(void) {
     const selfcal_counters_t *count = selfcal_counters(&bank.self);
     TEST_ASSERT_TRUE(count->samples > 0U && count->missing > 0U && count->gaps > 0U && count->blocks_lost > 0U &&
                      count->blocks_part > 0U && count->blocks_moving > 0U && count->not_finite[0] > 0U &&
-                         count->saturated[1] > 0U && count->stuck[1] > 0U);
+                     count->saturated[1] > 0U && count->stuck[1] > 0U);
     TEST_ASSERT_TRUE(bank.self.watched > 0U && bank.self.bad[0] > 0U && bank.self.bad_blocks[0] > 0U);
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     memset(&other, 0xA5, sizeof other);
@@ -278,9 +285,8 @@ static void any_alignment_will_do(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, save(&bank, &saved));
     for (size_t shift = 0; shift < 8U; shift++) {
         memmove(again.bytes + shift, saved.bytes, saved.length);
-        TEST_ASSERT_EQUAL(SELFCAL_OK,
-                          selfcal_restore(&other.self, &model, other.memory, sizeof other.memory, again.bytes + shift,
-                                                      saved.length));
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_restore(&other.self, &model, other.memory, sizeof other.memory,
+                                                      again.bytes + shift, saved.length));
         TEST_ASSERT_EQUAL_MEMORY(bank.memory, other.memory, SELFCAL_SIZE(model.nodes, model.axes));
     }
 }
@@ -345,11 +351,16 @@ static void other_models_builds_and_versions_are_refused(void) {
         size_t at;
         selfcal_status_t expected;
     } trials[] = {
-        {OFFSET_VERSION, SELFCAL_SNAPSHOT_VERSION}, {OFFSET_VERSION + 1, SELFCAL_SNAPSHOT_VERSION},
-        {OFFSET_REAL, SELFCAL_SNAPSHOT_FOREIGN},    {OFFSET_AXES, SELFCAL_SNAPSHOT_FOREIGN},
-        {OFFSET_NODES, SELFCAL_SNAPSHOT_FOREIGN},   {OFFSET_NODES + 1, SELFCAL_SNAPSHOT_FOREIGN},
-        {OFFSET_ID, SELFCAL_SNAPSHOT_FOREIGN},      {OFFSET_ID + 3, SELFCAL_SNAPSHOT_FOREIGN},
-        {14, SELFCAL_SNAPSHOT_FOREIGN},             {20, SELFCAL_SNAPSHOT_FOREIGN}, /* reserved; layout */
+        {OFFSET_VERSION, SELFCAL_SNAPSHOT_VERSION},
+        {OFFSET_VERSION + 1, SELFCAL_SNAPSHOT_VERSION},
+        {OFFSET_REAL, SELFCAL_SNAPSHOT_FOREIGN},
+        {OFFSET_AXES, SELFCAL_SNAPSHOT_FOREIGN},
+        {OFFSET_NODES, SELFCAL_SNAPSHOT_FOREIGN},
+        {OFFSET_NODES + 1, SELFCAL_SNAPSHOT_FOREIGN},
+        {OFFSET_ID, SELFCAL_SNAPSHOT_FOREIGN},
+        {OFFSET_ID + 3, SELFCAL_SNAPSHOT_FOREIGN},
+        {14, SELFCAL_SNAPSHOT_FOREIGN},
+        {20, SELFCAL_SNAPSHOT_FOREIGN}, /* reserved; layout */
     };
     begin_small_pair();
     for (size_t i = 0; i < sizeof trials / sizeof trials[0]; i++) {
@@ -389,9 +400,9 @@ static void bad_arguments_change_nothing(void) {
                       selfcal_restore(&other.self, &model, NULL, size, saved.bytes, saved.length));
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT,
                       selfcal_restore(&other.self, &model, other.memory, size, NULL, saved.length));
-    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_restore(&other.self, &model, other.memory,
-                                                          SELFCAL_SIZE(model.nodes, model.axes) - 1U, saved.bytes,
-                                                              saved.length));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY,
+                      selfcal_restore(&other.self, &model, other.memory, SELFCAL_SIZE(model.nodes, model.axes) - 1U,
+                                      saved.bytes, saved.length));
     model.block = 0;
     TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL,
                       selfcal_restore(&other.self, &model, other.memory, size, saved.bytes, saved.length));

@@ -10,12 +10,10 @@
 
 static const selfcal_axis_t axis_table[2];
 static const selfcal_grid_t grid; /* a hypothesis has the places whose grids it has */
-static const selfcal_hypothesis_t all_laws[] = {
-    {&named_law[GAUSS_MARKOV], 0.0F, &grid, &grid, NULL},
-    {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
-    {&named_law[RANDOM_WALK], 0.0F, &grid, NULL, NULL}};
-static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL, NULL,
-                                     NULL};
+static const selfcal_hypothesis_t all_laws[] = {{&named_law[GAUSS_MARKOV], 0.0F, &grid, &grid, NULL},
+                                                {&named_law[CONSTANT], 0.0F, NULL, NULL, NULL},
+                                                {&named_law[RANDOM_WALK], 0.0F, &grid, NULL, NULL}};
+static const selfcal_model_t full = {0xCAFEF00DU, 1.0F, 100, 2, 3, 3, axis_table, all_laws, NULL, NULL, NULL, NULL};
 static const char *const names[] = {"ay", "gx"};
 enum { GX = 0x201, AY = 0x205, GX_H0 = 0x220, AY_H0 = 0x240, GX_COEFFICIENTS = 0x20A }; /* of node 0 */
 
@@ -23,8 +21,7 @@ static selfcal_telemetry_t telemetry;
 static selfcal_counters_t counters;
 static selfcal_report_t report;
 
-void setUp(void)
-{
+void setUp(void) {
     memset(&counters, 0, sizeof counters);
     memset(&report, 0, sizeof report);
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_init(&telemetry, &full, names));
@@ -32,8 +29,7 @@ void setUp(void)
 
 void tearDown(void) {}
 
-static uint64_t bits(const selfcal_frame_t *frame)
-{
+static uint64_t bits(const selfcal_frame_t *frame) {
     uint64_t all = 0;
     for (unsigned i = 0; i < 8; i++) {
         all |= (uint64_t)frame->data[i] << (8U * i);
@@ -41,19 +37,16 @@ static uint64_t bits(const selfcal_frame_t *frame)
     return all;
 }
 
-static uint32_t value(const selfcal_frame_t *frame)
-{
+static uint32_t value(const selfcal_frame_t *frame) {
     return (uint32_t)bits(frame);
 }
 
-static uint32_t field(const selfcal_frame_t *frame, unsigned start, unsigned length)
-{
+static uint32_t field(const selfcal_frame_t *frame, unsigned start, unsigned length) {
     return (uint32_t)(bits(frame) >> start & ((1ULL << length) - 1U));
 }
 
 /* Next frame, which must carry `item`. */
-static selfcal_frame_t next(uint32_t item)
-{
+static selfcal_frame_t next(uint32_t item) {
     selfcal_frame_t frame;
     TEST_ASSERT_TRUE(selfcal_telemetry_next(&telemetry, &frame));
     TEST_ASSERT_EQUAL_UINT32(item, field(&frame, 32, 6));
@@ -61,16 +54,14 @@ static selfcal_frame_t next(uint32_t item)
 }
 
 /* Next frame, which must carry `item` of the message `id`. */
-static selfcal_frame_t next_of(uint16_t id, uint32_t item)
-{
+static selfcal_frame_t next_of(uint16_t id, uint32_t item) {
     const selfcal_frame_t frame = next(item);
     TEST_ASSERT_EQUAL_HEX16(id, frame.id);
     return frame;
 }
 
 /* All frames; returns how many. */
-static unsigned drain(void)
-{
+static unsigned drain(void) {
     selfcal_frame_t frame;
     unsigned count = 0;
     while (selfcal_telemetry_next(&telemetry, &frame)) {
@@ -79,8 +70,7 @@ static unsigned drain(void)
     return count;
 }
 
-static uint32_t bits_of(float number)
-{
+static uint32_t bits_of(float number) {
     uint32_t all;
     memcpy(&all, &number, sizeof all);
     return all;
@@ -88,17 +78,22 @@ static uint32_t bits_of(float number)
 
 /* Published check value of CRC-12/CDMA2000 (catalogue of parametrised CRC algorithms, G. Cook): "123456789" gives
  * 0xD4D. */
-static void test_crc_check_value(void)
-{
+static void test_crc_check_value(void) {
     TEST_ASSERT_EQUAL_HEX16(0xD4D, selfcal_crc12((const uint8_t *)"123456789", 9));
 }
 
 /* The checksum by long division of the covered bits, one bit at a time, as the DBC states them. */
-static uint32_t crc_by_division(const selfcal_frame_t *frame)
-{
-    const uint8_t covered[10] = {(uint8_t)(frame->id >> 8), (uint8_t)(frame->id & 0xFFU), frame->length,
-                                 frame->data[0], frame->data[1], frame->data[2], frame->data[3], frame->data[4],
-                                 frame->data[5], (uint8_t)(frame->data[6] & 0x0FU)};
+static uint32_t crc_by_division(const selfcal_frame_t *frame) {
+    const uint8_t covered[10] = {(uint8_t)(frame->id >> 8),
+                                 (uint8_t)(frame->id & 0xFFU),
+                                 frame->length,
+                                 frame->data[0],
+                                 frame->data[1],
+                                 frame->data[2],
+                                 frame->data[3],
+                                 frame->data[4],
+                                 frame->data[5],
+                                 (uint8_t)(frame->data[6] & 0x0FU)};
     uint32_t remainder = 0xFFFU;
     for (unsigned bit = 0; bit < 8U * sizeof covered; bit++) {
         const uint32_t in = ((uint32_t)covered[bit / 8U] >> (7U - bit % 8U)) & 1U;
@@ -108,8 +103,7 @@ static uint32_t crc_by_division(const selfcal_frame_t *frame)
     return remainder;
 }
 
-static void test_every_frame_has_form_counter_time_and_checksum(void)
-{
+static void test_every_frame_has_form_counter_time_and_checksum(void) {
     const uint32_t time_ms = 4294967295U; /* the last before it wraps: 4294967 s */
     for (unsigned counter = 0; counter < 300;) {
         report.axis = (uint8_t)(counter % 2U);
@@ -126,8 +120,7 @@ static void test_every_frame_has_form_counter_time_and_checksum(void)
     }
 }
 
-static void test_full_report_is_opening_hypotheses_and_end(void)
-{
+static void test_full_report_is_opening_hypotheses_and_end(void) {
     const uint32_t time_ms = 0x12345678U;
     static const uint32_t last_item[] = {17, 7, 12}; /* three places, one, two */
     report.axis = 1;
@@ -150,12 +143,10 @@ static void test_full_report_is_opening_hypotheses_and_end(void)
 
 /* Place 1 is K if the law has a walk, else the deviation. Place 2 has the grid alpha. Every statistic and flag is its
  * own. */
-static void test_each_place_carries_its_parameter(void)
-{
-    static const selfcal_parameter_t parameter[3][3] = {
-        {SELFCAL_N, SELFCAL_SIGMA_M, SELFCAL_ALPHA},
-        {SELFCAL_N, SELFCAL_PARAMETERS, SELFCAL_PARAMETERS},
-        {SELFCAL_N, SELFCAL_K, SELFCAL_PARAMETERS}};
+static void test_each_place_carries_its_parameter(void) {
+    static const selfcal_parameter_t parameter[3][3] = {{SELFCAL_N, SELFCAL_SIGMA_M, SELFCAL_ALPHA},
+                                                        {SELFCAL_N, SELFCAL_PARAMETERS, SELFCAL_PARAMETERS},
+                                                        {SELFCAL_N, SELFCAL_K, SELFCAL_PARAMETERS}};
     for (unsigned k = 0; k < 3; k++) {
         for (unsigned q = 0; q < SELFCAL_PARAMETERS; q++) {
             const float base = (float)(100U * k + 10U * q);
@@ -194,8 +185,7 @@ static void test_each_place_carries_its_parameter(void)
     (void)next_of(AY, 43);
 }
 
-static void test_the_same_law_may_stand_more_than_once(void)
-{
+static void test_the_same_law_may_stand_more_than_once(void) {
     static selfcal_hypothesis_t same[9];
     static selfcal_model_t model;
     TEST_ASSERT_TRUE(SELFCAL_HYPOTHESES_MAX >= 4);
@@ -218,8 +208,7 @@ static void test_the_same_law_may_stand_more_than_once(void)
 }
 
 /* Columns by place, before the end; one of which nothing is known is left out. */
-static void test_coefficients_are_sent_by_column(void)
-{
+static void test_coefficients_are_sent_by_column(void) {
     static const selfcal_regressors_t regressors = {.count = 3};
     static const selfcal_sent_coefficient_t column[] = {{0.25F, 0.5F, 0.75F}, {NAN, NAN, NAN}, {-2.0F, 4.0F, 1.0F}};
     selfcal_model_t model = full;
@@ -251,8 +240,7 @@ static void test_coefficients_are_sent_by_column(void)
 }
 
 /* Node n has the identifiers of node 0, 128 n higher; the checksum covers them. */
-static void test_a_node_has_identifiers_of_its_own(void)
-{
+static void test_a_node_has_identifiers_of_its_own(void) {
     for (uint8_t node = 0; node < 12; node++) {
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_node(&telemetry, node));
         const uint16_t first = (uint16_t)(0x200U + 128U * node);
@@ -277,8 +265,7 @@ static void test_a_node_has_identifiers_of_its_own(void)
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_node(NULL, 0));
 }
 
-static void test_evidences_are_differences_to_the_best_held_at_the_ends(void)
-{
+static void test_evidences_are_differences_to_the_best_held_at_the_ends(void) {
     report.hypothesis[0].ln_evidence = -1000.0;
     report.hypothesis[1].ln_evidence = -1.0e12;     /* beyond 2^31 steps */
     report.hypothesis[2].ln_evidence = -1001.23456; /* in steps of 0.001 */
@@ -302,8 +289,7 @@ static void test_evidences_are_differences_to_the_best_held_at_the_ends(void)
     }
 }
 
-static void test_health_flags_are_the_axis_s_own(void)
-{
+static void test_health_flags_are_the_axis_s_own(void) {
     counters.stuck[1] = 1;
     counters.gaps = 1;
     counters.outliers[1] = 5;
@@ -320,8 +306,7 @@ static void test_health_flags_are_the_axis_s_own(void)
     }
 }
 
-static void test_status_counts_stop_at_the_end_of_their_range(void)
-{
+static void test_status_counts_stop_at_the_end_of_their_range(void) {
     counters.samples = 0x1FFFFFFFFULL;
     counters.saturated[0] = 0xFFFFFFFFU;
     counters.saturated[1] = 2;
@@ -344,8 +329,7 @@ static void test_status_counts_stop_at_the_end_of_their_range(void)
     TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
 }
 
-static void test_busy_until_all_frames_are_fetched(void)
-{
+static void test_busy_until_all_frames_are_fetched(void) {
     selfcal_frame_t frame;
     TEST_ASSERT_FALSE(selfcal_telemetry_next(&telemetry, &frame));
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_report(&telemetry, &report, &counters, 0));
@@ -358,8 +342,7 @@ static void test_busy_until_all_frames_are_fetched(void)
 
 /* gx is axis 1 of the model and item 1 (its sd 7), ay axis 0 and item 5 (11); an axis without sd, and axes the model
  * has not, are left out. */
-static void test_a_corrected_sample_goes_out_by_axis(void)
-{
+static void test_a_corrected_sample_goes_out_by_axis(void) {
     selfcal_corrected_t corrected = {
         {0.25F, -1.5F}, {0.5F, 0.125F}, 2U, {SELFCAL_REASON_NOT_IDENTIFIED, SELFCAL_REASON_NONE}};
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_corrected(&telemetry, &corrected, 70000));
@@ -386,8 +369,7 @@ static void test_a_corrected_sample_goes_out_by_axis(void)
     TEST_ASSERT_EQUAL_UINT(4, drain());
 }
 
-static void test_an_answer_is_one_frame(void)
-{
+static void test_an_answer_is_one_frame(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_answer(&telemetry, 1, 0x0305, 9000));
     selfcal_frame_t frame = next(1);
     TEST_ASSERT_EQUAL_HEX16(0x209, frame.id);
@@ -398,8 +380,7 @@ static void test_an_answer_is_one_frame(void)
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_corrected(&telemetry, NULL, 0));
 }
 
-static void test_bad_arguments_and_models_are_refused(void)
-{
+static void test_bad_arguments_and_models_are_refused(void) {
     static const char *const unknown[] = {"ay", "mx"};
     static const char *const twice[] = {"gx", "gx"};
     static const char *const none[] = {"gx", NULL};
@@ -417,8 +398,7 @@ static void test_bad_arguments_and_models_are_refused(void)
     TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_status(&telemetry, NULL, SELFCAL_RUNNING, 1, 0));
 }
 
-int main(void)
-{
+int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_crc_check_value);
     RUN_TEST(test_every_frame_has_form_counter_time_and_checksum);

@@ -60,8 +60,9 @@ static sensor_fault_t toy_end_test(sensor_state_t *state) {
         return SENSOR_NOT_YET;
     }
     ((toy_t *)(void *)state)->placed = false;
-    return control != TOY_TEST_PASSED ? SENSOR_SELF_TEST
-                                      : toy_write(state, TOY_CONTROL, TOY_ON) ? SENSOR_NO_FAULT : SENSOR_SET_UP;
+    return control != TOY_TEST_PASSED              ? SENSOR_SELF_TEST
+           : toy_write(state, TOY_CONTROL, TOY_ON) ? SENSOR_NO_FAULT
+                                                   : SENSOR_SET_UP;
 }
 
 static void toy_watch(sensor_state_t *state, uint64_t now_us) {
@@ -93,8 +94,9 @@ static bool toy_read(sensor_state_t *state, int32_t raw[SENSOR_AXES], uint32_t *
         self->temperature = 0.01F * (float)word;
     }
     const uint64_t now_us = state->bus->time_us(), passed = (now_us - self->last_us + 2500U) / 5000U;
-    *missing = self->placed ? (uint16_t)(count - self->count - 1U)
-               : state->counters.samples > 0U && passed > 0U ? (uint32_t)(passed - 1U) : 0U;
+    *missing = self->placed                                  ? (uint16_t)(count - self->count - 1U)
+               : state->counters.samples > 0U && passed > 0U ? (uint32_t)(passed - 1U)
+                                                             : 0U;
     self->count = count;
     self->last_us = now_us;
     self->placed = true;

@@ -20,18 +20,19 @@ enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NOD
 enum { STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 32 };
 /* for bank samples, some 0.1 ms; but a batch and a part of the next are had by all */
 enum { EFFORT = 1500, SAMPLES_MIN = 10 };
-#define MORE (SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
-              SELFCAL_TERMS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX))
+#define MORE                                                                                                           \
+    (SELFCAL_REGRESSORS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) +                                    \
+     SELFCAL_TERMS_SIZE(NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX))
 #define BYTES_MAX (SELFCAL_SNAPSHOT_MAX(SELFCAL_SIZE(NODES_MAX, SELFCAL_AXES_MAX)) + MORE)
 
 #define LENGTH(array) (sizeof(array) / sizeof((array)[0]))
 
-#define HOLDS(condition)                                                        \
-    do {                                                                        \
-        if (!(condition)) {                                                     \
-            (void)fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #condition); \
-            abort();                                                            \
-        }                                                                       \
+#define HOLDS(condition)                                                                                               \
+    do {                                                                                                               \
+        if (!(condition)) {                                                                                            \
+            (void)fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #condition);                                      \
+            abort();                                                                                                   \
+        }                                                                                                              \
     } while (0)
 
 typedef struct {
@@ -49,11 +50,10 @@ typedef struct {
 } store_t;
 
 static selfcal_axis_t axis_table[SELFCAL_AXES_MAX];
-static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {
-    {-6.9F, -0.7F, false, false},
-    {-10.0F, -3.0F, false, false},
-    {-7.0F, -1.0F, false, false},
-    {-2.0F, 2.0F, false, false}};
+static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {{-6.9F, -0.7F, false, false},
+                                                                {-10.0F, -3.0F, false, false},
+                                                                {-7.0F, -1.0F, false, false},
+                                                                {-2.0F, 2.0F, false, false}};
 static selfcal_prior_t of_ratio[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_law_t law_table[NAMED_LAWS];
@@ -67,15 +67,15 @@ static float coefficient_mean[SELFCAL_AXES_MAX * SELFCAL_REGRESSORS_MAX];
 static float values[SELFCAL_REGRESSORS_MAX]; /* of the regressors, as they come with the next sample */
 
 static bank_t bank, twin;
-static bool twinned;      /* the twin is at the bank's state */
-static bool tampered;     /* the bank comes from a snapshot that no bank wrote: numbers may overflow, memory may not */
-static bool reporting;    /* a report is under way */
-static size_t in_use;     /* bytes of their memory */
+static bool twinned;   /* the twin is at the bank's state */
+static bool tampered;  /* the bank comes from a snapshot that no bank wrote: numbers may overflow, memory may not */
+static bool reporting; /* a report is under way */
+static size_t in_use;  /* bytes of their memory */
 static unsigned pushes, effort, steps, snapshots; /* left: long inputs, whole reports and snapshots are slow */
-static unsigned sample_effort;    /* of effort, for a bank sample */
+static unsigned sample_effort;                    /* of effort, for a bank sample */
 /* left: looks that take all nodes through a part of a batch, reports that come to an end */
 static unsigned flushes, reports;
-static bool moved;                /* there may be such a part */
+static bool moved; /* there may be such a part */
 static selfcal_counters_t before;
 static uint32_t count_before;
 static selfcal_work_t work, twin_work;
@@ -193,8 +193,8 @@ static void make_model(input_t *in, bool any_sums) {
             h->rho = law != CONSTANT ? &grid : NULL;
             h->alpha = law >= GAUSS_MARKOV ? &grid : NULL;
             h->prior = law >= MOVING_AVERAGE ? &of_ratio[0][0] : NULL;
-            model.nodes = (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) *
-                                     (h->alpha != NULL ? NODES_A_GRID : 1));
+            model.nodes =
+                (uint16_t)(model.nodes + (h->rho != NULL ? NODES_A_GRID : 1) * (h->alpha != NULL ? NODES_A_GRID : 1));
         }
     }
     if ((kind >> 7 & 1U) != 0U) {
@@ -298,8 +298,9 @@ static size_t plain_nodes(void) {
     size_t nodes = 0;
     for (uint8_t h = 0; h < model.hypotheses; h++) {
         const selfcal_hypothesis_t *of = &hypothesis_table[h];
-        nodes += selfcal_law_is_sum(of->law) ? 0U
-            : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
+        nodes += selfcal_law_is_sum(of->law)
+                     ? 0U
+                     : (of->rho != NULL ? NODES_A_GRID : 1U) * (of->alpha != NULL ? NODES_A_GRID : 1U);
     }
     return nodes;
 }
@@ -308,7 +309,7 @@ static size_t plain_nodes(void) {
  * digits. */
 static unsigned effort_of_sample(void) {
     const unsigned columns = 1U + model.axes + (model.regressors != NULL ? regressors.count : 0U),
-        plain = (unsigned)plain_nodes();
+                   plain = (unsigned)plain_nodes();
     return (model.nodes - plain) * (3U + columns) + plain * (2U + columns) / (model.regressors != NULL ? 2U : 4U) + 1U;
 }
 
@@ -329,13 +330,13 @@ static void fence(bank_t *of) {
 /* All but the pointers; padding is clear in both. */
 static void equal_banks(const bank_t *one, const bank_t *two) {
     const size_t from = offsetof(selfcal_t, n);
-    HOLDS(memcmp((const uint8_t *)&one->self + from, (const uint8_t *)&two->self + from,
-                 sizeof(selfcal_t) - from) == 0);
+    HOLDS(memcmp((const uint8_t *)&one->self + from, (const uint8_t *)&two->self + from, sizeof(selfcal_t) - from) ==
+          0);
     HOLDS(memcmp(one->memory, two->memory, SELFCAL_SIZE(model.nodes, model.axes)) == 0);
     if (model.regressors != NULL) {
         const uint8_t *a = (const void *)one->self.columns->column, *b = (const void *)two->self.columns->column;
-        const size_t all = SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U -
-            sizeof(selfcal_columns_t);
+        const size_t all =
+            SELFCAL_REGRESSORS_SIZE(model.nodes, model.axes, regressors.count) - 7U - sizeof(selfcal_columns_t);
         HOLDS(memcmp(a, b, all) == 0);
     }
     if (one->self.terms != NULL) {
@@ -363,8 +364,7 @@ static void check_counters(void) {
           grown(before.blocks_moving, now.blocks_moving));
     for (unsigned axis = 0; axis < model.axes; axis++) {
         HOLDS(grown(before.not_finite[axis], now.not_finite[axis]) &&
-              grown(before.saturated[axis], now.saturated[axis]) &&
-              grown(before.stuck[axis], now.stuck[axis]));
+              grown(before.saturated[axis], now.saturated[axis]) && grown(before.stuck[axis], now.stuck[axis]));
         HOLDS(isfinite(selfcal_offset(&bank.self, (uint8_t)axis)));
         HOLDS(!(selfcal_within_sd(&bank.self, (uint8_t)axis) < 0.0F));
     }
@@ -573,8 +573,7 @@ static void report_steps(unsigned wanted) {
     for (; reporting && wanted > 0U && steps > 0U && status == SELFCAL_BUSY; wanted--, steps--) {
         status = selfcal_report_step(&work, &report);
         HOLDS(status == SELFCAL_BUSY || status == SELFCAL_OK || status == SELFCAL_OVERTAKEN ||
-              status == SELFCAL_AXIS_RETIRED ||
-              (status == SELFCAL_TOO_SHORT && model.forgetting != NULL));
+              status == SELFCAL_AXIS_RETIRED || (status == SELFCAL_TOO_SHORT && model.forgetting != NULL));
         HOLDS(!twinned || selfcal_report_step(&twin_work, &twin_report) == status);
     }
     if (status != SELFCAL_BUSY) {
@@ -587,8 +586,8 @@ static void report_steps(unsigned wanted) {
         if (!tampered) {
             check_report();
         }
-        if (has_telemetry && selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank.self),
-                                                      1000U) == SELFCAL_OK) {
+        if (has_telemetry &&
+            selfcal_telemetry_report(&telemetry, &report, selfcal_counters(&bank.self), 1000U) == SELFCAL_OK) {
             check_frames();
         }
     }

@@ -256,7 +256,6 @@ def test_times_of_other_forms_get_the_way_out(cell: str, tmp_path: Path) -> None
     assert load(log, columns={"t": "when"}).rate_hz == pytest.approx(1.0)
 
 
-
 def test_no_time_takes_the_stated_rate(tmp_path: Path) -> None:
     n = 500
     stamps = np.random.default_rng(1).uniform(0.0, 1.0, n)

@@ -79,9 +79,7 @@ def test_a_level_that_follows_nothing() -> None:
     """Two channels beside it change, and the other axis is shaken: no more look so than a look may by chance."""
     random = np.random.default_rng(71)
     records = case_records(60, 1000)
-    count = sum(
-        any(look.net >= NET_LEAST for look in looked(*drawn(random, "nothing")[:3])) for _ in range(records)
-    )
+    count = sum(any(look.net >= NET_LEAST for look in looked(*drawn(random, "nothing")[:3])) for _ in range(records))
     print(f"clean: {count} of {records}")
     assert count <= poisson.isf(1e-3, records * P_LOOK)
 

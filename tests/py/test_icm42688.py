@@ -362,9 +362,7 @@ def test_a_long_pause(library: ctypes.CDLL, pause_s: float) -> None:
         ({"dead": True, "floating_high": False}, SILENT, {"dead": False}),
     ],
 )
-def test_a_fault(
-    library: ctypes.CDLL, change: dict[str, bool], fault: int, recovers: dict[str, bool]
-) -> None:
+def test_a_fault(library: ctypes.CDLL, change: dict[str, bool], fault: int, recovers: dict[str, bool]) -> None:
     """Told within half a second, and none of its packets is delivered as new. After it samples come again, and the gap
     is counted."""
     product = Product(library, 200.0)

@@ -25,13 +25,12 @@ using SourceTuple = std::tuple<int, uint8_t, float, float>; // selfcal_source_t
 // [columns] source, [axes * columns] ln prior odds
 using ColumnsTuple = std::tuple<std::vector<SourceTuple>, std::vector<float>>;
 // window, false_alarm, hold, settle, memory, sigma [axes], is_rate [axes]
-using GateTuple =
-    std::tuple<uint32_t, float, uint32_t, uint32_t, uint32_t, std::vector<float>, std::vector<bool>>;
+using GateTuple = std::tuple<uint32_t, float, uint32_t, uint32_t, uint32_t, std::vector<float>, std::vector<bool>>;
 
 namespace MODULE_NAME {
 
 class Module : Tables {
-public:
+  public:
     Module(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes,
            const std::vector<HypothesisTuple> &hypotheses, uint32_t id,
            const std::optional<RegressorsTuple> &regressors, double half_life_s,
@@ -49,7 +48,8 @@ public:
         model_of_ = {{&model_, static_cast<float>(rate_hz), gate ? watch(*gate) : nullptr,
                       gate ? &selfcal_gate_code : nullptr, columns ? &selfcal_columns_code : nullptr,
                       &selfcal_judging_code, changes ? &selfcal_changes_code : nullptr},
-                     name_.data(), channels};
+                     name_.data(),
+                     channels};
         firmware_model = &model_of_;
         file_.reset(std::fopen(rows.c_str(), "rb"));
         if (!file_)
@@ -81,7 +81,7 @@ public:
 
     bool ended() const { return !more_; }
 
-private:
+  private:
     void form(const ColumnsTuple &columns) {
         for (const auto &[kind, channel, number, second] : std::get<0>(columns))
             source_.push_back({static_cast<selfcal_column_kind_t>(kind), channel, number, second});

@@ -26,11 +26,10 @@ using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu
 namespace MODULE_NAME {
 
 class Bank : Tables {
-public:
+  public:
     Bank(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes,
-         const std::vector<HypothesisTuple> &hypotheses,
-         uint32_t id, const std::optional<RegressorsTuple> &regressors, double half_life_s,
-         const std::tuple<double, bool, bool> &handling)
+         const std::vector<HypothesisTuple> &hypotheses, uint32_t id, const std::optional<RegressorsTuple> &regressors,
+         double half_life_s, const std::tuple<double, bool, bool> &handling)
         : Tables(dt_s, block, axes, hypotheses, id, regressors, half_life_s, handling) {
         memory_.resize(size() / sizeof(double) + 1);
         check(selfcal_init(&bank_, &model_, memory_.data(), memory_.size() * sizeof(double)));
@@ -249,7 +248,7 @@ public:
     uint16_t nodes() const { return model_.nodes; }
     size_t size() const {
         return SELFCAL_SIZE(model_.nodes, model_.axes) +
-            SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size()) +
+               SELFCAL_REGRESSORS_SIZE(model_.nodes, model_.axes, reference_.size()) +
                SELFCAL_TERMS_SIZE(term_nodes_, model_.axes, reference_.size());
     }
 
@@ -277,32 +276,22 @@ public:
         return selfcal_within_sd(&bank_, axis);
     }
 
-private:
+  private:
     static void check(selfcal_status_t status) {
         switch (status) {
-        case SELFCAL_OK:
-            return;
-        case SELFCAL_TOO_SHORT:
-            throw std::length_error("too few bank samples for a report");
-        case SELFCAL_AXIS_RETIRED:
-            throw std::domain_error("the axis is retired: it failed for too long");
-        case SELFCAL_BAD_ARGUMENT:
-            throw std::invalid_argument("argument out of range");
+        case SELFCAL_OK: return;
+        case SELFCAL_TOO_SHORT: throw std::length_error("too few bank samples for a report");
+        case SELFCAL_AXIS_RETIRED: throw std::domain_error("the axis is retired: it failed for too long");
+        case SELFCAL_BAD_ARGUMENT: throw std::invalid_argument("argument out of range");
         case SELFCAL_BAD_MODEL:
             throw std::invalid_argument("the model's tables contradict themselves or exceed "
                                         "what the library is built for");
-        case SELFCAL_SNAPSHOT_TRUNCATED:
-            throw std::invalid_argument("the snapshot is truncated");
-        case SELFCAL_SNAPSHOT_TOO_LONG:
-            throw std::invalid_argument("the snapshot is longer than it says");
-        case SELFCAL_SNAPSHOT_DAMAGED:
-            throw std::invalid_argument("the snapshot is damaged");
-        case SELFCAL_SNAPSHOT_FOREIGN:
-            throw std::invalid_argument("not a snapshot of this model and build");
-        case SELFCAL_SNAPSHOT_VERSION:
-            throw std::invalid_argument("the snapshot is of another format version");
-        default:
-            throw std::runtime_error("selfcal status " + std::to_string(static_cast<int>(status)));
+        case SELFCAL_SNAPSHOT_TRUNCATED: throw std::invalid_argument("the snapshot is truncated");
+        case SELFCAL_SNAPSHOT_TOO_LONG: throw std::invalid_argument("the snapshot is longer than it says");
+        case SELFCAL_SNAPSHOT_DAMAGED: throw std::invalid_argument("the snapshot is damaged");
+        case SELFCAL_SNAPSHOT_FOREIGN: throw std::invalid_argument("not a snapshot of this model and build");
+        case SELFCAL_SNAPSHOT_VERSION: throw std::invalid_argument("the snapshot is of another format version");
+        default: throw std::runtime_error("selfcal status " + std::to_string(static_cast<int>(status)));
         }
     }
 
@@ -312,14 +301,13 @@ private:
 };
 
 class Gate {
-public:
+  public:
     Gate(uint32_t window, float false_alarm, uint32_t hold, uint32_t settle, uint32_t memory,
-         const std::vector<float> &sigma,
-         const std::vector<bool> &is_rate) {
+         const std::vector<float> &sigma, const std::vector<bool> &is_rate) {
         if (sigma.size() > SELFCAL_AXES_MAX || is_rate.size() != sigma.size())
             throw std::invalid_argument("one sigma and one kind an axis, up to SELFCAL_AXES_MAX");
-        selfcal_gate_config_t config{static_cast<uint8_t>(sigma.size()), window, false_alarm, hold, settle, memory, {},
-            {}};
+        selfcal_gate_config_t config{
+            static_cast<uint8_t>(sigma.size()), window, false_alarm, hold, settle, memory, {}, {}};
         std::copy(sigma.begin(), sigma.end(), config.sigma);
         std::copy(is_rate.begin(), is_rate.end(), config.is_rate);
         check(selfcal_gate_init(&gate_, &config));
@@ -365,7 +353,7 @@ public:
         return d;
     }
 
-private:
+  private:
     static void check(selfcal_status_t status) {
         if (status != SELFCAL_OK)
             throw std::invalid_argument(status == SELFCAL_TOO_SHORT ? "too few windows" : "argument out of range");
@@ -380,8 +368,7 @@ using SourceTuple = std::tuple<int, int, float, float>; // kind, channel, number
 // `powered` samples after power-on.
 using Missing = nb::ndarray<const uint64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 static nb::ndarray<nb::numpy, float> form(const std::vector<SourceTuple> &tuples, double interval_s,
-                                          const Rows &channels, const Missing &missing_before,
-                                          uint64_t powered) {
+                                          const Rows &channels, const Missing &missing_before, uint64_t powered) {
     std::vector<selfcal_source_t> sources;
     for (const auto &[kind, channel, number, second] : tuples) {
         if (channel < 0 || static_cast<size_t>(channel) >= std::max<size_t>(channels.shape(1), 1))
@@ -430,7 +417,7 @@ NB_MODULE(MODULE_NAME, m) {
         .def(nb::init<double, uint32_t, const std::vector<AxisTuple> &, const std::vector<HypothesisTuple> &, uint32_t,
                       const std::optional<RegressorsTuple> &, double, const std::tuple<double, bool, bool> &>(),
              nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("regressors") = nb::none(),
-                 nb::arg("half_life_s") = 0.0, nb::arg("handling") = std::make_tuple(0.0, false, false))
+             nb::arg("half_life_s") = 0.0, nb::arg("handling") = std::make_tuple(0.0, false, false))
         .def("push", &Bank::push, nb::arg(), nb::arg(), nb::arg("regressors") = nb::none())
         .def("watch", &Bank::watch)
         .def("skip", &Bank::skip)
@@ -461,7 +448,7 @@ NB_MODULE(MODULE_NAME, m) {
     using MODULE_NAME::Gate;
     nb::class_<Gate>(m, "Gate")
         .def(nb::init<uint32_t, float, uint32_t, uint32_t, uint32_t, const std::vector<float> &,
-             const std::vector<bool> &>())
+                      const std::vector<bool> &>())
         .def("push", &Gate::push)
         .def("skip", &Gate::skip)
         .def("noise", &Gate::noise)

@@ -107,12 +107,24 @@ template <int V> struct Dual {
     }
 };
 
-double value_of(double a) { return a; }
-template <int V> double value_of(const Dual<V> &a) { return a.value; }
-double root(double a) { return std::sqrt(a); }
-template <int V> Dual<V> root(const Dual<V> &a) { return a.through(std::sqrt(a.value), 0.5 / std::sqrt(a.value)); }
-double ln(double a) { return std::log(a); }
-template <int V> Dual<V> ln(const Dual<V> &a) { return a.through(std::log(a.value), 1.0 / a.value); }
+double value_of(double a) {
+    return a;
+}
+template <int V> double value_of(const Dual<V> &a) {
+    return a.value;
+}
+double root(double a) {
+    return std::sqrt(a);
+}
+template <int V> Dual<V> root(const Dual<V> &a) {
+    return a.through(std::sqrt(a.value), 0.5 / std::sqrt(a.value));
+}
+double ln(double a) {
+    return std::log(a);
+}
+template <int V> Dual<V> ln(const Dual<V> &a) {
+    return a.through(std::log(a.value), 1.0 / a.value);
+}
 
 // The matrices of a model, and their derivatives by each of `count` parameters, one after the other.
 struct Matrices {
@@ -130,7 +142,9 @@ struct Input {
     std::size_t mark_count;
 };
 
-void take(double &to, const double *values, const double *, std::size_t i, std::size_t, std::size_t) { to = values[i]; }
+void take(double &to, const double *values, const double *, std::size_t i, std::size_t, std::size_t) {
+    to = values[i];
+}
 
 template <int V>
 void take(Dual<V> &to, const double *values, const double *by, std::size_t i, std::size_t size, std::size_t count) {
@@ -322,7 +336,7 @@ template <class T, int D, bool PLAIN> struct Filter {
     std::vector<Gain<T, D>> *const gains; // null: nobody asks for them
     const Model<T, D> m;
     alignas(aligned) T below[D] = {}, on[D] = {}, above[D] = {}; // F[a][a-1], F[a][a], F[a][a+1]
-    bool tied[D] = {};                          // whether the state is one of a pair
+    bool tied[D] = {};                                           // whether the state is one of a pair
     alignas(aligned) Square<T, D> P;
     alignas(aligned) T FK[D] = {};
     T s = 0.0, scale = 0.0, ln_now = 0.0;
@@ -753,7 +767,7 @@ template <int D> void filter(std::size_t states, bool diagonal, const Input &in,
 
 // Derivatives, by each parameter, of the sums over one column; and the sums of products that their information is.
 struct Slopes {
-    double *G, *D;             // [count]
+    double *G, *D;                // [count]
     double *innovations, *spread; // [count, count]
 };
 
@@ -771,8 +785,7 @@ template <int V, int D, bool PLAIN> void passed(const Input &in, const Sums &out
 }
 
 // Compiled for few numbers of states: every one up to 4 and every second beyond, of many parameters every eighth.
-template <int V, int D>
-void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
+template <int V, int D> void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
     if (in.states > D) {
         if constexpr (D < states_max)
             differentiated<V, D + (V == 2 ? 8 : D < 4 ? 1 : 2)>(diagonal, in, out, slopes);
@@ -845,8 +858,8 @@ template <int D> struct Backward {
         for (int a = 0; a < E; a++) {
             const int before = a > 0 ? a - 1 : 0, after = a < E - 1 ? a + 1 : a;
             for (int c = 0; c < columns; c++) {
-                const double next = left[a] * was[before][c] + on[a] * was[a][c] + right[a] * was[after][c] -
-                                    gR[c] * h[a];
+                const double next =
+                    left[a] * was[before][c] + on[a] * was[a][c] + right[a] * was[after][c] - gR[c] * h[a];
                 R[a][c] = std::fabs(next) < 1e-250 ? 0.0 : next;
             }
         }
@@ -892,7 +905,9 @@ template <int D> void shifted(std::size_t states, const Input &in, const Sums &o
         shifted<D + 1>(states, in, out, shifts);
 }
 
-double *fresh(std::size_t size) { return new double[size > 0 ? size : 1]; }
+double *fresh(std::size_t size) {
+    return new double[size > 0 ? size : 1];
+}
 
 Out array(double *data, std::vector<std::size_t> shape) {
     nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<double *>(p); });

@@ -30,7 +30,7 @@ using Laws = nb::ndarray<const int, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // A numpy array that owns what it is filled with.
 template <typename T> class Array {
-public:
+  public:
     explicit Array(std::vector<std::size_t> shape) : shape_(std::move(shape)) {
         for (const std::size_t n : shape_)
             size_ *= n;
@@ -40,7 +40,7 @@ public:
     T *data() const { return data_; }
     nb::ndarray<nb::numpy, T> numpy() const { return {data_, shape_.size(), shape_.data(), owner_}; }
 
-private:
+  private:
     std::vector<std::size_t> shape_;
     std::size_t size_ = 1;
     T *data_;
@@ -126,8 +126,7 @@ sr::Node node(const std::vector<sr::Law> &laws, int hypothesis, double drift, do
     const auto takes_second = [](const sr::Term &term) {
         return term.by_ratio || (term.kind != sr::Kind::walk && !term.stated);
     };
-    const bool has_second =
-        law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), takes_second);
+    const bool has_second = law.coloured_noise || std::any_of(law.terms.begin(), law.terms.end(), takes_second);
     if (!(sigma_v > 0.0) || (!law.terms.empty() && !(drift >= 0.0)) || (has_second && !(second > 0.0)))
         throw std::invalid_argument("sigma_v and alpha or a ratio must be positive, drift at least 0");
     return out;
@@ -202,8 +201,8 @@ run_bank(const Vector &y, double dt_s, double bias_mean, double bias_sd, const s
             Eigen::Map<Eigen::Matrix3d>(covariance.data() + (m * k + h) * 9) = p.covariance[h];
         }
     }
-    return {weight.numpy(),        probability.numpy(), mean.numpy(), covariance.numpy(), bias_mean_now.numpy(),
-            bias_var_now.numpy()};
+    return {weight.numpy(),     probability.numpy(),   mean.numpy(),
+            covariance.numpy(), bias_mean_now.numpy(), bias_var_now.numpy()};
 }
 
 Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_sd, const LawTuple &law, double drift,
@@ -220,8 +219,8 @@ Output innovations(const Vector &y, double dt_s, double bias_mean, double bias_s
     return out.numpy();
 }
 
-std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<double>> simulate(
-    const sr::Scene &scene, const std::vector<sr::Axis> &axes, nb::object added) {
+std::tuple<Output, Output, Output, nb::ndarray<nb::numpy, bool>, std::vector<double>>
+simulate(const sr::Scene &scene, const std::vector<sr::Axis> &axes, nb::object added) {
     if (!(scene.rate_hz > 0.0) || scene.block < 1 || scene.filter_taps < 1)
         throw std::invalid_argument("rate_hz, block and filter_taps must be positive");
     for (const sr::Axis &axis : axes)

@@ -13,9 +13,9 @@
 
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
 using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
-using PriorTuple = std::tuple<double, double, bool, bool>; // ln_min, ln_max, uniform, measured
+using PriorTuple = std::tuple<double, double, bool, bool>;     // ln_min, ln_max, uniform, measured
 using TermTuple = std::tuple<int, double, double, bool, bool>; // kind, deviation, bandwidth, stated, by_ratio
-using LawTuple = std::tuple<std::vector<TermTuple>, bool>;      // terms, coloured_noise
+using LawTuple = std::tuple<std::vector<TermTuple>, bool>;     // terms, coloured_noise
 using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
                                    std::vector<std::vector<PriorTuple>>>; // priors [axes][parameters], or none
 
@@ -26,8 +26,8 @@ using RegressorsTuple = std::tuple<std::vector<float>, std::vector<float>, std::
 namespace MODULE_NAME {
 
 struct Grid {
-    explicit Grid(const GridTuple &t) : fit(std::get<1>(t).begin(), std::get<1>(t).end()),
-        grid{std::get<0>(t), fit.data()} {
+    explicit Grid(const GridTuple &t)
+        : fit(std::get<1>(t).begin(), std::get<1>(t).end()), grid{std::get<0>(t), fit.data()} {
         if (fit.size() != size_t{grid.nodes} * grid.nodes)
             throw std::invalid_argument("the spline matrix does not fit its nodes");
     }
@@ -36,7 +36,7 @@ struct Grid {
 };
 
 class Tables {
-public:
+  public:
     Tables(double dt_s, uint32_t block, const std::vector<AxisTuple> &axes,
            const std::vector<HypothesisTuple> &hypotheses, uint32_t id,
            const std::optional<RegressorsTuple> &regressors, double half_life_s,
@@ -56,7 +56,7 @@ public:
         size_t nodes = 0;
         for (const auto &[law, ln_probability, rho, alpha, priors] : hypotheses) {
             const selfcal_hypothesis_t h{add(law), static_cast<float>(ln_probability), add(rho), add(alpha),
-                add(priors)};
+                                         add(priors)};
             const size_t count = size_t{h.rho ? h.rho->nodes : 1u} * (h.alpha ? h.alpha->nodes : 1u);
             nodes += count;
             term_nodes_ += selfcal_law_is_sum(h.law) ? count : 0;
@@ -82,8 +82,13 @@ public:
                 coefficient_sd_.size() != axes_.size() * reference_.size() ||
                 coefficient_mean_.size() != coefficient_sd_.size())
                 throw std::invalid_argument("regressors need a reference each and a prior for every axis");
-            regressors_ = {&selfcal_regressors_code, static_cast<uint8_t>(reference_.size()), reference_.data(),
-                           coefficient_sd_.data(), nullptr, nullptr, coefficient_mean_.data()};
+            regressors_ = {&selfcal_regressors_code,
+                           static_cast<uint8_t>(reference_.size()),
+                           reference_.data(),
+                           coefficient_sd_.data(),
+                           nullptr,
+                           nullptr,
+                           coefficient_mean_.data()};
             model_.regressors = &regressors_;
         }
         forgetting_ = {&selfcal_forgetting_code, static_cast<float>(half_life_s)};
@@ -97,7 +102,7 @@ public:
     Tables(const Tables &) = delete;
     Tables &operator=(const Tables &) = delete;
 
-protected:
+  protected:
     const selfcal_law_t *add(const LawTuple &t) {
         const auto &[terms, coloured_noise] = t;
         if (terms.size() > SELFCAL_LAW_TERMS)
@@ -105,9 +110,8 @@ protected:
         selfcal_law_t &law = *laws_.emplace_back(std::make_unique<selfcal_law_t>());
         law.coloured_noise = coloured_noise;
         for (const auto &[kind, deviation, bandwidth, stated, by_ratio] : terms)
-            law.term[law.terms++] =
-                {static_cast<selfcal_term_kind_t>(kind), static_cast<float>(deviation), static_cast<float>(bandwidth),
-                                     stated, by_ratio};
+            law.term[law.terms++] = {static_cast<selfcal_term_kind_t>(kind), static_cast<float>(deviation),
+                                     static_cast<float>(bandwidth), stated, by_ratio};
         return &law;
     }
 

@@ -156,7 +156,9 @@ class FrameLog:
             self._reader: Any = (
                 _reader_of(self._lines)
                 if self._lines is not None
-                else McapFrames(self.path) if suffix == ".mcap" else can.LogReader(self.path)
+                else McapFrames(self.path)
+                if suffix == ".mcap"
+                else can.LogReader(self.path)
             )
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = self._next()

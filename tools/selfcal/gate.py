@@ -70,9 +70,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     axes = tuple(name for name in model.axes if name in recording.columns and recording.columns[name].clock is None)
     tables = make_tables(model, recording.rate_hz, axes)
     table = table_of(recording, model, axes)
-    samples = np.column_stack(
-        [as_float(bridged(recording.in_unit(name, model.group_of(name).unit))) for name in axes]
-    )
+    samples = np.column_stack([as_float(bridged(recording.in_unit(name, model.group_of(name).unit))) for name in axes])
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)
     if used.any():

@@ -680,9 +680,7 @@ class _Header:
                 self.dated = self.dated or key
             if not (name == "t" and self.no_time):
                 lsb = entry.get("lsb", None if size == 1.0 else size)
-                found += self._field(
-                    key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates
-                )
+                found += self._field(key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates)
         names = [field.name for field in found]
         fields = [field for field in found if not field.optional or names.count(field.name) == 1]
         names = [field.name for field in fields]
@@ -832,9 +830,7 @@ class _Text:
     def _read(self, several: bool) -> Recording:
         header, path = self.header.of_part(several), self.text.path
         with ExitStack() as files:
-            table = TextTable(
-                path, files, header.knows_in(self.text), skip_bad=self.skip_bad, opened=self.text.open
-            )
+            table = TextTable(path, files, header.knows_in(self.text), skip_bad=self.skip_bad, opened=self.text.open)
             meta = dict(_meta_beside(path))
             keys = [key for key in table.keys if key not in self.others]
             first = [cell for key, cell in zip(table.keys, table.first, strict=False) if key not in self.others]
@@ -870,9 +866,7 @@ def _meta_beside(path: Path) -> Mapping[str, Any]:
         return {}
 
 
-def _table_parts(
-    path: Path, rate: float | None, header: _Header, table: Table, several: bool
-) -> list[Part]:
+def _table_parts(path: Path, rate: float | None, header: _Header, table: Table, several: bool) -> list[Part]:
     """The sensors of a table, and the temperature in one without any."""
     sensors = header.sensors_of(list(table.members))
     sides = sides_of(table.members) if several and not sensors else None

@@ -15,6 +15,8 @@ struct Port {
 };
 
 extern Port Serial;
-inline long random(long below) { return std::rand() % below; }
+inline long random(long below) {
+    return std::rand() % below;
+}
 
 #endif

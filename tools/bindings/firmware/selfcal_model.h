@@ -23,10 +23,10 @@ extern const firmware_model_t *firmware_model;
 
 #define SELFCAL_MODEL_HYPOTHESES SELFCAL_HYPOTHESES_MAX
 #define SELFCAL_MODEL_UNITS_SENT 1 /* firmware.py looks */
-#define SELFCAL_MODEL_IMU_BYTES \
-    (SELFCAL_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX) + \
-     SELFCAL_REGRESSORS_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
-     SELFCAL_TERMS_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) + \
+#define SELFCAL_MODEL_IMU_BYTES                                                                                        \
+    (SELFCAL_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX) +                                                               \
+     SELFCAL_REGRESSORS_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) +                            \
+     SELFCAL_TERMS_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX, SELFCAL_REGRESSORS_MAX) +                                 \
      SELFCAL_PARTS_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX, 1, 1, 1, 1))
 
 #endif

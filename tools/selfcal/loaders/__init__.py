@@ -66,6 +66,7 @@ READ = (
 )
 WRITTEN = ".csv, .csv.gz or .npz"
 
+
 class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
