@@ -15,6 +15,7 @@
 #   make emulate                20 minutes of six axes through the emulated firmware
 #   make cases                  logs that went wrong, each kind on hundreds of records; half an hour
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
+#   make format                 lay out C, C++ and Python
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed]
 #                               random calls of the library under sanitizers, 10^7 executions
@@ -384,7 +385,8 @@ $(BENCH)/host/%/bench: tests/bench/host.cpp host_sim/textbook_bank.cpp tests/ben
 
 # ------------------------------------------------------------------------------------------------------------- checks
 
-CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-house check-ruff check-mypy
+CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-house check-format check-ruff \
+          check-mypy
 .PHONY: $(CHECKS)
 check: setup-dev
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
@@ -448,6 +450,16 @@ check-tokens:
 # Lines, conditionals, circles, lengths of functions, names.
 check-house: setup-dev
 	@$(BIN)/python tests/count_house.py
+
+# The layout of C, C++ and Python.
+.PHONY: format
+FORMATTED = $(shell find lib port host_sim tests tools -name '*.[ch]' -o -name '*.[ch]pp' -o -name '*.ino')
+format: setup-dev
+	@$(BIN)/clang-format -i $(FORMATTED)
+	@$(BIN)/ruff format --quiet --config tools/pyproject.toml tools tests host_sim
+check-format: setup-dev
+	@$(BIN)/clang-format --dry-run -Werror $(FORMATTED)
+	@$(BIN)/ruff format --quiet --check --config tools/pyproject.toml tools tests host_sim
 
 check-ruff: setup-dev
 	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests host_sim
