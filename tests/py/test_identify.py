@@ -300,7 +300,7 @@ def test_what_the_grid_does_not_bear_is_said(tmp_path: Path, capsys: pytest.Capt
     assert document["axes"]["gx"]["parameters"]["random_walk"]["K"]["off_grid"] is True
     assert document["axes"]["gx"]["parameters"]["constant"]["N"]["off_grid"] is False
     show(document)
-    assert "not borne by the grid of nodes: gx: random_walk" in capsys.readouterr().out
+    assert "grid of nodes too coarse: gx: random_walk" in capsys.readouterr().out
 
 
 def test_noise_far_below_the_prior_has_its_own(tmp_path: Path) -> None:

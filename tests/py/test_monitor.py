@@ -242,7 +242,7 @@ def test_view_of_what_the_grid_does_not_bear(monkeypatch: pytest.MonkeyPatch) ->
             values = {"h0_probability": 1.0, "h1_probability": 0.0, "h2_probability": 0.0, "hypotheses": 3.0}
             view = View(Decoder(), Link(bus), "test")
             view.show([AxisReport("gx", 1.0, True, values | {"h0_N_flags": flags, "h1_N_flags": 8.0})])
-            assert ("not borne by the grid" in shown(view)) == said
+            assert ("grid of nodes too coarse" in shown(view)) == said
 
 
 def test_view_tells_the_status_by_its_names() -> None:

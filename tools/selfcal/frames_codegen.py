@@ -294,8 +294,8 @@ def main() -> None:
     parser.parse_args()
     try:
         wire = ROOT / "lib" / "WIRE.md"
+        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
         wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
-        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")
         (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
     except UserError as error:
         parser.exit(2, f"selfcal: error: {error}\n")

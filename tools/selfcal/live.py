@@ -515,7 +515,7 @@ def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> lis
         unit = "s" if inverse else typeset(parameter_unit(parameter, axis_unit(report.axis)))
         said.append(f"{label} {middle} [{low}, {high}] {unit if unit != '1' else ''}".rstrip())
     if any(int(report.values.get(f"h{k}_{place}_flags", 0)) & OFF_GRID for place in PLACE_NAMES[: len(given)]):
-        said.append("not borne by the grid of nodes")
+        said.append("grid of nodes too coarse")
     if named or not names.known:
         name = names.hypotheses[k] if k < len(names.hypotheses) else BY_PLACE.hypotheses[k]
         said[:1] = [f"{name.replace('_', ' ')}: {said[0] if said else 'no number'}"]

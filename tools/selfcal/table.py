@@ -176,7 +176,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
-            failed.append(f"not borne by the grid of nodes: {name}: {', '.join(coarse)}")
+            failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
         counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
         if counts:
             kept.append(f"kept out: {name}: {', '.join(counts)}")
