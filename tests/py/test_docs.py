@@ -39,6 +39,7 @@ TOUR = ROOT / "README.md"
 #: Beginnings of commands that no test runs as printed, and why.
 UNTRIED = {
     "identify path/to/log.csv": "a place of the reader's own",
+    "diagnose path/to/log.csv": "a place of the reader's own",
     "identify adis_16405_imu1.rda": "a file of the R package imudata; test_recording.py reads its form",
     "monitor ": "a module on a port, or its log; test_monitor.py",
     "demo": "runs until it is stopped; test_monitor_hostile.py and test_replay_can.py start it",
@@ -199,7 +200,7 @@ def test_the_sizes_of_the_images_are_those_of_the_bench() -> None:
     """port/README.md against the table of tests/README.md, in KB."""
     table = (ROOT / "tests" / "README.md").read_text(encoding="utf-8").partition("**whole image**, bytes")[2]
     sizes = [[int(cell.replace(",", "")) for cell in re.findall(r"\d+,\d+", line)] for line in table.splitlines()[1:4]]
-    told = re.search(r"take ([\d.]+) KB of flash and ([\d.]+) KB of RAM beside ([\d.]+) KB of stack on the "
+    told = re.search(r"need ([\d.]+) KB of flash and ([\d.]+) KB of RAM beside ([\d.]+) KB of stack on the "
                      r"`stm32f405`,\s+([\d.]+) KB and ([\d.]+) KB beside ([\d.]+) KB on the `cortex-m0`",
                      (ROOT / "port" / "README.md").read_text(encoding="utf-8"))  # fmt: skip
     assert told is not None
