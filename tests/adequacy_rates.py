@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from selfcal.engines.library import Bank
 from selfcal.model import Handling, Model
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import Tables, make_tables
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 from selfcal.wire import choices
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")

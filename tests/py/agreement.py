@@ -21,8 +21,8 @@ from selfcal.engines.library import Bank
 from selfcal.laws import NAMED, PLACES, SUMS
 from selfcal.model import DEFAULT, Model, Regressor
 from selfcal.result import AxisResult
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import Tables, make_grid, make_tables
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import worst_difference
 

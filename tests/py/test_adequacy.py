@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from selfcal.engines.library import Bank
 from selfcal.model import Model
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 from selfcal.wire import choices

@@ -36,10 +36,10 @@ from selfcal.errors import UserError
 from selfcal.laws import PLAIN, named
 from selfcal.model import Model
 from selfcal.recording import as_float, save
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.table import show
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import shared_recording
 

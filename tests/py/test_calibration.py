@@ -26,7 +26,7 @@ from scipy import special, stats
 from selfcal.laws import NAMED, PLAIN, SUMS
 from selfcal.model import Model
 from selfcal.spread import Row, spread
-from selfcal.verbs.montecarlo import rows_of
+from selfcal.studies.montecarlo import rows_of
 
 from conftest import ROOT
 

@@ -25,11 +25,11 @@ from selfcal.methods.problem import Problem
 from selfcal.model import Model
 from selfcal.recording import load
 from selfcal.spread import Row, spread
-from selfcal.verbs.montecarlo import montecarlo
-from selfcal.verbs.navigate import navigate
-from selfcal.verbs.paper import paper
-from selfcal.verbs.rivals import ensemble, measured
-from selfcal.verbs.worth import worth
+from selfcal.studies.montecarlo import montecarlo
+from selfcal.studies.navigate import navigate
+from selfcal.studies.paper import paper
+from selfcal.studies.rivals import ensemble, measured
+from selfcal.studies.worth import worth
 
 from conftest import COMMAND, case_records
 

@@ -15,8 +15,8 @@ import pytest
 from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.laws import PLACES
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import Tables, make_tables
-from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.wire import choices
 
 from agreement import LIMITS, MODEL, REPORT_LIMIT, Floats, a_record, exact_report, model_of, push, tables_of

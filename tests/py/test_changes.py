@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Handling, Model
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 from selfcal.wire import choices

@@ -13,9 +13,9 @@ from selfcal import _library32
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.model import Model, Regressor
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.identify import identify
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from agreement import MODEL, Filter, faded, fading
 from conftest import ROOT, worst_difference

@@ -21,10 +21,10 @@ from selfcal.errors import UserError
 from selfcal.laws import PLAIN
 from selfcal.model import NODES, Model, Prior
 from selfcal.recording import save
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.table import show
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
 from conftest import shared_recording, worst_difference

@@ -19,7 +19,7 @@ from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.laws import NAMED
 from selfcal.model import DEFAULT, Model
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 from agreement import (
     REPORT_LIMIT,

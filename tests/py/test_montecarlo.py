@@ -8,7 +8,7 @@ import pytest
 
 from selfcal.errors import UserError
 from selfcal.model import Model
-from selfcal.verbs.montecarlo import montecarlo, show
+from selfcal.studies.montecarlo import montecarlo, show
 
 #: 400 records a law, one hour at 1 Hz, as the issue asks.
 RECORDS = 400

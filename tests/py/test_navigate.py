@@ -25,8 +25,8 @@ from selfcal.navigation import (
     true_noise,
 )
 from selfcal.parts import LAWS, Floats
+from selfcal.studies.navigate import FIGURES, TIMES, TITLES, identified_noise, navigate, sheet_noise, show
 from selfcal.units import STANDARD_GRAVITY
-from selfcal.verbs.navigate import FIGURES, TIMES, TITLES, identified_noise, navigate, sheet_noise, show
 
 from conftest import run
 

@@ -12,7 +12,7 @@ import pytest
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.paper_figures import section3, section4
-from selfcal.verbs.paper import paper, show
+from selfcal.studies.paper import paper, show
 
 from conftest import SHARED_DATA, run
 

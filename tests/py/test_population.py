@@ -16,9 +16,9 @@ from selfcal.engines.library import Bank
 from selfcal.model import DEFAULT, Model, read_yaml
 from selfcal.recording import save
 from selfcal.result import HALF_90
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import make_tables
 from selfcal.verbs.fleet import fleet
-from selfcal.verbs.montecarlo import simulate_bank_samples
 
 from conftest import case_records, run
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from selfcal.engines.library import Bank
 from selfcal.laws import NAMED, PLAIN
 from selfcal.model import Model
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import Tables, make_tables
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from agreement import REGRESSORS, columns_of, push, tables_of
 

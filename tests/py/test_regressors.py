@@ -21,10 +21,10 @@ from selfcal.errors import UserError
 from selfcal.laws import PLAIN
 from selfcal.model import MOST_COLUMNS, Model
 from selfcal.recording import save
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from agreement import (
     MODEL as PLAIN_MODEL,

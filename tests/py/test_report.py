@@ -23,8 +23,8 @@ from selfcal.engines.reference import identify_axis
 from selfcal.errors import UserError
 from selfcal.laws import PLACES
 from selfcal.recording import load
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import AxisTable, Tables, make_grid, make_tables
-from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
 from agreement import (

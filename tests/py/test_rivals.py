@@ -25,8 +25,8 @@ from selfcal.methods.recursive import update
 from selfcal.methods.steady_state import ln_likelihood
 from selfcal.methods.wavelets import covariance
 from selfcal.model import Model
-from selfcal.verbs.montecarlo import simulate_bank_samples
-from selfcal.verbs.rivals import longest_stretch, problem_of, rivals, show
+from selfcal.studies.montecarlo import simulate_bank_samples
+from selfcal.studies.rivals import longest_stretch, problem_of, rivals, show
 
 from conftest import ROOT, run, shared_recording
 

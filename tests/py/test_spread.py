@@ -16,7 +16,7 @@ import pytest
 from selfcal import spread as module
 from selfcal.errors import UserError
 from selfcal.spread import Row, spread
-from selfcal.verbs.montecarlo import montecarlo
+from selfcal.studies.montecarlo import montecarlo
 
 CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))
 needs_cluster = pytest.mark.skipif(not CLUSTER, reason="DASK OR PYARROW ABSENT: make setup-cluster")

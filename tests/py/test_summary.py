@@ -20,10 +20,10 @@ from selfcal.laws import PLAIN
 from selfcal.model import Model
 from selfcal.recording import save
 from selfcal.result import AxisResult, Estimate
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.summary import Number, summarize
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
-from selfcal.verbs.montecarlo import simulate_bank_samples
 
 from conftest import case_records
 

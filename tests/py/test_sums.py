@@ -23,9 +23,9 @@ from selfcal.errors import UserError
 from selfcal.laws import PLACES, SUMS
 from selfcal.model import Model
 from selfcal.result import in_unit
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from agreement import (
     MODEL_OF_SUMS as MODEL,

@@ -18,9 +18,9 @@ from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import save
 from selfcal.result import AxisResult
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import Tables, make_tables
 from selfcal.verbs.fleet import fleet
-from selfcal.verbs.montecarlo import simulate_bank_samples
 from selfcal.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, duration_words, judge
 
 from conftest import case_records, run

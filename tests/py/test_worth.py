@@ -13,8 +13,7 @@ import pytest
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.parts import SHEET_N, TURN_ON, simulate
-from selfcal.units import STANDARD_GRAVITY
-from selfcal.verbs.worth import (
+from selfcal.studies.worth import (
     CORNER_HZ,
     LAST_S,
     RECKONED_S,
@@ -25,6 +24,7 @@ from selfcal.verbs.worth import (
     show,
     worth,
 )
+from selfcal.units import STANDARD_GRAVITY
 
 from conftest import ROOT, run
 

@@ -31,8 +31,8 @@ from selfcal.engines.library import Bank
 from selfcal.laws import NAMED, PLAIN, SUMS
 from selfcal.recording import load
 from selfcal.result import AxisResult
+from selfcal.studies.montecarlo import draw, montecarlo, simulate_bank_samples
 from selfcal.tables import make_tables
-from selfcal.verbs.montecarlo import draw, montecarlo, simulate_bank_samples
 
 from agreement import (
     LENGTHS,

@@ -13,13 +13,36 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
+import selfcal
 from selfcal.ending import Held, install, last_signal, leave
 from selfcal.errors import UserError, called, note, printable
 from selfcal.loaders import READ, WRITTEN, Reading
 
+#: Folders of the verbs, and their headings in the help.
+_HEADINGS = {"verbs": "Commands", "studies": "Studies of the method"}
+
+
+class _Headed(TyperGroup):
+    """The commands under a heading for each folder of verbs."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        limit = formatter.width - 6 - max(map(len, self.commands))
+        for folder, heading in _HEADINGS.items():
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [
+                        (name, command.get_short_help_str(limit))
+                        for name, command in self.commands.items()
+                        if selfcal.VERBS[name] == folder
+                    ]
+                )
+
+
 app = typer.Typer(
+    cls=_Headed,
     help="An inertial sensor at rest identifies its own error model.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -28,8 +51,6 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        import selfcal
-
         typer.echo(f"selfcal {selfcal.__version__}")
         raise typer.Exit
 
@@ -634,7 +655,7 @@ def rivals(
     json: Json = None,
 ) -> None:
     """Other methods on the same recording, or on simulated records: estimates, choice of a law, time and memory."""
-    from selfcal.verbs import rivals as verb
+    from selfcal.studies import rivals as verb
 
     if (log is None) == (records is None):
         raise UserError(f"rivals takes a recording, or --records N for simulated ones: {called()} rivals LOG")
@@ -847,7 +868,7 @@ def montecarlo(
     json: Json = None,
 ) -> None:
     """Simulate records with parameters drawn from the prior and compare stated with actual errors."""
-    from selfcal.verbs import montecarlo as verb
+    from selfcal.studies import montecarlo as verb
 
     result = verb.montecarlo(
         model,
@@ -876,7 +897,7 @@ def paper(
     results: Results = None,
 ) -> None:
     """Make the figures of Stepanov & Motorin (2017) anew, on one page beside what the paper says."""
-    from selfcal.verbs import paper as verb
+    from selfcal.studies import paper as verb
 
     verb.show(verb.paper(output, data=data, records=records, seed=seed, scheduler=scheduler, results=results), output)
 
@@ -898,7 +919,7 @@ def worth(
     json: Json = None,
 ) -> None:
     """Error of the bias some time after a rest, by the bank and by what people flash today."""
-    from selfcal.verbs import worth as verb
+    from selfcal.studies import worth as verb
 
     result = verb.worth(
         logs or (),
@@ -922,7 +943,7 @@ def navigate(
     json: Json = None,
 ) -> None:
     """Errors and consistency of a GPS/INS filter, by the noise that it is told."""
-    from selfcal.verbs import navigate as verb
+    from selfcal.studies import navigate as verb
 
     result = verb.navigate(records=records, seed=seed, json=json, scheduler=scheduler, results=results)
     verb.show(result, to_stderr=str(json) == "-")

@@ -16,7 +16,7 @@ from selfcal.methods import Rival
 from selfcal.methods.problem import Answer, Floats, Problem
 from selfcal.model import Group, Model, Prior
 from selfcal.spread import Row
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 #: The method that errors are compared with.
 REFERENCE = "ml"

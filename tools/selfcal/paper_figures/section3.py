@@ -19,8 +19,8 @@ from selfcal.model import DEFAULT, Model
 from selfcal.paper_figures.told import Told
 from selfcal.result import AxisResult
 from selfcal.spread import Row, spread
+from selfcal.studies.montecarlo import draw, settings_of, simulate_bank_samples
 from selfcal.tables import make_tables
-from selfcal.verbs.montecarlo import draw, settings_of, simulate_bank_samples
 
 Floats = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from selfcal.paper_figures.section3 import PAPER, over_time
 from selfcal.paper_figures.told import Told
 from selfcal.recording import as_float, load
 from selfcal.result import HALF_90, AxisResult
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import make_tables
-from selfcal.verbs.montecarlo import simulate_bank_samples
 
 Floats = NDArray[np.float64]
 

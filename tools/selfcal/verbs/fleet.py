@@ -19,7 +19,7 @@ from selfcal.fail_on import check, outcome
 from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.spread import spread
-from selfcal.verbs import montecarlo
+from selfcal.studies import montecarlo
 from selfcal.verdicts import FAIL, PASS, Judged, Limits, check_options, judge, unjudged, write
 
 SCHEMA = "selfcal.fleet/1"

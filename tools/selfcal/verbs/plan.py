@@ -28,8 +28,8 @@ from selfcal.model import Model
 from selfcal.plot import COLORS, check_picture, save_picture
 from selfcal.result import HALF_90
 from selfcal.spread import Row, record_seeds, spread
+from selfcal.studies.montecarlo import has_nodes, simulate_bank_samples
 from selfcal.tables import make_tables
-from selfcal.verbs.montecarlo import has_nodes, simulate_bank_samples
 from selfcal.verbs.simulate import truth_of
 from selfcal.verdicts import duration_words
 

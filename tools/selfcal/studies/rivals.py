@@ -35,9 +35,9 @@ from selfcal.model import DEFAULT, Model
 from selfcal.priors import for_record
 from selfcal.recording import Recording, as_float, load
 from selfcal.spread import record_seeds, spread, workers
+from selfcal.studies.montecarlo import settings_of
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
-from selfcal.verbs.montecarlo import settings_of
 
 SCHEMA = "selfcal.rivals/1"
 ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"

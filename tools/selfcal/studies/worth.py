@@ -224,8 +224,8 @@ def _means(recording: Recording, model: Model, name: str) -> Floats:
 
 
 def _recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
+    from selfcal.studies.rivals import longest_stretch
     from selfcal.verbs.identify import chosen_axes
-    from selfcal.verbs.rivals import longest_stretch
 
     recording = load(log)
     means = {name: _means(recording, model, name) for name in chosen_axes(recording, model, wanted)}
