@@ -165,7 +165,7 @@ INCLUDES := -Ilib -Iport -Iport/app -Iport/sensors -Iport/replay -I$(MODEL) -DSE
 # What the tests look at beyond the default model.
 TEST_SIZES := -DSELFCAL_HYPOTHESES_MAX=4 -DSELFCAL_REGRESSORS_MAX=6
 TESTED := $(wildcard lib/*.c port/app/*.c) port/sensors/sensor.c $(MODEL)/selfcal_model.c
-TEST_NAMES := $(basename $(notdir $(wildcard tests/c/test_*.c)))
+TEST_NAMES := $(basename $(notdir $(wildcard tests/lib/test_*.c tests/port/test_*.c)))
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
@@ -199,31 +199,31 @@ false-alarms: setup-dev
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
 
 soak: setup-dev
-	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/py/test_long.py
+	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/agree/test_long.py
 
 # SEEDS times the records; QUICK=1: records of up to 10^4 bank samples; ONLY="dense targets": these pairs alone.
 tolerances: setup-dev
-	@$(LONG) $(BIN)/python tests/py/tolerances.py \
+	@$(LONG) $(BIN)/python tests/agree/tolerances.py \
 	    $(if $(SEEDS),--seeds $(SEEDS)) $(if $(QUICK),--quick) $(ONLY:%=--only %)
 
 emulate: setup-dev
-	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/py/test_firmware_qemu.py -k twenty
+	SELFCAL_EMULATE=1 $(LONG) $(PYTEST) -s tests/port/test_firmware_qemu.py -k twenty
 
 # Records of each law and length; the fast subset of `make test` has 60.
 calibration: setup-dev
 	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
-	    $(PYTEST) -s tests/py/test_calibration.py
+	    $(PYTEST) -s tests/agree/test_calibration.py
 
 # Records of each kind of disturbed log; `make test` looks at a few.
 cases: setup-dev setup-all
 	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
-	    $(PYTEST) -s -n 2 tests/py/test_cases_*.py tests/py/test_docs.py
+	    $(PYTEST) -s -n 2 tests/cases tests/tools/test_docs.py
 
 campaigns: setup-dev
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
-	    tests/py/test_firmware_faults.py tests/py/test_firmware_commands.py tests/py/test_firmware_m0.py \
-	    tests/py/test_hostile.py
+	    tests/port/test_firmware_faults.py tests/port/test_firmware_commands.py tests/port/test_firmware_m0.py \
+	    tests/tools/test_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)
@@ -239,6 +239,13 @@ $(BUILD)/c/sanitized/%: C := $(SANITIZED)
 $(BUILD)/c/fixed/%: C := $(SANITIZED) -DSELFCAL_FIXED
 # From a folder four levels below to this one, whose path may have spaces.
 BACK := ../../../..
+C_ROOMS := lib lib/fixed port
+define C_TEST
+
+$(BUILD)/c/$(1)/test_%: tests/$(2)/test_%.c $(BUILD)/c/$(1)/tested.a $(wildcard tests/common/*.h tests/port/*.h)
+	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -Itests/common -isystem $(UNITY_ROOT) \
+	    $$(filter-out %.h,$$^) -lm -o $$@
+endef
 define C_TESTS
 $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h port/sensors/*.h) $(UNITY)
 	@rm -rf $$(@D)/objects $$@ && mkdir -p $$(@D)/objects
@@ -246,12 +253,7 @@ $(BUILD)/c/$(1)/tested.a: $(TESTED) $(wildcard lib/*.h port/*.h port/app/*.h por
 	    -c $(TESTED:%=$(BACK)/%)
 	$(CC) $$(filter-out $(WARNINGS),$$(C)) -c $(UNITY) -o $$(@D)/objects/unity.o
 	$(AR) -rcs $$@ $$(@D)/objects/*.o
-$(BUILD)/c/$(1)/test_%: tests/c/test_%.c $(BUILD)/c/$(1)/tested.a $(wildcard tests/c/*.h)
-	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
-	    $$(filter-out %.h,$$^) -lm -o $$@
-$(BUILD)/c/$(1)/test_%: tests/c/fixed/test_%.c $(BUILD)/c/$(1)/tested.a $(wildcard tests/c/*.h)
-	$(CC) -std=c99 $$(C) $(TEST_SIZES) -ffp-contract=off $(INCLUDES) -isystem $(UNITY_ROOT) \
-	    $$(filter-out %.h,$$^) -lm -o $$@
+$(foreach room,$(C_ROOMS),$(call C_TEST,$(1),$(room)))
 endef
 $(eval $(call C_TESTS,plain))
 $(eval $(call C_TESTS,sanitized))

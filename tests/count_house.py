@@ -110,12 +110,12 @@ def calls(texts: Mapping[str, str]) -> dict[str, set[str]]:
 
 def complaints() -> list[str]:
     """What breaks the rules, a line each."""
-    files = [path for path in tracked([".c", ".h"]) if path.parent.name == "lib"]
+    files = [path for path in tracked([".c", ".h"]) if path.parent == ROOT / "lib"]
     library = {path.name: path.read_text(encoding="utf-8") for path in files}
     found = long_lines(tracked(WRITTEN))
     application, sensors = (
-        {path.name: path.read_text(encoding="utf-8") for path in tracked([".c", ".h"]) if path.parent.name == room}
-        for room in ("app", "sensors")
+        {path.name: path.read_text(encoding="utf-8") for path in tracked([".c", ".h"]) if path.parent == room}
+        for room in (ROOT / "port" / "app", ROOT / "port" / "sensors")
     )
     guards = sum(name.endswith(".h") for name in application)
     for folder, texts, most in (("lib", library, CONDITIONALS), ("port/app", application, APP_CONDITIONALS + guards)):

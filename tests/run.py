@@ -36,18 +36,18 @@ VARIANTS = ("plain", "sanitized", "fixed")
 #: The thin way of `make quick`: numbers against the textbook, the command, the wire, a recording through the firmware,
 #: both images on their boards. A test that is gone is an error.
 QUICK = (
-    "test_bank.py::test_parity_with_the_textbook_bank[gauss_markov-1000-gaps]",
-    "test_reference.py::test_bank_over_time_follows_equations_11_to_14",
-    "test_report.py::test_report_over_the_whole_prior[100]",
-    "test_cli.py::test_version_is_the_headers",
-    "test_cli.py::test_identify_loads_no_scipy_optimize",
-    "test_units.py",
-    "test_export.py",
-    "test_firmware_faults.py::test_saturation",
-    "test_firmware_m0.py::test_samples_and_telemetry",
-    "test_firmware_commands.py::test_an_answer_outlives_the_next_question",
+    "agree/test_bank.py::test_parity_with_the_textbook_bank[gauss_markov-1000-gaps]",
+    "agree/test_reference.py::test_bank_over_time_follows_equations_11_to_14",
+    "agree/test_report.py::test_report_over_the_whole_prior[100]",
+    "tools/test_cli.py::test_version_is_the_headers",
+    "tools/test_cli.py::test_identify_loads_no_scipy_optimize",
+    "tools/test_units.py",
+    "tools/test_export.py",
+    "port/test_firmware_faults.py::test_saturation",
+    "port/test_firmware_m0.py::test_samples_and_telemetry",
+    "port/test_firmware_commands.py::test_an_answer_outlives_the_next_question",
 )
-C_TESTS = sorted((ROOT / "tests" / "c").glob("test_*.c"))
+C_TESTS = sorted(path for room in ("lib", "port") for path in (ROOT / "tests" / room).glob("test_*.c"))
 MAKE = ("make", "--silent", "--keep-going", "--output-sync=target", f"--jobs={WORKERS}")
 
 
@@ -117,7 +117,7 @@ def c_tests(quick: bool) -> Count:
     if code != 0:
         print(f"FAILED c-tests do not build\n{output}")
         total.failed += 1
-    sources = C_TESTS if quick else sorted((ROOT / "tests" / "c").glob("**/test_*.c"))
+    sources = C_TESTS if quick else [*C_TESTS, *sorted((ROOT / "tests" / "lib" / "fixed").glob("test_*.c"))]
     made = [ROOT / program(variant, source) for variant in VARIANTS[: 1 if quick else None] for source in sources]
     with ThreadPoolExecutor(WORKERS) as pool:
         for count in pool.map(c_test, (path for path in made if path.is_file())):
@@ -177,7 +177,7 @@ def pytest(quick: bool) -> Count:
     report = BUILD / "pytest.xml"
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", "-q", f"-n{WORKERS}", "--dist=worksteal"]
-    chosen = [f"tests/py/{test}" for test in QUICK] if quick else ["tests/py"]
+    chosen = [f"tests/{test}" for test in QUICK] if quick else ["tests"]
     try:
         code = subprocess.run(
             [*command, "--config-file=tools/pyproject.toml", "--rootdir=.", f"--junitxml={report}", *chosen],

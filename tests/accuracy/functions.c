@@ -1,6 +1,6 @@
 /* Writes what each function of <math.h> that lib/ relies on makes of many arguments: for every function its arguments
  * and values in binary, one file. Runs on a host and, with the start-up of tests/bench/image.c, on an emulated
- * Cortex-M. The judge is tests/py/test_math.py, which knows the order below.
+ * Cortex-M. The judge is tests/lib/test_math.py, which knows the order below.
  *
  * Arguments are COUNT bit patterns at even steps between two of one sign, hence evenly spread over the exponents. */
 #include <math.h>

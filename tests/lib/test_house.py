@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
+import count_house
 import pytest
 
 from selfcal.verbs.codegen import codegen
 
 from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / "tests"))
-import count_house
 
 USER = """#include "selfcal_model.h"
 #include <cstdio>

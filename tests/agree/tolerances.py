@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from rich import box
@@ -34,7 +35,8 @@ from selfcal.result import AxisResult
 from selfcal.studies.montecarlo import draw, montecarlo, simulate_bank_samples
 from selfcal.tables import make_tables
 
-from agreement import (
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / folder) for folder in ("common", ".")]
+from agreement import (  # noqa: E402
     LENGTHS,
     LIMITS,
     MODEL,
@@ -51,8 +53,8 @@ from agreement import (
     report_differences,
     tables_of,
 )
-from agreement import dense as dense_nodes
-from conftest import SHARED_DATA, worst_difference
+from agreement import dense as dense_nodes  # noqa: E402
+from conftest import SHARED_DATA, worst_difference  # noqa: E402
 
 #: Of the host's report against the refined reference: the sd to 5 %, see test_identify.py.
 REFINED_LIMIT = np.array([0.05, 0.05, 0.05])

@@ -1,7 +1,7 @@
 """The wire: what the C code packs against the DBC, and the decoder on sound and on damaged streams.
 
-Truth: tests/c/telemetry_stream.c prints the numbers it puts in, by struct member; the DBC is read by cantools, which is
-not ours. Numbers are printed with 17 digits and must come back exactly, but for evidence differences.
+Truth: tests/lib/telemetry_stream.c prints the numbers it puts in, by struct member; the DBC is read by cantools, which
+is not ours. Numbers are printed with 17 digits and must come back exactly, but for evidence differences.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def test_cantools_reads_every_item_that_c_packs(hypotheses: int, columns: int) -
         for name, number in truth.items():
             assert_equal(name, decoded[name], number)
             seen.add((sent.message, name))
-    if hypotheses == 8:  # CORRECTED, COMMAND, ANSWER: tests/py/test_firmware_commands.py
+    if hypotheses == 8:  # CORRECTED, COMMAND, ANSWER: tests/port/test_firmware_commands.py
         others = ("CORRECTED", "COMMAND", "ANSWER")
         everything = {
             (m.name.partition("_")[0], f"{prefix(m.name)}{s.name}")

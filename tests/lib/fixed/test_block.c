@@ -2,7 +2,7 @@
 #include <float.h>
 #include <math.h>
 
-#include "../noise.h"
+#include "noise.h"
 #include "selfcal_model.h"
 #include "unity.h"
 

@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / "tests" / "hidden"))
-
 import evidence
 import physics
 import physics_judge
+from conftest import ROOT
 from physics import FINE, KINDS, pair
 
 HIDDEN = ROOT / "tests" / "hidden"

@@ -10,18 +10,14 @@ import ctypes
 import math
 import random
 import subprocess
-import sys
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import pytest
-
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / "host_sim"))
-
 from parts import icm42688
 from parts.icm42688 import FIFO_DATA, G, Icm42688, Sample
+
+from conftest import ROOT
 
 STATES = ("off", "starting", "running", "failed")
 NONE, ABSENT, SET_UP, SELF_TEST, SILENT, NO_DATA, STUCK = range(7)

@@ -1,4 +1,4 @@
-"""Frames made by the C code (tests/c/telemetry_stream.c), and a pseudo-terminal to send them over."""
+"""Frames made by the C code (tests/lib/telemetry_stream.c), and a pseudo-terminal to send them over."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Sent:
 @lru_cache(maxsize=1)
 def _program() -> Path:
     program = Path(_folder.name) / "telemetry_stream"
-    sources = ["tests/c/telemetry_stream.c", "lib/telemetry.c", "port/app/slcan.c"]
-    options = ["-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-Itools/bindings"]
+    sources = ["tests/lib/telemetry_stream.c", "lib/telemetry.c", "port/app/slcan.c"]
+    options = ["-std=c99", "-O1", "-Ilib", "-Iport", "-Iport/app", "-Itools/bindings", "-Itests/common"]
     command = [os.environ.get("CC", "cc"), *options, "-o", str(program), *sources, "-lm"]
     subprocess.run(command, cwd=ROOT, check=True)
     return program

@@ -13,8 +13,10 @@ import sys
 import time
 from pathlib import Path
 
+import image_sizes
 import pytest
 from firmware import ROOT, image
+from image_sizes import FirmwareError, Image
 
 from selfcal import recording as recording_module
 from selfcal.model import Model
@@ -23,11 +25,6 @@ from selfcal.verbs.codegen import codegen
 from selfcal.verbs.command import build_flag
 from selfcal.verbs.replay import TARGETS, build, emulator, write_rows
 from selfcal.wire import load_dbc
-
-sys.path.insert(0, str(ROOT / "tests" / "bench"))
-
-import image_sizes
-from image_sizes import FirmwareError, Image
 
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})

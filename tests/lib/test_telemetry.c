@@ -1,5 +1,5 @@
 /* The frames against the format in words (the comment of lib/selfcal.dbc), taken apart here without selfcal_frames.h.
- * Every item's bits against the DBC: tests/py/test_wire.py. */
+ * Every item's bits against the DBC: tests/lib/test_wire.py. */
 #include "selfcal.h"
 
 #include "laws.h"

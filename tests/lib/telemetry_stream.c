@@ -1,4 +1,4 @@
-/* Frames of random reports, with the numbers that went in, for tests/py/test_wire.py. Not a test of its own.
+/* Frames of random reports, with the numbers that went in, for tests/lib/test_wire.py. Not a test of its own.
  *
  *     telemetry_stream SEED REPORTS HYPOTHESES SLOW_MS COLUMNS NODE
  *

@@ -3,7 +3,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "../noise.h"
+#include "noise.h"
 #include "selfcal_model.h"
 #include "unity.h"
 
@@ -64,7 +64,7 @@ static void the_first_batch_sets_the_step(void) {
 
 /* Every node at the bound of |y|, at random and then as it hurts most: the innovation doubles when the sign turns after
  * a node has followed. 20 000 samples pass all times 1/g that settle. The values are judged in
- * tests/py/test_long.py. */
+ * tests/agree/test_long.py. */
 static void nothing_overflows_at_the_bound(void) {
     start(0.04F);
     const float bound = (float)SELFCAL_FIXED_LIMIT * step() * 0.99999F - 0.2F;
@@ -208,7 +208,7 @@ static void full_scale(bool at_once) {
 }
 
 /* SELFCAL_MODEL_EXPONENTS: no reading within the range makes a step coarser, and some make it so within a factor 2.
- * (Where the prior lets a first batch from end to end pass for noise: tests/py/test_long.py.) */
+ * (Where the prior lets a first batch from end to end pass for noise: tests/agree/test_long.py.) */
 static void the_models_exponents_bound_the_steps(void) {
     full_scale(true);
     full_scale(false);

@@ -1,5 +1,5 @@
 /* The stationary gate through the public header: arguments and extremes. Its statistics are tested in
- * tests/py/test_gate.py. */
+ * tests/lib/test_gate.py. */
 #include <float.h>
 #include <math.h>
 

@@ -6,12 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import long_run
 import pytest
 
 from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / "tests"))
-import long_run
 
 
 @pytest.fixture(autouse=True)

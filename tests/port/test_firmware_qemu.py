@@ -1,8 +1,8 @@
 """The firmware on emulated cores: `selfcal replay --target cortex-m4f|cortex-m0`, by QEMU's UART and semihosting.
 
 Three truths. The host firmware over the same samples and nodes: the C code is the same and rounds alike, so telemetry
-must be the same to the last bit once both link the same <math.h> (tests/c/same_math.c); with newlib's it may differ by
-what newlib's exp, log and their kin differ from the host's. The textbook bank in double over the continuous prior,
+must be the same to the last bit once both link the same <math.h> (tests/port/same_math.c); with newlib's it may differ
+by what newlib's exp, log and their kin differ from the host's. The textbook bank in double over the continuous prior,
 which shares no code. And the wire's own arithmetic: that every frame arrives, and the same ones in every run.
 
 `SELFCAL_EMULATE=1` (make emulate) adds 20 minutes of six axes.
@@ -96,7 +96,7 @@ def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> 
     every = 200.0 if core == "cortex-m4f" else 600.0
     recording = part(tmp_path, 600.0, axes, slice(3000, 3070))
     small = " -DSAME_FMAF -DSELFCAL_MODEL_JUDGED=0"  # as its core has it
-    flags = f"{ROOT}/tests/c/same_math.c -Wno-double-promotion" + (small if core == "cortex-m0" else "")
+    flags = f"{ROOT}/tests/port/same_math.c -Wno-double-promotion" + (small if core == "cortex-m0" else "")
     history = {}
     for target in ("host", core):
         firmware = program(model, recording.rate_hz, axes, target, core, tmp_path, flags)

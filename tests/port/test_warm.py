@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 
 from selfcal.engines.library import Bank
 from selfcal.errors import UserError
@@ -31,9 +31,6 @@ from selfcal.verbs.codegen import codegen
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 from selfcal.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load, warmed
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 
 Files = tuple[Path, Path]
 

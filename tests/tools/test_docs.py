@@ -1,6 +1,6 @@
 """What the documents say that is made from a source elsewhere.
 
-`.venv/bin/python tests/py/test_docs.py` writes the outputs in README.md and tools/README.md anew. Every command of a
+`.venv/bin/python tests/tools/test_docs.py` writes the outputs in README.md and tools/README.md anew. Every command of a
 document is run by a test, or UNTRIED says why not; all are parsed.
 """
 
@@ -26,10 +26,12 @@ from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
-from conftest import CASE_RECORDS, SHARED_DATA
-from conftest import COMMAND as PROGRAM
-
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests"))  # where this is run as a program
+
+from conftest import CASE_RECORDS, SHARED_DATA  # noqa: E402
+from conftest import COMMAND as PROGRAM  # noqa: E402
+
 DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
     *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md", "tools/LOGS.md"),

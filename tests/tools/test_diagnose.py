@@ -33,8 +33,6 @@ from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
 from conftest import CALLED, run
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "hidden"))
 from generator import CAUSES, CLEAN, Record, draw
 
 SEED = 4100

@@ -1,4 +1,4 @@
-"""`selfcal monitor`: what it counts, logs and shows. Truth: the frames that tests/c/telemetry_stream.c made."""
+"""`selfcal monitor`: what it counts, logs and shows. Truth: the frames that tests/lib/telemetry_stream.c made."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """`monitor --stream` and `--log x.mcap`, read by clients that know nothing of selfcal: sockets, websockets, json, mcap.
 
-Truth: the values that tests/c/telemetry_stream.c sent, and for `selfcal demo` what the frame log of the same run holds.
+Truth: the values that tests/lib/telemetry_stream.c sent, and for `selfcal demo` what the frame log of the same run
+holds.
 """
 
 from __future__ import annotations

@@ -150,8 +150,8 @@ def test_times_found_are_those_of_the_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_gate_takes_the_samples_that_the_firmware_takes(seed: int) -> None:
-    """Shaking at a random time, and a gap: sample by sample against the library behind the gate (tests/py/gated.py),
-    whose bank then has the same sums."""
+    """Shaking at a random time, and a gap: sample by sample against the library behind the gate
+    (tests/common/gated.py), whose bank then has the same sums."""
     random = np.random.default_rng(seed)
     rate_hz, model = 20.0, Model.load()
     columns = quiet(10 + seed, rate_hz, 200.0)

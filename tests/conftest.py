@@ -23,7 +23,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # So does one under nohup a hang-up.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
+#: Folders whose modules the tests of every room import by name.
+ROOMS = ("common", "agree", "bench", "cases", "hidden", "port", "tools", "lib", "../host_sim")
+sys.path[:0] = [str((ROOT / "tests" / room).resolve()) for room in ROOMS]
 #: The recordings' licence keeps them out of this repository.
 SHARED_DATA = Path(os.environ.get("SELFCAL_DATA", ROOT.parent / "shared" / "data"))
 #: Small logs of the kinds that people report, each written by a script of its own.

@@ -1,6 +1,6 @@
 """`selfcal replay --transport can`, `selfcal demo`, and what a signal leaves of either.
 
-Truth: `replay` over SLCAN, which loses nothing (tests/py/test_replay.py), of the same recording.
+Truth: `replay` over SLCAN, which loses nothing (tests/port/test_replay.py), of the same recording.
 """
 
 from __future__ import annotations

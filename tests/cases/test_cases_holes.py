@@ -126,7 +126,7 @@ PROGRAM = """
 import sys
 from functools import partial
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path[:] = {path!r}
 from selfcal import ending
 from selfcal.spread import spread
 from test_cases_holes import slow
@@ -138,7 +138,7 @@ spread(partial(slow, Path(sys.argv[1])), range(4), settings={{}}, piece=1)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM] if case_records(0, 1) else [signal.SIGKILL])
 def test_workers_end_with_their_command(tmp_path: Path, number: signal.Signals) -> None:
     """However it ends: none is left to work for nobody."""
-    program = PROGRAM.format(tests=str(Path(__file__).parent))
+    program = PROGRAM.format(path=sys.path)
     command = subprocess.Popen([sys.executable, "-c", program, tmp_path], stderr=subprocess.DEVNULL)
     within(60.0, lambda: any(tmp_path.iterdir()))
     command.send_signal(number)
@@ -232,11 +232,11 @@ def test_changed_matlab_files(tmp_path: Path) -> None:
             names.append(tmp_path / f"{form}{packed}{k}.mat")
             names[-1].write_bytes((packed_again if packed else mutations)(whole.read_bytes(), chance))
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from test_cases_holes import *\n"
+        "import sys; sys.path[:] = sys.argv[1:]; from test_cases_holes import *\n"
         "for line in sys.stdin: refused_in_one_line(lambda: load(line.strip(), **STATED), Path(line.strip()))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, Path(__file__).parent],
+        [sys.executable, "-c", program, *sys.path],
         input="\n".join(map(str, names)),
         capture_output=True,
         text=True,

@@ -1,6 +1,6 @@
 """`selfcal monitor` where module, line, log or user end badly: hostile frames, silence, ports that go, signals.
 
-Truth: the frames that tests/c/telemetry_stream.c made, and what was then done to them.
+Truth: the frames that tests/lib/telemetry_stream.c made, and what was then done to them.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ with the drawn effect and the dense covariance of what was drawn.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import cholesky, solve_triangular
-
-from conftest import ROOT
-
-sys.path.insert(0, str(ROOT / "tests" / "hidden"))
 
 import generator
 import judge

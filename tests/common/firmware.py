@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import os
 import subprocess
-import sys
 from collections.abc import Iterable
 from functools import lru_cache
 from itertools import pairwise
@@ -23,7 +22,6 @@ from selfcal.verbs.codegen import codegen
 from selfcal.wire import AxisReport, Decoder
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "host_sim"), str(ROOT / "tests" / "bench")]
 
 parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup-dev")
 Board = parts.Board
