@@ -7,7 +7,7 @@
  * most drift that is plausible: the 95 % quantile of the drift parameter, under a law with a walk if one has 1 % of the
  * probability, else under one with a drift. Too much drift makes z negatively correlated: only positive correlation
  * counts. A slow effect of a channel has widened that quantile as well: its score is far below the score under the
- * true drift, and a warm-up may pass (tests/README.md has the power).
+ * true drift, and a warm-up may pass (tests/ACCURACY.md has the power).
  *
  * State of the filter, relative to sigma_v: the level (the bias, with the walk if there is one), then the Gauss-Markov
  * terms. The innovation nu has variance S. If the model holds, z = nu / sqrt(S) is white with variance 1.
@@ -23,7 +23,7 @@
  *
  * All but the last two are also summed over all epochs, which finds an effect that is small and lasts.
  * Each is normal with variance 1 for large n. The doubt about the parameters widens it by sqrt(1 + n / n_before), which
- * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/README.md). */
+ * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/ACCURACY.md). */
 #include "bank.h"
 
 #define SLOW R(0.0625)          /* l: a mean over some 16 bank samples */

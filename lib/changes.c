@@ -13,7 +13,7 @@
  * windows before. It is told where two windows in a row are LOUDER or QUIETER. So held, eight samples of a burst do not
  * tell.
  *
- * tests/README.md has the rates of false alarms and the delays as measured. */
+ * tests/ACCURACY.md has the rates of false alarms and the delays as measured. */
 #include "bank.h"
 
 #define SPACING 16U

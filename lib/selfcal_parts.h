@@ -238,7 +238,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
 /* An epoch, bank samples. At its end each axis is judged. */
 #define SELFCAL_EPOCH_MIN 256U
 #define SELFCAL_EPOCH_MAX 4096U
-/* Scores beyond these make a model inadequate. One false flag in 1000 h over six axes at 1 Hz: tests/README.md. */
+/* Scores beyond these make a model inadequate. One false flag in 1000 h over six axes at 1 Hz: tests/ACCURACY.md. */
 #define SELFCAL_ADEQUACY_LIMIT 5.0F
 #define SELFCAL_ADEQUACY_LIMIT_EARLY 8.0F /* of ramp, colored_noise and flicker over fewer bank samples than that: */
 #define SELFCAL_ADEQUACY_EARLY 1024U

@@ -70,7 +70,7 @@ def shared_case(name: str, folder: Path, *arguments: str) -> Path:
     """The log of a case, written into `folder` where the case is a script, or a skip that says what is missing."""
     path = SHARED_CASES / name
     if not path.exists():
-        pytest.skip(f"CASES ABSENT: {path} (see tests/README.md, 'Logs that went wrong')")
+        pytest.skip(f"CASES ABSENT: {path} (see tests/README.md)")
     if path.suffix != ".py":
         return path
     before = set(folder.iterdir())

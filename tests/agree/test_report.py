@@ -204,7 +204,7 @@ def test_cases_priors_that_say_as_much_as_the_record(
     n: int, columns: int, spread: float, bias_sd: float, bias: float, limit: Floats | tuple[float, ...]
 ) -> None:
     """Against direct integration: sigma_v's mode is that of a fit under the priors of bias and coefficients. Its shape
-    is taken to the second order in ln sigma_v; tests/README.md says what so few samples lose by that."""
+    is taken to the second order in ln sigma_v; tests/ACCURACY.md says what so few samples lose by that."""
     coefficient_sd, noise = 0.02, 0.05
     tables = tables_of(MODEL, columns=columns, bias_sd=bias_sd, only="constant")
     regressors = tuple(replace(one, reference=0.0, coefficient_sd=(coefficient_sd,)) for one in tables.regressors)
@@ -232,7 +232,7 @@ def test_cases_priors_that_say_as_much_as_the_record(
 def test_a_walk_where_no_walk_is(n: int) -> None:
     """Against direct integration, a sine of 60 s in white noise, which a random walk can but follow: the default model
     keeps the bounds, and so do 20 nodes where no Gauss-Markov law is beside the walk. (16 of them do not, and nothing
-    flags it: tests/README.md has what is printed of them.)"""
+    flags it: tests/ACCURACY.md has what is printed of them.)"""
     y = 0.04 * np.random.default_rng(n).normal(size=n) + 0.05 * np.sin(2.0 * math.pi * np.arange(n) / 60.0)
     default = tables_of(MODEL)
     pair = replace(default, hypotheses=tuple(h for h in default.hypotheses if h.name != "gauss_markov"))

@@ -62,7 +62,7 @@ RHO = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Records a cell by length; beyond, one.
 RECORDS = {10: 12, 100: 12, 1000: 8, 10_000: 3}
 DENSE_RECORDS = {10: 6, 100: 6, 1000: 6, 10_000: 6, 100_000: 3, 300_000: 3}
-#: Bank samples up to which a report on the model's nodes is to hold: of the plain laws, of a sum (tests/README.md).
+#: Bank samples up to which a report on the model's nodes is to hold: of the plain laws, of a sum (tests/ACCURACY.md).
 DENSE_LENGTH, DENSE_LENGTH_SUM = 300_000, 1000
 ENSEMBLE = 500
 #: Columns of text at most; the table takes what it needs.

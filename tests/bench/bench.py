@@ -22,7 +22,7 @@ import image_sizes
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "bench"
 REFERENCE = Path(__file__).with_name("counts.json")
-DOCUMENT = ROOT / "tests" / "README.md"
+DOCUMENT = ROOT / "tests" / "COST.md"
 #: Where the document has the table, whose lines are as long as its others.
 LINE = 120
 TABLE = re.compile(r"(<!-- python tests/bench/bench.py --table -->\n).*(\n<!-- end of the table -->)", re.DOTALL)
@@ -418,7 +418,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--table", action="store_true", help="print counts.json as markdown; measure nothing")
     parser.add_argument("--host", action="store_true", help="measure ns on this machine as well")
-    parser.add_argument("--accept", action="store_true", help="write counts.json and the table of tests/README.md anew")
+    parser.add_argument("--accept", action="store_true", help="write counts.json and the table of tests/COST.md anew")
     arguments = parser.parse_args()
     if arguments.table:
         print(table(read_reference()))

@@ -22,7 +22,7 @@ from selfcal.wire import choices
 from agreement import LIMITS, MODEL, REPORT_LIMIT, Floats, a_record, exact_report, model_of, push, tables_of
 from conftest import case_records, worst_difference
 
-#: To a law excluded by its priors all the noise that they allow is less likely by so many nats (tests/README.md).
+#: To a law excluded by its priors all the noise that they allow is less likely by so many nats (tests/ACCURACY.md).
 EXCLUDED = 13.0
 TARGETS = tuple(MODEL.nodes)
 SUSPECTS = choices("GX_ADEQUACY", "suspicion")
@@ -125,7 +125,7 @@ def flagged(coefficient: float, seed: int) -> set[str]:
 
 
 def test_the_module_names_a_temperature_cycle() -> None:
-    """The power that tests/README.md states: of 0.03 deg/s per degC every record is flagged, by that name. Without the
-    effect one of 200 may be."""
+    """The power that tests/ACCURACY.md states: of 0.03 deg/s per degC every record is flagged, by that name. Without
+    the effect one of 200 may be."""
     assert all(flagged(0.03, seed) == {"temperature"} for seed in range(300, 300 + case_records(4, 60)))
     assert sum(bool(flagged(0.0, seed)) for seed in range(500, 500 + case_records(4, 200))) <= 1

@@ -1,7 +1,7 @@
 """The module's adequacy (lib/adequacy.c): its statistics against a filter in numpy, what it flags and what it does not.
 
 Truth: the textbook Kalman filter of the model stated, and records whose effect is known. The rate of false flags over
-5000 h and the shares found are campaigns: tests/adequacy_rates.py, figures in tests/README.md.
+5000 h and the shares found are campaigns: tests/adequacy_rates.py, figures in tests/ACCURACY.md.
 """
 
 from __future__ import annotations

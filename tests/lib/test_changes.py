@@ -2,7 +2,7 @@
 (lib/changes.c, lib/bank_reopen.c).
 
 Truth: sums of the two parts of a record as the textbook filter has them, and records whose change is known. The rate of
-false changes over 5000 h and the shares found are campaigns: tests/adequacy_rates.py, figures in tests/README.md.
+false changes over 5000 h and the shares found are campaigns: tests/adequacy_rates.py, figures in tests/ACCURACY.md.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ static uint64_t any(void) {
     return state * 0x2545F4914F6CDD1DULL;
 }
 
-/* tests/README.md states these numbers. By chance one would be obeyed in 1400 runs of this test: it has a seed. */
+/* tests/ACCURACY.md states these numbers. By chance one would be obeyed in 1400 runs of this test: it has a seed. */
 static void test_no_random_frame_is_obeyed(void) {
     for (uint32_t i = 0; i < 3000000U; i++) {
         const uint32_t now = 2000U * i;

@@ -1,7 +1,7 @@
 """The warm start (tools/selfcal/warm.py): the prior that a diagnosis gives, in the library and in the firmware.
 
 Truth: the dense Gaussian density of a record under the stated prior; records whose truth is drawn from that prior; and
-a simulated part. The figures of tests/README.md come from tests/warm_start.py, whose campaign is run here with few
+a simulated part. The figures of tests/ACCURACY.md come from tests/warm_start.py, whose campaign is run here with few
 records.
 """
 
@@ -115,7 +115,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(files: Files) -> None:
 
 def test_a_warm_start_gains_at_once(files: Files) -> None:
     """The same part again, 60 samples after the start: the corrected output 300 s later errs by a third of the cold
-    one's error (tests/README.md: a quarter); K and the coefficient are narrower, N no wider. 60 rests."""
+    one's error (tests/ACCURACY.md: a quarter); K and the coefficient are narrower, N no wider. 60 rests."""
     found = campaign(both(*files), 60, 60, 1, "same")
     cold, warm = found["cold"], found["warm"]
     assert warm["error"] < cold["error"] / 3.0

@@ -34,6 +34,7 @@ from conftest import COMMAND as PROGRAM  # noqa: E402
 
 DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
+    *("tests/ACCURACY.md", "tests/COST.md"),
     *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "tools/README.md", "tools/MODEL.md", "tools/LOGS.md"),
 )
 WALKTHROUGH = ROOT / "tools" / "README.md"
@@ -199,8 +200,8 @@ def test_every_command_of_the_documents_runs(name: str, request: pytest.FixtureR
 
 
 def test_the_sizes_of_the_images_are_those_of_the_bench() -> None:
-    """port/README.md against the table of tests/README.md, in KB."""
-    table = (ROOT / "tests" / "README.md").read_text(encoding="utf-8").partition("**whole image**, bytes")[2]
+    """port/README.md against the table of tests/COST.md, in KB."""
+    table = (ROOT / "tests" / "COST.md").read_text(encoding="utf-8").partition("**whole image**, bytes")[2]
     sizes = [[int(cell.replace(",", "")) for cell in re.findall(r"\d+,\d+", line)] for line in table.splitlines()[1:4]]
     told = re.search(r"need ([\d.]+) KB of flash and ([\d.]+) KB of RAM beside ([\d.]+) KB of stack on the "
                      r"`stm32f405`,\s+([\d.]+) KB and ([\d.]+) KB beside ([\d.]+) KB on the `cortex-m0`",
@@ -224,7 +225,7 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
 def test_the_cost_table_is_the_one_of_the_bench() -> None:
     bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), "--table"]
     table = subprocess.run(bench, capture_output=True, text=True, check=True).stdout.strip()
-    assert table in (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
+    assert table in (ROOT / "tests" / "COST.md").read_text(encoding="utf-8")
 
 
 def blocks(document: Path, language: str) -> list[str]:

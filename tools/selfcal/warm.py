@@ -25,8 +25,9 @@ from selfcal.tables import HypothesisTable, PriorRow, RegressorTable, Tables
 #: Half the width of a measured prior, in sd of what is expected of ln(parameter); sd of that prior over this sd.
 REACH = 4.0
 WIDENED = REACH / math.sqrt(3.0)
-#: sd of ln(parameter) from one rest of a part to its next, by place: N; the drift parameter; alpha or the ratio. From
-#: three runs of one ADIS16405 (tests/README.md, "Warm start"). Of a coefficient, assumed: the runs have no temperature.
+#: sd of ln(parameter) from one rest of a part to its next, by place: N; the drift parameter; alpha or the ratio.
+#: From three runs of one ADIS16405 (tests/ACCURACY.md, "Warm start"). Of a coefficient, assumed: the runs have no
+#: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
 RUN_TO_RUN_SECOND, RUN_TO_RUN_COEFFICIENT = 0.4, 0.1
 #: A law with less than this probability keeps the model's priors: its parameters stand for nothing.
