@@ -87,8 +87,7 @@ def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
     for part in (
         "Makefile",
         "port/boards.txt",
-        "port/boards.mk",
-        "port/arm.mk",
+        *(part.relative_to(ROOT) for room in ("port", "tests") for part in (ROOT / room).rglob("*.mk")),
         "tools/requirements.txt",
         "tools/pyproject.toml",
         "tools/CMakeLists.txt",
