@@ -10,7 +10,7 @@
  * `. */
 #include "selfcal.h"
 
-#include "laws.h"
+#include "named_laws.h"
 #include "slcan.h"
 
 #include <math.h>

@@ -2,7 +2,7 @@
  * Every item's bits against the DBC: tests/lib/test_wire.py. */
 #include "selfcal.h"
 
-#include "laws.h"
+#include "named_laws.h"
 #include "unity.h"
 
 #include <math.h>
