@@ -1,0 +1,112 @@
+"""Shares of truths in the 90 % intervals, on noise that no part of the library draws.
+
+    python tests/noise_coverage.py flicker --hours 1 --records 400 --seed 7
+    python tests/noise_coverage.py counted --hours 1 --records 100 --seed 7
+
+flicker: two-sided density B^2 / (2 pi f) at readings of 10 Hz, by Fourier synthesis over 16 times the record, beside
+white noise of N 0.04. B from 0.005 to 0.05. The law is `flicker` of sums.yaml alone, at its nodes of the host.
+
+counted: differences of white remainders of sd Q beside white noise and a random walk, readings of 4 Hz. N from 0.0074
+to 0.054, Q / N from 0.4 to 3 sqrt(s), K / N of 0.0037 to 0.027 /s. What `identify` states by itself is counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.engines.library import Bank
+from selfcal.model import DEFAULT, Model
+from selfcal.recording import as_float
+from selfcal.tables import make_tables
+from selfcal.verbs.identify import identify
+
+Floats = NDArray[np.float64]
+#: By parameter: truth, 5 %, median and 95 %; and whether the grid of nodes is flagged.
+Found = tuple[dict[str, tuple[float, float, float, float]], bool]
+
+FLICKER_HZ, LONGER, COUNTED_HZ = 10.0, 16, 4.0
+
+
+def one_over_f(random: np.random.Generator, n: int, rate: float, B: float) -> Floats:
+    """[n] readings."""
+    whole = n * LONGER
+    frequency = np.fft.rfftfreq(whole, 1.0 / rate)
+    density = np.zeros(frequency.size)
+    density[1:] = B**2 / (2.0 * math.pi * frequency[1:])
+    size = np.sqrt(0.5 * density * whole * rate)
+    parts = random.standard_normal(frequency.size) + 1j * random.standard_normal(frequency.size)
+    return np.asarray(np.fft.irfft(parts * size, whole)[:n])
+
+
+def flicker(random: np.random.Generator, seconds: float) -> Iterator[Found]:
+    model = replace(Model.load(DEFAULT.parent / "sums.yaml"), hypotheses={"flicker": 1.0})
+    tables = make_tables(model, FLICKER_HZ, ("gx",))
+    n = round(seconds * FLICKER_HZ)
+    while True:
+        N, B = 0.04, math.exp(random.uniform(math.log(0.005), math.log(0.05)))
+        y = 0.1 + one_over_f(random, n, FLICKER_HZ, B) + N * math.sqrt(FLICKER_HZ) * random.standard_normal(n)
+        bank = Bank(tables)
+        bank.push(as_float(y)[:, None])
+        found = bank.report(0).parameters["flicker"]
+        told = {name: (truth, *quantiles(found[name])) for name, truth in (("N", N), ("B", B))}
+        yield told, found["B"].off_grid
+
+
+def quantiles(one: object) -> tuple[float, float, float]:
+    low, middle, high = (float(getattr(one, key)) for key in ("q05", "median", "q95"))
+    return low, middle, high
+
+
+def counted(random: np.random.Generator, seconds: float) -> Iterator[Found]:
+    n = round(seconds * COUNTED_HZ)
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log.npz"
+        while True:
+            N = 0.02 * math.exp(random.uniform(-1.0, 1.0))
+            K = 0.01 * N * math.exp(random.uniform(-1.0, 1.0))
+            Q = N * math.exp(random.uniform(math.log(0.4), math.log(3.0)))
+            y = 0.1 + K / math.sqrt(COUNTED_HZ) * random.standard_normal(n).cumsum()
+            y += N * math.sqrt(COUNTED_HZ) * random.standard_normal(n)
+            y += np.diff(Q * random.standard_normal(n + 1)) * COUNTED_HZ
+            np.savez(log, **{"t[s]": np.arange(n) / COUNTED_HZ, "gx[deg/s]": y})
+            axis = identify(log).axes["gx"]
+            found, numbers = axis.parameters[axis.law], axis["summary"]
+            told = {name: (truth, *quantiles(found[name])) for name, truth in (("N", N), ("K", K)) if name in found}
+            if "quantization_noise" in numbers:
+                one = numbers["quantization_noise"]
+                told["Q"] = (Q, one["q05"], one["median"], one["q95"])
+            yield told, bool(found["N"].off_grid)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("noise", choices=("flicker", "counted"))
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--records", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=7)
+    given = parser.parse_args()
+    random = np.random.default_rng([given.seed, round(3600.0 * given.hours)])
+    draw = {"flicker": flicker, "counted": counted}[given.noise]
+    each = [one for _, one in zip(range(given.records), draw(random, 3600.0 * given.hours), strict=False)]
+    for name in dict.fromkeys(name for told, _ in each for name in told):
+        rows = np.array([told[name] for told, _ in each if name in told])
+        inside = (rows[:, 1] <= rows[:, 0]) & (rows[:, 0] <= rows[:, 3])
+        off = np.log(rows[:, 2] / rows[:, 0])
+        print(
+            f"{given.noise}, {given.hours:g} h: {name}: {inside.sum()} of {len(rows)} in the 90 % interval "
+            f"({100.0 * inside.mean():.1f} %), mean error of the ln {off.mean():+.3f}, "
+            f"its error {off.std() / math.sqrt(len(rows)):.3f}"
+        )
+    print(f"flagged: {sum(flagged for _, flagged in each)} of {len(each)}")
+
+
+if __name__ == "__main__":
+    main()
