@@ -115,9 +115,14 @@ def test_codes_that_are_alike_are_not_named(kind: str) -> None:
     assert named <= binom.isf(1e-3, count, 1.0 / 200.0)
 
 
-@pytest.mark.parametrize(("ratio", "count", "q"), [(2, 60, 0.2), (2, 40, 0.0), (3, 30, 0.5), (4, 25, 0.3)])
+@pytest.mark.parametrize(
+    ("ratio", "count", "q"), [(2, 60, 0.2), (2, 40, 0.0), (3, 30, 0.4), (4, 25, 0.3), (3, 60, 0.7)]
+)
 def test_a_stretch_at_a_part_of_the_rate_is_named(ratio: int, count: int, q: float, tmp_path: Path) -> None:
-    """`count` readings, each `ratio` times. An end may be a reading off: it may equal its neighbour by chance."""
+    """`count` readings, each `ratio` times. An end may be a reading off: it may equal its neighbour by chance.
+
+    A lattice coarser than half the noise is a finding of its own. No lattice here is near that limit: the noise that
+    the record shows decides there."""
     for seed in range(case_records(1, 20)):
         random = np.random.default_rng([64, seed, ratio, count])
         y = rounded(quiet(random), q * SD)
@@ -126,8 +131,9 @@ def test_a_stretch_at_a_part_of_the_rate_is_named(ratio: int, count: int, q: flo
         held[:] = held[np.arange(held.size) // ratio * ratio]
         rate = float(random.choice([1.0, 4.0]))
         axis = diagnose(log_of(tmp_path / "held.npz", y, rate))["axes"]["gx"]
-        (finding,) = axis["findings"]
-        assert finding["cause"] == "held_samples"
+        found = {finding["cause"]: finding for finding in axis["findings"]}
+        assert found.keys() == {"held_samples"} | ({"quantization"} if q > 0.5 else set())
+        finding = found["held_samples"]
         assert finding["estimate"]["rate_hz"]["median"] == pytest.approx(rate / ratio)
         ((begin, end),) = finding["estimate"]["intervals"]
         assert abs(begin * rate - first) <= 2 * ratio

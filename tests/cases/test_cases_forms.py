@@ -22,7 +22,7 @@ from selfcal.diagnosis.loop import LOOKS, diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, State
 from selfcal.errors import UserError
-from selfcal.forms import formed, variance_of
+from selfcal.forms import formed, slope, variance_of
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import load
 from selfcal.verbs.codegen import codegen
@@ -163,7 +163,7 @@ KINDS: dict[str, tuple[Effect, str, str, dict[str, float]]] = {
     "static": (static, "temperature", "static", {"coefficient": 0.03}),
     "square": (bend, "temperature", "square", {"square": 0.004}),
     "lag": (lag, "temperature", "lag", {"coefficient": 0.04, "lag_s": 310.0}),
-    "rate": (rate, "temperature", "rate", {}),
+    "rate": (rate, "temperature", "rate", {"rate": 6.0}),
     "play": (hysteresis, "temperature", "play", {"width": 2.6}),
     "leak": (leak, "cross_axis", "lag", {"coefficient": 5.0, "lag_s": 13.0}),
     "fan": (fan, "vibration", "static", {}),
@@ -283,6 +283,19 @@ def test_columns_are_as_defined(gaps: bool) -> None:
     window = 32
     slope = [np.polyfit(dt * np.arange(window), whole[i - window + 1 : i + 1], 1)[0] for i in rows[rows >= window]]
     assert formed(values[rows], "rate", window * dt, 0.0, dt, missing)[rows >= window] == pytest.approx(slope, abs=2e-5)
+
+
+@pytest.mark.parametrize(("window_s", "dt"), [(40.0, 1.0), (9.0, 0.3), (0.5, 1.0)])
+def test_the_slope_of_the_diagnosis_is_not_late(window_s: float, dt: float) -> None:
+    """Of a parabola the slope about a sample is its derivative there, wherever whole windows fit. The middle of an even
+    number of samples is half of one off; the library forms the column in float32."""
+    n = 400
+    t = dt * np.arange(n)
+    whole = max(2, round(window_s / dt))
+    inner = slice(whole, n - whole)
+    curve = 30.0 + 0.01 * t + 3e-4 * t**2
+    assert slope(curve, window_s, dt)[inner] == pytest.approx((0.01 + 6e-4 * t)[inner], abs=6e-4 * dt * 0.51 + 2e-5)
+    assert np.all(np.isfinite(slope(curve[:3], window_s, dt)))
 
 
 def test_a_form_begins_at_rest() -> None:

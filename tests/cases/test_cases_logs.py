@@ -437,6 +437,26 @@ def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path) -> None:
     print(f"{name}: {refused} of {copies} refused")
 
 
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 255])
+@pytest.mark.parametrize("place", ["begin", "end"])
+def test_a_message_of_no_bytes_ends(length: int, place: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """A DataFlash message without fields, 3 bytes of head, that states another length: a recording of some of the
+    samples or one line, in a small part of the time that a file may take."""
+    log = logs.write_dataflash(drawn, tmp_path)
+    whole = log.read_bytes()
+    fmt = b"\xa3\x95\x80" + bytes([200, length]) + b"NONE".ljust(4 + 16 + 64, b"\0")
+    at = whole.index(b"\xa3\x95\x80", 1) if place == "begin" else len(whole)
+    log.write_bytes(whole[:at] + fmt + b"\xa3\x95\xc8" + whole[at:])
+    begun = time.monotonic()
+    try:
+        assert 0 < load(log).samples <= drawn.t.size
+    except UserError as error:
+        assert "\n" not in str(error)
+        assert str(log) in str(error)
+        assert length != 3  # the one that fits
+    assert time.monotonic() - begun < 20.0
+
+
 @pytest.mark.parametrize(
     ("does", "line"),
     [

@@ -108,6 +108,26 @@ def test_a_level_that_follows_a_channel(follows: str) -> None:
         assert binom.isf(1.0 - 1e-3, right, 0.9) <= inside
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("quiet", ["throughout", "at first"])
+def test_an_axis_without_noise_is_no_channel(quiet: str) -> None:
+    """Another axis that reads one value has no variance to follow, and no library warns of its logarithm. One that is
+    quiet for a part of the record has one."""
+    random = np.random.default_rng(74)
+    y, _, other, _ = drawn(random, "nothing")
+    other[: None if quiet == "throughout" else y.size // 2] = 0.0
+    axes = {
+        "gx": State("gx", "deg/s", y, 1.0, 0.0, np.ones(y.size)).refit(),
+        "gy": State("gy", "deg/s", other, 1.0, 0.0, np.ones(y.size)),
+    }
+    roughness = {name: variance_of(one.y) for name, one in axes.items()}
+    record = Record(1.0, axes, {}, {}, np.ones(y.size, bool), recorded_hz=1.0, roughness=roughness)
+    levels = {one.column: one.values for one in variance_change.levels(axes["gx"], record)}
+    assert set(levels) == (set() if quiet == "throughout" else {"gy"})
+    assert all(np.isfinite(values).all() for values in levels.values())
+    variance_change.looks(axes["gx"], record)
+
+
 def test_a_recording_of_both(tmp_path: Path) -> None:
     """The whole diagnosis names the temperature, states the size, and the noise level is explained by it."""
     random = np.random.default_rng(73)

@@ -91,6 +91,16 @@ def formed(
     return np.asarray(column + origin) if form == "lag" else column
 
 
+def slope(values: Array, window_s: float, interval_s: float) -> Array:
+    """[n]: the slope of the straight line that fits the window about each sample best, per second; near an end that of
+    the nearest whole window. A module's rate trails, and so it is late by half of its window."""
+    if window_s <= interval_s:
+        return np.asarray(np.gradient(values, interval_s))
+    last, whole = values.size - 1, round(window_s / interval_s)
+    at = np.clip(np.arange(values.size) + whole // 2, min(whole, last), last)
+    return formed(values, "rate", window_s, 0.0, interval_s)[at]
+
+
 def played(values: Array, width: float) -> Array:
     """What follows at half of `width` at most, and moves only if it must."""
     out = np.empty(values.size)

@@ -22,7 +22,7 @@ from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import FORMS, NUMBER, POWER, formed
+from selfcal.forms import FORMS, NUMBER, POWER, formed, slope
 from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import coefficient_unit
 from selfcal.units import power
@@ -34,7 +34,7 @@ KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
 #: file's window is as wide and trails: a module has no later values.
 SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
-#: Windows of a rate, s. A lattice of 0.14 degC wants a long one, a large coefficient a short one: it lags by half.
+#: Windows of a rate, s. A lattice of 0.14 degC wants a long one, a quick change of the channel a short one.
 RATE_WINDOWS_S = (20.0, 40.0, 60.0, 90.0, 150.0, 400.0)
 #: Widths of a play over the channel's own range.
 PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
@@ -130,7 +130,7 @@ def look(state: State, channels: Sequence[Channel]) -> list[Look]:
 
 
 def column_of(channel: Channel, state: State, form: str, number: float, width_s: float) -> Option:
-    """A form's columns as the diagnosis takes them: of centred means, which have no lag of their own."""
+    """A form's columns as the diagnosis takes them: of centred means and slopes, which have no lag of their own."""
     window = max(1, round(width_s / state.dt))
     about = smoothed(channel.values, window) - channel.reference
     entry: dict[str, Any] = {"kind": "column", "column": channel.column, "unit": channel.unit}
@@ -147,17 +147,12 @@ def column_of(channel: Channel, state: State, form: str, number: float, width_s:
 
     known = _known(state)
     parts = [part for part in PARTS.get(form, (form,)) if (channel.column, channel.input, part) not in known]
-    return Option(
-        form,
-        number,
-        tuple(
-            regressor(
-                part, formed(about, part, number, 0.0, state.dt), **({NUMBER[part]: number} if part in NUMBER else {})
-            )
-            for part in parts
-        ),
-        window,
-    )
+
+    def values(part: str) -> Array:
+        return slope(about, number, state.dt) if part == "rate" else formed(about, part, number, 0.0, state.dt)
+
+    numbers = {part: {NUMBER[part]: number} if part in NUMBER else {} for part in parts}
+    return Option(form, number, tuple(regressor(part, values(part), **numbers[part]) for part in parts), window)
 
 
 def form_of(column: Regressor) -> tuple[str, str, str]:
@@ -447,7 +442,8 @@ RATE_WINDOW_S = 60.0
 
 
 def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
-    """What the forms of a channel add to a reading beside its static coefficient, [n]; 0 at the first sample."""
+    """What the forms of a channel add to a reading beside its static coefficient, [n]; but for a rate 0 at the first
+    sample."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
     total = np.zeros(values.size)
     for form in ("lag", "play"):
@@ -456,7 +452,7 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
             total += float(keys["coefficient"]) * (late - values)
     if "rate" in keys:
         window_s = float(keys.get("window_s", RATE_WINDOW_S))
-        total += float(keys["rate"]) * formed(values, "rate", window_s, 0.0, interval_s)
+        total += float(keys["rate"]) * slope(values, window_s, interval_s)
     for form in POWER:
         if form in keys:
             column = formed(values, form, about=float(values.mean()))

@@ -30,6 +30,8 @@ Seen = dict[tuple[Looks, tuple[int, ...]], tuple[list[Look], Record]]
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
+#: A look that predicts held-out time worse is no cause. From this worth on it is no chance either.
+UNLASTING = 2.0 * NET_LEAST
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
 
@@ -280,5 +282,16 @@ def _unexplained(one: Diagnosed) -> None:
     if one.state.below_lattice:
         return
     one.after, look = unexplained(one.state, one.record)
+    if look is None and not one.findings:
+        look = _unlasting(one.harmful)
     if look is not None and all(finding.look.cause != "unexplained" for finding in one.findings):
         one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
+
+
+def _unlasting(harmful: Sequence[Look]) -> Look | None:
+    """The most evident of the looks that predict held-out time worse, as what has no name."""
+    most = max(harmful, key=lambda look: look.net, default=None)
+    if most is None or most.net < UNLASTING:
+        return None
+    estimate = {"statistic": f"{most.cause} that does not last", "measured": most.gain}
+    return Look("unexplained", most.gain, most.net, estimate, {}, shown_by=str(most.estimate.get("other", most.cause)))

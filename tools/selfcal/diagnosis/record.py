@@ -74,11 +74,16 @@ class Record:
         return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
 
     def variances(self, axis: str) -> dict[str, Array]:
-        """Short-term variance of the other axes, bridged where an axis is missing or left out."""
-        return {
-            name: bridged(np.where(np.isfinite(self.axes[name].y), values, np.nan))
+        """Short-term variance of the other axes that have any, bridged where an axis is missing or left out."""
+        known = {
+            name: np.where(np.isfinite(self.axes[name].y), values, np.nan)
             for name, values in self.roughness.items()
-            if name != axis and name in self.axes and np.isfinite(self.axes[name].y + values).sum() > 1
+            if name != axis and name in self.axes
+        }
+        return {
+            name: bridged(values)
+            for name, values in known.items()
+            if np.isfinite(values).sum() > 1 and np.nansum(values) > 0.0
         }
 
     def channel_of(self, column: str, by: str = "value") -> Array:

@@ -21,7 +21,7 @@ from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, NOISES, inconstancy
 from selfcal.diagnosis.record import smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
 from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array
-from selfcal.forms import formed
+from selfcal.forms import formed, slope
 
 Complex = NDArray[np.complex128]
 #: Probability of an interval.
@@ -98,13 +98,6 @@ def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure
     def level(width: float) -> Array:
         return smoothed(u, max(1, round(width / dt)))
 
-    def slope(window: float) -> Array:
-        if window <= dt:
-            return np.gradient(u, dt)
-        # A line's slope over its window is late by half of it: put back.
-        shift, trailing = round(window / 2.0 / dt), formed(u, "rate", window, 0.0, dt)
-        return np.concatenate([trailing[shift:], np.full(shift, trailing[-1])])
-
     def late(lag: float, values: Array = u) -> Array:
         return formed(values, "lag", lag, 0.0, dt)
 
@@ -116,10 +109,11 @@ def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure
     middle = widths[len(widths) // 2]
     return [
         Structure("static", 0, ("gain",), widths, lambda w: level(w)[None], lambda c, _, s: c[:, 0] + 0.0 * s),
-        Structure("rate", 0, ("rate",), windows_s, lambda w: slope(w)[None], lambda c, _, s: c[:, 0] * s),
+        Structure("rate", 0, ("rate",), windows_s, lambda w: slope(u, w, dt)[None], lambda c, _, s: c[:, 0] * s),
         Structure(
             "static and rate", 0, ("gain", "rate"), windows_s,
-            lambda w: np.array([level(middle if w > dt else 0.0), slope(w)]), lambda c, _, s: c[:, 0] + c[:, 1] * s,
+            lambda w: np.array([level(middle if w > dt else 0.0), slope(u, w, dt)]),
+            lambda c, _, s: c[:, 0] + c[:, 1] * s,
         ),
         Structure(
             "late rate", 1, ("rate", "start"), lags,

@@ -73,7 +73,17 @@ def _bin(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
     """Source, kind, headings and values of each message of an IMU."""
     from pymavlink.DFReader import DFReader_binary
 
-    log = DFReader_binary(str(path), zero_time_base=True)
+    class Log(DFReader_binary):  # type: ignore[misc]
+        """A log whose reading ends: the library takes a message of no bytes for ever."""
+
+        def recv_msg(self) -> Any:
+            begin = self.offset
+            message = super().recv_msg()
+            if message is not None and self.offset <= begin:
+                raise UserError(f"{path}: damaged: a message of no bytes at byte {begin}")
+            return message
+
+    log = Log(str(path), zero_time_base=True)
     known: dict[tuple[Any, Any], tuple[list[int], list[float], list[str], int | None]] = {}
     while (message := log.recv_match(type=list(_DATAFLASH), strict=True)) is not None:
         layout = message.fmt

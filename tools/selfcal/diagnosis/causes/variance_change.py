@@ -55,7 +55,7 @@ def once(state: State, record: Record) -> list[Look]:
     square = np.minimum(w * w, MOST) + 1e-12
     total = np.cumsum(square)
     k = np.arange(1, n)
-    first, second = total[:-1] / k, (total[-1] - total[:-1]) / (n - k)
+    first, second = total[:-1] / k, np.maximum((total[-1] - total[:-1]) / (n - k), 1e-12)
     gain = 0.5 * (n * math.log(total[-1] / n) - k * np.log(first) - (n - k) * np.log(second))
     gain[: edge - 1] = gain[n - edge :] = 0.0
     at = int(np.argmax(gain))
@@ -129,7 +129,7 @@ def levels(state: State, record: Record) -> Iterator[Level]:
         for width in vibration.WIDTHS_S:
             if width * record.recorded_hz >= vibration.LEAST and width <= 0.1 * n * dt:
                 power = smoothed(values, round(width / dt))
-                yield Level(name, "1", np.log(np.maximum(power, 1e-12 * power.max())), "variance", width, price)
+                yield Level(name, "1", np.log(np.maximum(power / power.max(), 1e-12)), "variance", width, price)
 
 
 def follows(state: State, record: Record) -> list[Look]:
