@@ -11,7 +11,6 @@ import pytest
 
 from selfcal.errors import UserError
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.identify import identify
 
 from conftest import shared_case
 
@@ -33,12 +32,3 @@ def test_a_cubic_of_the_temperature_has_its_curvature(tmp_path: Path) -> None:
     found = causes_of(shared_case("P30_cubic.py", tmp_path))
     assert "ramp" not in found
     assert found.get("temperature", {}).get("form") in ("square", "cube")
-
-
-@later(15, "quantization noise Q")
-def test_quantization_noise_stands_beside_white_noise(tmp_path: Path) -> None:
-    """P23: increments counted in steps of 2e-3 m/s beside N = 8e-4 m/s^2/sqrt(Hz). 4 sd."""
-    (axis,) = identify(shared_case("P23_qn_accel.py", tmp_path))["axes"].values()
-    law = max(axis["hypotheses"], key=axis["hypotheses"].get)
-    N = axis["parameters"][law]["N"]
-    assert abs(N["median"] - 8e-4) < 4.0 * N["sd"]

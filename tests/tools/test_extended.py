@@ -48,6 +48,7 @@ EFFECTS = {
     "oscillation": ("period_s=120,damping=0.1,sd=0.03", 1.0),
     "flicker": ("B=0.05", 10.0),
     "colored_noise": ("lag1=0.4", 1.0),
+    "quantization_noise": ("Q=0.04", 1.0),
     "quantization": ("lsb=0.3", 10.0),
     "outliers": ("fraction=0.005", 1.0),
     "variance_change": ("time_s=1000,ratio=2", 1.0),

@@ -353,8 +353,8 @@ def test_csv_and_npz_hold_the_same_recording(tmp_path: Path) -> None:
     "effect",
     ["temperature", "supply", "cross_axis", "ramp", "step", "pulse", "two_level", "turn_on", "periodic", "flicker",
      "oscillation",
-     "colored_noise", "quantization", "outliers", "variance_change", "saturation", "motion", "missing_samples", "stuck",
-     "held_samples", "rate_change"],
+     "colored_noise", "quantization_noise", "quantization", "outliers", "variance_change", "saturation", "motion",
+     "missing_samples", "stuck", "held_samples", "rate_change"],
 )  # fmt: skip
 def test_every_effect_changes_the_recording_with_its_defaults(effect: str, tmp_path: Path) -> None:
     path = DATA / "simulated_adis16405.yaml"

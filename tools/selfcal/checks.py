@@ -78,11 +78,14 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
 
 
-def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *, as_fed: bool = False) -> Judged:
-    """The same with the checks of the readings. `unit`: the recording's.
+def with_readings(
+    judged: Judged, readings: Readings, group: Group, unit: str, dt_s: float, *, as_fed: bool = False
+) -> Judged:
+    """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
 
-    `lattice`, if they lie on one: is their noise above it? `value`: steps in the noise of a reading; `step` in the
-    recording's unit; `distinct` readings. `saturation`, if some are clipped: their share, and the `at` of the limit.
+    `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
+    noise of a reading; `step` in the recording's unit; `distinct` readings.
+    `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
     `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
     `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
@@ -93,7 +96,7 @@ def with_readings(judged: Judged, readings: Readings, group: Group, unit: str, *
     checks: dict[str, dict[str, Any]] = {}
     found = readings.lattice
     if found is not None:
-        told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse}
+        told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse_over(dt_s)}
         checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct}
     if readings.clipped is not None:
         share = float(readings.clipped.mask.mean())

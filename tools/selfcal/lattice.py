@@ -13,6 +13,14 @@ from numpy.typing import NDArray
 #: lattice. A reading that toggles between two values has at least 2, however little noise there was before rounding.
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
 BELOW_LATTICE = 1.9
+#: Seconds that show whether rounding errors are carried on: sums of a second then scatter by less than this share of
+#: what rounding by itself makes of them.
+CARRIED_SECONDS, CARRIED_SHARE = 120, 0.5
+#: Difference of two remainders of sums that follow each other, each uniform in a step: its share in the scatter.
+REMAINDERS = 0.25
+#: Variance, in steps^2, that noise gains in an interval from which on the remainders of its ends are white: they
+#: correlate by exp(-2 pi^2 of it), 0.14.
+WHITE_REMAINDERS = 0.1
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
@@ -21,16 +29,24 @@ SHOWN = 20
 
 @dataclass(frozen=True)
 class Lattice:
-    """`step` in the unit of the readings; `coarseness`: steps in the noise of a reading; `distinct` readings."""
+    """`step` in the unit of the readings; `coarseness`: steps in the noise of a reading; `distinct` readings.
+
+    `carried`: of a counter whose increments are read, the variance that its noise gains in a second, in steps^2; 0
+    where each reading is rounded by itself."""
 
     step: float
     coarseness: float
     distinct: int
+    carried: float = 0.0
 
     @property
     def too_coarse(self) -> bool:
         """Rounding is no white noise: what is told of the noise is the lattice's."""
         return self.coarseness > BELOW_LATTICE
+
+    def too_coarse_over(self, interval_s: float) -> bool:
+        """The same of means over an interval. Those of a counter have white remainders (quantization noise)."""
+        return self.too_coarse and self.carried * interval_s < WHITE_REMAINDERS
 
 
 def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | None:
@@ -39,6 +55,7 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
     Their noise is the scatter about means of 1 s, or that of differences where a second holds fewer than four: a drift
     has no part in either.
     """
+    carried = 0.0
     unique = np.unique(values)
     step = _step(unique)
     if step <= 0.0 or not _throughout(unique, step):
@@ -51,7 +68,12 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
     else:
         noise = float(np.diff(values).std()) / math.sqrt(2.0)
     coarseness = step / noise if noise > 0.0 else math.inf
-    return Lattice(step, coarseness, unique.size) if coarseness >= FINE else None
+    if count >= CARRIED_SECONDS and BELOW_LATTICE < coarseness < math.inf:
+        sums = within.sum(axis=1) / step
+        scatter = 0.5 * float((np.diff(sums) ** 2).mean())
+        if scatter < CARRIED_SHARE * second / coarseness**2:
+            carried = max(0.0, scatter - REMAINDERS)
+    return Lattice(step, coarseness, unique.size, carried) if coarseness >= FINE else None
 
 
 def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:

@@ -117,6 +117,7 @@ class IdentifiedAxis(Object):
     checks: dict[str, Check]
     suspicion: str | None
     more_laws: dict[str, float] | None
+    added_law: str | None
     allan: dict[str, Any] | None
     regressors: dict[str, Any] | None
     regressors_in_use: list[str] | None

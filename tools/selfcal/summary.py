@@ -1,9 +1,11 @@
-"""The three numbers of a data sheet, of the posterior of all laws: white noise, random walk, bias instability.
+"""The numbers of a data sheet, of the posterior of all laws: white noise, random walk, bias instability, quantization.
 
 The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
 Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
 has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
-Each law counts by its probability.
+Coloured noise of a spectral ratio below 1 is white noise beside quantization noise; at the bank's interval dt
+Q = N sqrt(dt) sqrt(1 / ratio^2 - 1) / 2. The number is there where such noise is sure. Each law counts by its
+probability.
 """
 
 from __future__ import annotations
@@ -44,13 +46,13 @@ class Number:
 
 
 def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, Number]:
-    """The numbers of an axis by their keys (arw, rrw, bias_instability), in the group's unit: of `n` readings every
-    `dt_s`, gaps among them, each the mean of `block` samples. Empty where the record is too short for an Allan
-    deviation."""
+    """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
+    the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
+    record is too short for an Allan deviation."""
     if n < 2 * LONGEST:
         return {}
     m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
-    white, walk, floor, reached, weight = [], [], [], [], []
+    white, walk, counted, floor, reached, weight = [], [], [], [], [], []
     drifts, open_drifts = 0.0, 0.0  # probability of the laws with a drift, and of those that leave its size open
     for law, probability in result.probability.items():
         estimates = result.parameters[law]
@@ -64,6 +66,7 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
         open_drifts += probability * (bool(sizes) and not any(sizes))
         white.append(draws["N"])
         walk.append(_walk(draws))
+        counted.append(_quantization(draws, dt_s))
         lowest = [
             _minimum(terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block), m)
             for row in zip(*draws.values(), strict=True)
@@ -74,13 +77,15 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
     if not weight:
         return {}
     w = np.concatenate(weight) / np.concatenate(weight).sum()
-    k, place = np.concatenate(walk), np.concatenate(reached)
+    k, q, place = np.concatenate(walk), np.concatenate(counted), np.concatenate(reached)
     has_walk, has_floor = float(w[k > 0.0].sum()), float(w[place == 0].sum())
     found = {
         "arw": _number(np.concatenate(white), w),
         "rrw": _number(np.where(np.isnan(k), 0.0, k), w),
         "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
     }
+    if float(w[q > 0.0].sum()) >= _SURE:
+        found["quantization_noise"] = _number(q, w)
     prior = group.priors["K"]
     widest = HALF_90 * math.log(prior.max / prior.min) / math.sqrt(12.0)  # of ln(q95 / q05): half the prior's sd
     if has_walk < _SURE:
@@ -101,6 +106,14 @@ def _walk(draws: Mapping[str, _Floats]) -> _Floats:
     if "sigma_m" in draws and "alpha" in draws:
         return np.asarray(draws["sigma_m"] * np.sqrt(2.0 * draws["alpha"]))
     return np.zeros(draws["N"].size)
+
+
+def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
+    """Q of each draw; 0 of a law whose noise has no memory, or one of the other sign."""
+    if "spectral_ratio" not in draws:
+        return np.zeros(draws["N"].size)
+    over = np.maximum(draws["spectral_ratio"] ** -2.0 - 1.0, 0.0)
+    return np.asarray(0.5 * draws["N"] * np.sqrt(dt_s * over))
 
 
 def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:

@@ -72,6 +72,7 @@ _NUMBERS = {
     "arw": ("ARW", "VRW", "white noise"),
     "rrw": ("RRW", "RRW", "random walk"),
     "bias_instability": ("bias instability",) * 3,
+    "quantization_noise": ("quantization noise",) * 3,
 }
 
 
@@ -210,9 +211,14 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         ]
         if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
             failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
-    suspected = [f"{name}: {axis['suspicion'].replace('_', ' ')}" for name, axis in axes.items() if "suspicion" in axis]
-    if suspected:
-        failed.append(f"strongest suspicion: {'; '.join(suspected)}")
+    for said, chosen in (("identified with", True), ("strongest suspicion", False)):
+        suspected = [
+            f"{name}: {axis['suspicion'].replace('_', ' ')}"
+            for name, axis in axes.items()
+            if "suspicion" in axis and ("added_law" in axis) is chosen
+        ]
+        if suspected:
+            failed.append(f"{said}: {'; '.join(suspected)}")
     for name, axis in axes.items():
         if "more_laws" in axis:
             laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]

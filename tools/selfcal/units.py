@@ -48,6 +48,7 @@ _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "rad": (_dimension(angle=1), 1.0),
     "mrad": (_dimension(angle=1), 1e-3),
     "deg": (_dimension(angle=1), math.pi / 180.0),
+    "arcsec": (_dimension(angle=1), math.pi / 648_000.0),
     "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
     "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
     "m": (_dimension(length=1), 1.0),
@@ -194,6 +195,15 @@ def per_second(unit: str) -> str:
     return f"{unit[: match.start()]}/s^{int(match[1] or 1) + 1}"
 
 
+def times_second(unit: str) -> str:
+    """`unit` times a second: `deg/s` -> `deg`, `m/s^2` -> `m/s`, `deg/h` -> `deg/h*s`."""
+    match = re.search(r"/s(?:\^(\d+))?\Z", unit)
+    if match is None:
+        return f"{unit}*s"
+    less = int(match[1] or 1) - 1
+    return unit[: match.start()] + ("" if less == 0 else "/s" if less == 1 else f"/s^{less}")
+
+
 def power(unit: str, exponent: int) -> str:
     """`unit` to a power: `m/s^2` squared is `m^2/s^4`."""
     factors = []
@@ -208,8 +218,8 @@ def power(unit: str, exponent: int) -> str:
 
 
 def parameter_unit(parameter: str, unit: str) -> str:
-    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios), or of a number of summary.py, of an
-    axis that reads in `unit`."""
+    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios), of Q, or of a number of summary.py, of
+    an axis that reads in `unit`."""
     match parameter:
         case "bias" | "sigma_m" | "B" | "bias_instability":
             return unit
@@ -217,6 +227,8 @@ def parameter_unit(parameter: str, unit: str) -> str:
             return f"{unit}/sqrt(Hz)"
         case "K" | "rrw":
             return f"{per_second(unit)}/sqrt(Hz)"
+        case "Q" | "quantization_noise":
+            return times_second(unit)
         case "alpha":
             return "1/s"
         case "spectral_ratio" | "markov_ratio":
@@ -236,6 +248,7 @@ _DATASHEET = {
     "arw": ("deg/sqrt(h)", "m/s/sqrt(h)"),
     "rrw": ("deg/h/sqrt(h)", "mg/sqrt(h)"),
     "bias_instability": ("deg/h", "mg"),
+    "quantization_noise": ("arcsec", "m/s"),
 }
 
 

@@ -124,6 +124,7 @@ class Cause:
     entry        the model file's entry of its column for the whole recording.
     smoothed     its column is the mean of a channel: the model file states the trailing window that suits it.
     from_zero    the simulator's effect begins at 0, its column is about the middle.
+    law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
     extend       writes what is no column into the model file.
     of_column    keys of `--effect` for its columns: the first one and the coefficients of all.
     of_estimate  keys of `--effect` for a finding without a column; None: the column has them.
@@ -155,6 +156,7 @@ class Cause:
     entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
     smoothed: bool = False
     from_zero: bool = False
+    law: Callable[[dict[str, Any], Look], None] | None = None
     extend: Callable[[Extension], None] | None = None
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
     of_estimate: Callable[[Look], dict[str, Any] | None] | None = None

@@ -168,10 +168,12 @@ def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:
 
 
 def _in_unit(value: Any, inner: str, factor: float, unit: str) -> Any:
-    """An interval in the recording's unit where its own begins with the axis' one."""
+    """An interval in the recording's unit where its own begins with the axis' one, or is that times a second."""
     if not isinstance(value, Mapping):
         return value
     own = str(value["unit"])
+    if own == unit_module.times_second(inner):
+        inner, unit = own, unit_module.times_second(unit)
     if own != inner and not own.startswith(f"{inner}/"):
         return dict(value)
     scaled = {key: entry * factor for key, entry in value.items() if key != "unit"}

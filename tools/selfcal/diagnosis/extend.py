@@ -169,7 +169,9 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
     block = max(1, round(one.record.recorded_hz / one.record.rate_hz)) if block is None else block
     fit = one.state.best
     N = fit.N
-    if fit.terms.color:
+    if fit.quantized:
+        N = fit.N_of_color
+    elif fit.terms.color:
         # The simulator's noise with memory has this level at low frequency, and (1 - lag1) / (1 + lag1) of it in all.
         m = math.tanh(fit.value("color"))
         lag1 = m if fit.terms.color == "ar" else m / (1.0 + m * m)

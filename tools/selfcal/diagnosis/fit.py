@@ -135,6 +135,24 @@ class Fit:
         return self.sigma * math.sqrt(self.dt)
 
     @property
+    def quantized(self) -> bool:
+        """Whether its noise is white and quantization noise: a moving average of neighbours that pull apart."""
+        return self.terms.color == "ma" and self.value("color") < 0.0
+
+    @property
+    def increment(self) -> float:
+        """Of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
+        m = math.tanh(self.value("color"))
+        return self.sigma * self.dt * math.sqrt(-12.0 * m / (1.0 + m * m))
+
+    @property
+    def N_of_color(self) -> float:
+        """White noise density at low frequency, of a fit with memory."""
+        m = math.tanh(self.value("color"))
+        of_all = (1.0 + m) ** 2 / (1.0 + m * m) if self.terms.color == "ma" else (1.0 + m) / (1.0 - m)
+        return self.N * math.sqrt(of_all)
+
+    @property
     def K(self) -> float:
         """Coefficient of the random walk, unit/s/sqrt(Hz); 0 without one."""
         return self.sigma * math.exp(self.value("ln_rho")) / math.sqrt(self.dt) if self.terms.walk else 0.0

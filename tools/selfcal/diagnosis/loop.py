@@ -11,7 +11,7 @@ from selfcal.diagnosis import integrity, score, work
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
@@ -55,8 +55,12 @@ def diagnose_record(
     states = dict(zip(quiet, work.each(lambda state: state.refit(), quiet.values()), strict=True))
     shown = [name for name in handled if name in axes]
     spoilt = dict(zip(shown, work.each(lambda name: record.axes[name].refit(), shown), strict=True))
-    # An axis below its stated lattice is judged by nobody, and explains nobody.
-    left_out = {name for name, state in states.items() if state.below_lattice and (state.redrawn or _stated(state))}
+    # An axis below its stated lattice is judged by nobody, and explains nobody. Nor is a counter's, but in means.
+    left_out = {
+        name
+        for name, state in states.items()
+        if state.below_lattice and (state.redrawn or _stated(state) or carried(record, name))
+    }
     states = {name: state for name, state in states.items() if name not in left_out}
     record = replace(record, axes=states)
     works = {name: work.of_axis(state.y.size) for name, state in states.items()}

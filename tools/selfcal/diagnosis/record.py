@@ -236,7 +236,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             stated_lsb=group.lsb,
             redrawn=each > 1,
             block=each,
-            below_lattice=found is not None and found.too_coarse,
+            below_lattice=found is not None and (found.too_coarse if each == 1 else found.too_coarse_over(dt)),
         )
     present = np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0])
     channels: dict[str, Array] = {}
@@ -279,6 +279,12 @@ def _held_on(values: Array) -> Array:
     """Each value until the next that is there."""
     there = np.flatnonzero(np.isfinite(values))
     return values[there[np.maximum(0, np.searchsorted(there, np.arange(values.size), side="right") - 1)]]
+
+
+def carried(record: Record, name: str) -> bool:
+    """Whether the readings are increments of a counter."""
+    readings = record.readings.get(name)
+    return readings is not None and readings.lattice is not None and readings.lattice.carried > 0.0
 
 
 def why_left_out(recording: Recording, model: Model, name: str) -> str:

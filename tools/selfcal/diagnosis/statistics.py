@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from scipy.stats import t as student
 from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.state import State
 from selfcal.diagnosis.statemodel import Array, Matrices, matrices
+from selfcal.lattice import WHITE_REMAINDERS
 
 Indices = NDArray[np.int64]
 
@@ -295,20 +296,39 @@ def _longest_run(y: Array) -> int:
 
 
 def simulated(state: State, random: np.random.Generator) -> Array:
-    """One record of the fitted model, read out as the recording: gaps, lattice, limits."""
+    """One record of the fitted model, read out as the recording: gaps, lattice, limits, a counter's increments."""
     fit = state.best
     n = state.y.size
-    m = matrices(fit.terms, fit.theta, fit.dt, fit.duration_s, state.block)
-    # Reading out on the lattice adds lsb^2 / 12, which the fitted white noise holds already.
-    white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
+    if fit.quantized:  # the counter makes what remembers
+        keep = np.array([name != "color" for name in fit.terms.names])
+        m = matrices(replace(fit.terms, color=""), fit.theta[keep], fit.dt, fit.duration_s, state.block)
+        white = fit.N_of_color**2 / fit.dt
+    else:
+        m = matrices(fit.terms, fit.theta, fit.dt, fit.duration_s, state.block)
+        # Reading out on the lattice adds lsb^2 / 12, which the fitted white noise holds already.
+        white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
     lost = fit.sigma**2 * m.lost * (state.r - 1.0)
     y = np.sqrt(np.maximum(white * state.r + lost, 0.1 * white * state.r)) * random.standard_normal(n)
     y += _states(m, np.sqrt(state.r), random) * fit.sigma
     y += fit.c @ state.series.columns
+    if fit.quantized:
+        y = _counted(y, fit, random)
     y = np.where(np.isfinite(state.y), y, np.nan)
     if state.lsb > 0.0:
         y = np.rint((y + state.level) / state.lsb) * state.lsb - state.level
     return y
+
+
+def _counted(y: Array, fit: Fit, random: np.random.Generator) -> Array:
+    """Readings of a counter that gains `y`. How far it gets within an increment from one reading to the next decides
+    what two remainders have in common, and no fit knows that: it is drawn. Of a counter that its noise does not stir
+    the remainders are white: something else does."""
+    step = fit.increment / fit.dt
+    if fit.N_of_color**2 / fit.dt < WHITE_REMAINDERS * step**2:
+        return np.asarray(y + np.diff(step * random.random(y.size + 1)))
+    start, gain = random.random(2)
+    total = np.floor(np.cumsum(y / step + gain) + start)
+    return np.asarray((np.diff(total, prepend=0.0) - gain) * step)
 
 
 def _states(m: Matrices, level: Array, random: np.random.Generator) -> Array:
@@ -361,8 +381,6 @@ def _half(covariance: Array) -> Array:
 
 def whitened_of(state: State, y: Array) -> Array:
     """Residual innovations of a record under the fitted noise model, the coefficients refitted."""
-    from dataclasses import replace
-
     fit = state.best
     sums, white, _ = run(replace(state.series, y=y), fit.terms, fit.theta, innovations=True)
     c, _, rss = sums[0].coefficients()
@@ -381,8 +399,9 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
     """Residual innovations, and readings, of `count` records of the fitted model, read out as the recording.
 
     Without a lattice the innovations are white, and fitting the coefficients takes the columns' part out of them. That
-    is drawn as it is. The readings then matter as far as no two are equal."""
-    if state.lsb > 0.0:
+    is drawn as it is. The readings then matter as far as no two are equal. A counter's noise is
+    not normal."""
+    if state.lsb > 0.0 or state.best.quantized:
         for _ in range(count):
             y = simulated(state, random)
             yield whitened_of(state, y), y

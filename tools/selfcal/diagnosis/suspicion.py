@@ -8,7 +8,7 @@ from selfcal.diagnosis.fit import ROUGH_FTOL
 from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
-from selfcal.diagnosis.state import NET_LEAST
+from selfcal.diagnosis.state import NET_LEAST, Look
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import Recording
@@ -17,15 +17,15 @@ from selfcal.recording import Recording
 RATE_HZ, MOST = 1.0, 20_000
 
 
-def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[str, str]:
-    """By axis the cause that gains most on means of 1 s. Axes that show none, or are too short, are left out.
+def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[str, Look]:
+    """By axis the look that gains most on means of 1 s. Axes that show none, or are too short, are left out.
 
-    The fits are rough: they rank causes, and no size of one is used."""
+    The fits are rough: they rank causes, and their sizes lay a prior at most."""
     try:
         record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
     except UserError:
         return {}
-    found: dict[str, str] = {}
+    found: dict[str, Look] = {}
     for name in axes:
         if name not in record.axes or record.axes[name].below_lattice:
             continue
@@ -33,5 +33,5 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
         state = (masked(state, record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
         best = max((look for cause in LOOKS for look in cause(state, record)), key=lambda look: look.net, default=None)
         if best is not None and best.net >= NET_LEAST:
-            found[name] = best.cause
+            found[name] = best
     return found

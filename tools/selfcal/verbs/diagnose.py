@@ -17,7 +17,7 @@ from selfcal.diagnosis.document import SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, ROUNDS, diagnose_record
-from selfcal.diagnosis.record import Record, of_recording, why_left_out
+from selfcal.diagnosis.record import Record, carried, of_recording, why_left_out
 from selfcal.diagnosis.verdict import joined, of_checks
 from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
 from selfcal.ending import Held, Stopped, abandon, held
@@ -36,6 +36,7 @@ from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
+OF_COUNTER = "its readings are increments of a counter, coarse against their noise: give --decimate 1"
 #: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
 FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
 #: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
@@ -105,7 +106,12 @@ def diagnose(
             first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
             _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
-        looked = {name: joined(seen.get(name), first.get(name), INTERRUPTED) for name in names}
+        looked = {
+            name: first.get(name)
+            if name not in seen and _below_lattice(record, name)
+            else joined(seen.get(name), first.get(name), INTERRUPTED)
+            for name in names
+        }
         found = {name: one for name, one in looked.items() if one is not None}
         if not ending.asked:
             doing.now("checks")
@@ -164,8 +170,8 @@ def _add_carried(
     from selfcal.diagnosis.carried import gains
 
     document["on"] = recording_entry(second)
-    for name, carried in gains(model, tree, record, found, second).items():
-        for finding, one in zip(document["axes"][name]["findings"], carried, strict=True):
+    for name, each in gains(model, tree, record, found, second).items():
+        for finding, one in zip(document["axes"][name]["findings"], each, strict=True):
             finding["gain_on"] = one.gain
             if one.gain is None:
                 finding["gain_on_reason"] = one.reason
@@ -227,7 +233,13 @@ def _why_not(recording: Recording, model: Model, record: Record, name: str) -> s
     """Why an axis has no result."""
     if name not in record.axes:
         return why_left_out(recording, model, name)
-    return BELOW_LATTICE if record.axes[name].below_lattice else INTERRUPTED
+    if not _below_lattice(record, name):
+        return INTERRUPTED
+    return OF_COUNTER if carried(record, name) else BELOW_LATTICE
+
+
+def _below_lattice(record: Record, name: str) -> bool:
+    return name in record.axes and record.axes[name].below_lattice
 
 
 def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model, ending: Held) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
@@ -36,6 +37,9 @@ from selfcal.results import Identification
 from selfcal.summary import summarize
 from selfcal.tables import make_tables
 from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
+
+if TYPE_CHECKING:
+    from selfcal.diagnosis.state import Look
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
@@ -135,15 +139,17 @@ def identify(
             from selfcal.diagnosis.suspicion import suspicions
 
             progress.update(task, description="strongest suspicion")
-            for name, cause in suspicions(recording, loaded_model, doubtful).items():
-                document["axes"][name]["suspicion"] = cause
+            suspected = suspicions(recording, loaded_model, doubtful)
+            for name, shown in suspected.items():
+                document["axes"][name]["suspicion"] = shown.cause
             for name in doubtful:
                 for cause in ("held_samples", "outliers", "saturation", "motion"):  # shown by the readings themselves
                     if cause in document["axes"][name]["checks"]:
                         document["axes"][name]["suspicion"] = cause
             if model is None:
                 progress.update(task, description="more laws")
-                _weigh_more_laws(document, recording, doubtful)
+                again = _with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
+                _weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
     if json is not None:
@@ -170,6 +176,41 @@ def with_reasons(found: dict[str, Identified | UserError], recording: Recording,
     if outside:
         reason = UserError(outside_priors(recording, model, outside))
         found.update(dict.fromkeys(outside, reason))
+
+
+def _with_added_laws(
+    document: dict[str, Any],
+    recording: Recording,
+    suspected: Mapping[str, Look],
+    engine: str,
+    decimate: float | None,
+    *,
+    draw: bool,
+) -> list[str]:
+    """Identify axes anew whose suspicion is noise of another kind than white: N of the default laws is wrong there.
+
+    The law of that noise joins the default ones. Where it is the likeliest, its answer takes the place of the first
+    one, with `added_law` and the suspicion. Returns those axes."""
+    from selfcal.diagnosis.causes import CAUSES
+
+    again = []
+    for name, shown in suspected.items():
+        add_law = CAUSES[shown.cause].law
+        if add_law is None or document["axes"][name]["suspicion"] != shown.cause:
+            continue
+        tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+        before = set(tree["hypotheses"])
+        add_law(tree, shown)
+        with suppress(UserError):  # too long for the law's filters
+            of_file = Model.of_tree(tree, DEFAULT)
+            model = for_record(of_file, recording, (name,))
+            axis = identify_axis(recording, name, model, engine, decimate, draw=draw)
+            if axis.result.best not in before:
+                own = to_document(recording, {name: axis})
+                add_sources(own, of_file, model)
+                document["axes"][name] = own["axes"][name] | {"suspicion": shown.cause, "added_law": axis.result.best}
+                again.append(name)
+    return again
 
 
 def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequence[str]) -> None:
@@ -293,7 +334,7 @@ def identify_axis(
             advance()
     kept = kept_out_of(blocks, recording, int(readings.moving.sum()))
     if not regressors:
-        judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit)
+        judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit, tables.dt_s)
         curve = curve_of_samples(samples) if draw else None
         numbers = summarize(results[0], group, tables.dt_s, blocks.mean.size, tables.block)
         return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, kept, None, curve, numbers)
@@ -301,7 +342,8 @@ def identify_axis(
         raise OutsidePriors
     inside = combine(choices, results, model.hypotheses, group.unit)
     used = _used(mask_of(regressors, choices[inside.best]))
-    judged = with_readings(judge(blocks, tables, group, results[inside.best], used), readings, group, unit)
+    judged = judge(blocks, tables, group, results[inside.best], used)
+    judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)

@@ -622,7 +622,9 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     if not gate:
         used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
         readings = look(recording, name, group)
-        judged = with_readings(judge(blocks, tables, group, result, used), readings, group, unit, as_fed=True)
+        judged = with_readings(
+            judge(blocks, tables, group, result, used), readings, group, unit, tables.dt_s, as_fed=True
+        )
     told = in_unit(result, group.unit, unit)
     scored = replace(scored, result=told) if scored else None
     numbers = summarize(result, group, tables.dt_s, blocks.mean.size, tables.block)

@@ -1,23 +1,27 @@
-"""White noise with memory: a moving average, whose correlation cuts off, or a first-order process."""
+"""White noise with memory: a moving average, whose correlation cuts off, or a first-order process.
+
+A moving average of neighbours that pull apart is white noise beside quantization noise: quantization_noise.py."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.fit import best, fit, moved
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State, interval, net
 from selfcal.diagnosis.statemodel import Array
 from selfcal.laws import RATIO_LIMITS
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """The better of the two, the drift fitted with it."""
+    """The better of the two, the drift fitted with it. Of two as good, neighbours that pull apart are a counter's."""
     if state.extras.color:
         return []
     w = np.nan_to_num(state.whitened)
@@ -26,8 +30,9 @@ def looks(state: State, record: Record) -> list[Look]:
     if 0.5 * n * float(lags @ lags) < 2.0:
         return []
     found: list[Look] = []
-    for color in ("ma", "ar"):
-        fits = []
+    colors: tuple[Literal["ma", "ar"], ...] = ("ma", "ar")
+    for color in colors:
+        fits, extras = [], replace(state.extras, color=color)
         for drift in state.near():
             terms = replace(drift, color=color)
             start = moved(next(one for one in state.fits if one.terms == drift), terms)
@@ -36,18 +41,15 @@ def looks(state: State, record: Record) -> list[Look]:
         chosen = best(fits)
         gain = chosen.ln_likelihood - state.best.ln_likelihood
         m = math.tanh(chosen.value("color"))
+        if chosen.quantized:
+            found.append(quantization_noise.look_of(chosen, gain, state, extras))
+            continue
         lag1 = m / (1.0 + m * m) if color == "ma" else m
         sd = (1.0 - lag1 * lag1) / math.sqrt(n)
-        found.append(
-            Look(
-                "colored_noise",
-                gain,
-                net(gain),
-                {"lag1": interval(lag1, sd, "1")},
-                {"extras": replace(state.extras, color=color)},
-            )
-        )
-    return [max(found, key=lambda one: one.gain)]
+        found.append(Look("colored_noise", gain, net(gain), {"lag1": interval(lag1, sd, "1")}, {"extras": extras}))
+    average, process = found
+    counter = average.cause == "quantization_noise"
+    return [average if average.gain > process.gain - ALIKE * counter else process]
 
 
 def _extend(at: Extension) -> None:
