@@ -11,11 +11,20 @@
 #define HEADER(name) QUOTED(name.h) /* NOLINT(bugprone-macro-parentheses): the name of a file */
 #include HEADER(SENSOR)
 
-/* No constant, and no image, if it would divide by zero. (An array's size must be an integer constant expression: no
- * quotient of floats.) */
-static const int the_sensor_makes_the_rate = 1 / OF(SENSOR, has_rate)(SELFCAL_MODEL_RATE_HZ);
+/* No image of a model that the sensor cannot keep: the compiler states why, if it can, else the linker finds no such
+ * function. */
+#define TEXT_OF(what) #what
+#define TEXT(what) TEXT_OF(what)
+#ifdef __GNUC__
+#define REFUSED(what) __attribute__((error(what)))
+#else
+#define REFUSED(what)
+#endif
+extern void the_sensor_has_not_this_rate(void) REFUSED("the model's rate is " TEXT(
+    SELFCAL_MODEL_RATE_HZ) " Hz, the " TEXT(SENSOR) " has " OF(SENSOR, rates) ": set sensor.rate_hz in the model file");
+extern void the_sensor_has_not_this_channel(void) REFUSED(
+    "a regressor of the model reads a channel that the " TEXT(SENSOR) " has not: take it out of the model file");
 enum { CHANNELS_KNOWN = SELFCAL_MODEL_CHANNELS_READ && (OF(SENSOR, has_supply) || !SELFCAL_MODEL_SUPPLY_READ) };
-typedef char the_sensor_has_the_channels[CHANNELS_KNOWN ? 1 : -1];
 typedef char the_axes_and_channels_are_the_ports
     [PORT_AXES == (int)SENSOR_AXES && PORT_SIDE == (int)SENSOR_SIDE && PORT_SUPPLY == (int)SENSOR_SUPPLY ? 1 : -1];
 
@@ -29,7 +38,13 @@ bool readings_init(const sensor_bus_t *bus) {
         }
         channel[axis] = (uint8_t)at;
     }
-    return the_sensor_makes_the_rate != 0 && sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
+    if (!OF(SENSOR, has_rate)(SELFCAL_MODEL_RATE_HZ)) {
+        the_sensor_has_not_this_rate();
+    }
+    if (!CHANNELS_KNOWN) {
+        the_sensor_has_not_this_channel();
+    }
+    return sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
 }
 
 void readings_ready(void) {

@@ -12,6 +12,8 @@ import shlex
 import subprocess
 import sys
 import time
+import zipfile
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -23,7 +25,7 @@ from scipy.stats import binom
 from selfcal.errors import UserError
 from selfcal.loaders import FORMATS, Format, child, format_of
 from selfcal.loaders.table import Hints
-from selfcal.recording import Recording, load
+from selfcal.recording import Recording, load, parse_pairs, parse_scales
 from selfcal.verbs.convert import convert
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -145,15 +147,15 @@ def test_several_imus_are_listed(form: str, drawn: logs.Drawn, tmp_path: Path) -
     (line,) = done.stderr.splitlines()
     for source in ("/left/imu", "/right/imu"):
         assert f"--source '{source}' (gx gy gz ax ay az; 100 Hz, 7.99 s)" in line
-    recording = load(log, source=["/right/imu"])
+    recording = load(log, sources=["/right/imu"])
     assert in_si(recording, "gy") == pytest.approx(-drawn.gyro[:, 1])
     assert ("--source", "/right/imu") in recording.options
     with pytest.raises(UserError, match=r"there is no source '/up/imu'; give --source '/left/imu'"):
-        load(log, source=["/up/imu"])
+        load(log, sources=["/up/imu"])
     with pytest.raises(UserError, match="no axis is in '/imu/temperature'"):
-        load(log, source=["/imu/temperature"])
+        load(log, sources=["/imu/temperature"])
     with pytest.raises(UserError, match=r"axis '..' is in more than one of the sources"):
-        load(log, source=["/left/imu", "/right/imu"])
+        load(log, sources=["/left/imu", "/right/imu"])
 
 
 def test_instances_of_a_ulog_are_not_mixed(drawn: logs.Drawn, tmp_path: Path) -> None:
@@ -164,7 +166,7 @@ def test_instances_of_a_ulog_are_not_mixed(drawn: logs.Drawn, tmp_path: Path) ->
     log = logs.ulog_of(tmp_path / "two.ulg", topics)
     with pytest.raises(UserError, match=r"--source 'sensor.0'.*--source 'sensor.1'"):
         load(log)
-    recording = load(log, source=["sensor.1"])
+    recording = load(log, sources=["sensor.1"])
     for name, truth in (("gx", -drawn.gyro[:, 0]), ("az", -drawn.accel[:, 2])):
         assert in_si(recording, name) == pytest.approx(truth, rel=3e-7)
 
@@ -177,7 +179,7 @@ def test_imus_of_a_dataflash_log_are_not_mixed(with_units: bool, drawn: logs.Dra
     with pytest.raises(UserError, match=r"--source 'IMU.0' \(gx gy gz ax ay az; 100 Hz.*--source 'IMU.1'"):
         load(log)
     for name, sign in (("IMU.0", 1.0), ("IMU.1", -1.0)):
-        recording = load(log, source=[name])
+        recording = load(log, sources=[name])
         assert recording.samples == drawn.t.size
         for axis, truth in (("gx", drawn.gyro[:, 0]), ("az", drawn.accel[:, 2])):
             assert in_si(recording, axis) == pytest.approx(sign * truth, rel=3e-7)
@@ -207,12 +209,12 @@ def test_counts_of_a_tlog(drawn: logs.Drawn, tmp_path: Path) -> None:
     assert recording.columns["gx"].unit == "mrad/s"
     assert recording.columns["az"].values == pytest.approx(1000.0)
     assert recording.columns["az"].unit == "mg"
-    with pytest.raises(UserError, match=r"'gx' is in LSB: give the size of one with --scale"):
+    with pytest.raises(UserError, match=r"gx.*; give --scale gx=SIZE\[deg/s\] --scale gy="):
         load(log({1: 12}))
     path = log({1: 3, 2: 3})
     with pytest.raises(UserError, match=r"--source 'RAW_IMU@1'.*--source 'RAW_IMU@2'"):
         load(path)
-    assert load(path, source=["RAW_IMU@2"]).columns["gx"].values[:3] == pytest.approx([2.0, 3.0, 4.0])
+    assert load(path, sources=["RAW_IMU@2"]).columns["gx"].values[:3] == pytest.approx([2.0, 3.0, 4.0])
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc", ".trc", ".log"])
@@ -249,7 +251,7 @@ def test_counts_of_a_blackbox(fine: bool, drawn: logs.Drawn, tmp_path: Path) -> 
     log.write_bytes(data + data)
     with pytest.raises(UserError, match=r"--source 'log 1' .*--source 'log 2'"):
         load(log)
-    assert load(log, source=["log 2"]).samples == drawn.t.size
+    assert load(log, sources=["log 2"]).samples == drawn.t.size
     middle = len(data) // 2
     log.write_bytes(data[:middle] + b"\xff" * 6 + data[middle + 6 :])
     hurt = load(log)
@@ -309,19 +311,106 @@ def test_messages_out_of_order_and_a_restart(drawn: logs.Drawn, tmp_path: Path) 
         load(log)
 
 
-def test_a_log_without_units(drawn: logs.Drawn, tmp_path: Path) -> None:
-    """A line that says what to type, which works."""
+@pytest.mark.parametrize("form", ["h5", "mat", "csv"])
+def test_a_log_without_units(form: str, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """One line names every option, by the file's own names. Typed as it is there, with the true units, it works."""
     import h5py
+    from scipy.io import savemat
 
-    log = tmp_path / "plain.h5"
-    with h5py.File(log, "w") as file:
-        file["t"], file["gyro"] = drawn.t, np.degrees(drawn.gyro)
-    with pytest.raises(
-        UserError, match=r"column 'gx' has no unit: write gx\[deg/s\] in the header or give --unit gx=deg/s"
-    ):
+    log = tmp_path / f"plain.{form}"
+    gyro, accel = np.degrees(drawn.gyro), drawn.accel
+    if form == "h5":
+        with h5py.File(log, "w") as file:
+            file["time"], file["omega"], file["acc"] = drawn.t, gyro, accel
+    elif form == "mat":
+        savemat(log, {"time": drawn.t[:, None], "omega": gyro, "acc": accel})
+    else:
+        columns = np.column_stack([drawn.t, gyro, accel])
+        header = ",".join(["time", *(f"{of} {axis}" for of in ("omega", "acc") for axis in "xyz")])
+        np.savetxt(log, columns, fmt="%.9g", delimiter=",", header=header, comments="")
+    with pytest.raises(UserError) as caught:
         load(log)
-    units = {"t": "s", **{f"g{axis}": "deg/s" for axis in "xyz"}}
-    assert in_si(load(log, units=units), "gz") == pytest.approx(drawn.gyro[:, 2])
+    options = shlex.split(str(caught.value).partition("; give ")[2].partition(", or ")[0])
+    assert set(options[::2]) == {"--unit"}
+    units = parse_pairs("--unit", options[1::2])
+    assert set(units) == ({"time", "omega", "acc"} if form != "csv" else set(header.split(",")))
+    recording = load(log, units=units)
+    assert in_si(recording, "gz") == pytest.approx(drawn.gyro[:, 2], abs=1e-9)
+    assert recording.columns["ay"].values == pytest.approx(accel[:, 1], abs=1e-7)
+
+
+@pytest.mark.parametrize("names", [("gx", "gy", "gz"), ("gyro_x", "gyro_y", "gyro_z")])
+def test_counts_without_a_size(names: Sequence[str], drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Likewise for counts."""
+    counts = np.rint(drawn.gyro / 1e-4)
+    log = tmp_path / "counts.csv"
+    header = ",".join(["t[s]", *(f"{name}[LSB]" for name in names)])
+    np.savetxt(log, np.column_stack([drawn.t, counts]), fmt="%.9g", delimiter=",", header=header, comments="")
+    with pytest.raises(UserError) as caught:
+        load(log)
+    options = shlex.split(str(caught.value).partition("; give ")[2].partition(", or ")[0])
+    assert options[::2] == ["--scale"] * 3
+    scale = parse_scales([one.replace("SIZE[deg/s]", "1e-4[rad/s]") for one in options[1::2]])
+    assert set(scale) == set(names)
+    assert in_si(load(log, scale=scale), "gz") == pytest.approx(1e-4 * counts[:, 2])
+
+
+def test_a_name_in_the_file_is_not_one_of_ours(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """`--unit gx` means gx here, not the heading that --column makes gy. A name that is nowhere is refused."""
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack([drawn.t, drawn.gyro]), delimiter=",", header="t[s],gx,p,q", comments="")
+    with pytest.raises(UserError, match=r"columns with no unit: gx; give --unit gy="):
+        load(log, columns={"gy": "gx"}, units={"gx": "rad/s"})
+    with pytest.raises(UserError, match="there is no column 'gyr' for --unit"):
+        load(log, units={"gx": "rad/s", "gyr": "rad/s"})
+
+
+@pytest.mark.parametrize(("every", "late"), [(1, 0.003), (4, 0.0), (4, 0.003)])
+def test_a_line_names_every_clock(every: int, late: float, drawn: logs.Drawn, tmp_path: Path) -> None:
+    """Of sensors of one rate at other times too: each axis with its own rate, once."""
+    log = tmp_path / "phone.zip"
+    with zipfile.ZipFile(log, "w") as archive:
+        for name, label, unit, values, step, shift in (
+            ("Gyroscope", "Gyroscope", "rad/s", drawn.gyro, 1, 0.0),
+            ("Accelerometer", "Acceleration", "m/s^2", drawn.accel, every, late),
+        ):
+            rows = np.column_stack([drawn.t[::step] + shift, values[::step]])
+            header = ",".join(["Time (s)", *(f"{label} {axis} ({unit})" for axis in "xyz")])
+            text = "".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in rows)
+            archive.writestr(f"{name}.csv", f"{header}\n{text}")
+    assert load(log).notes == (
+        f"columns sampled at different times: gx, gy, gz at {drawn.rate:g} Hz; ax, ay, az at {drawn.rate / every:g} Hz",
+    )
+
+
+def test_the_clock_of_an_xsens_wraps(drawn: logs.Drawn, tmp_path: Path) -> None:
+    """It counts 100 us modulo 2^32."""
+    log = logs.write_xsens(drawn, tmp_path, 2**32 - round(0.6e4 * drawn.seconds))
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(drawn.rate, rel=RATE)
+    assert recording.samples == drawn.t.size and not recording.missing_before.any()
+    assert recording.notes == ("column 't' wraps 1 time like a 32-bit counter: undone",)
+
+
+@pytest.mark.parametrize("writer", [logs.write_xsens, logs.write_euroc, logs.write_plotjuggler])
+@pytest.mark.parametrize("code", ["utf-16-le", "utf-16-be"])
+def test_a_text_in_utf_16(
+    writer: Callable[[logs.Drawn, Path], Path], code: str, drawn: logs.Drawn, tmp_path: Path
+) -> None:
+    """As Windows' shells write it, with its mark: the same recording. Cut within a sign it lacks that line."""
+    plain = writer(drawn, tmp_path)
+    text = plain.read_text(encoding="utf-8")
+    expected = load(plain)
+    plain.write_bytes(("\ufeff" + text.replace("\n", "\r\n")).encode(code))
+    found = load(plain)
+    assert found.rate_hz == expected.rate_hz
+    for name, column in expected.columns.items():
+        assert np.array_equal(found.columns[name].values, column.values, equal_nan=True)
+    plain.write_bytes(plain.read_bytes()[:-7])
+    assert load(plain).samples == expected.samples - 1
+    plain.write_bytes(text.encode(code))
+    with pytest.raises(UserError, match=r"not text \(byte 0x00\); it must be UTF-8, or UTF-16 with its mark"):
+        load(plain)
 
 
 def test_a_driver_that_takes_turns(drawn: logs.Drawn, tmp_path: Path) -> None:

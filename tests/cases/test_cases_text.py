@@ -420,7 +420,7 @@ def test_a_column_that_nobody_asked_for_stops_nothing(tmp_path: Path) -> None:
     recording = load(log)
     assert list(recording.columns) == ["gx"]
     assert recording.columns["gx"].values == pytest.approx(GYRO, abs=1e-5)
-    assert recording.notes == ("column 'temp' has no unit and is left out: write temp[degC]",)
+    assert recording.notes == ("column 'temp' has no unit and is left out: write temp[degC], or give --unit temp=degC",)
     with pytest.raises(UserError, match="line 2: column 'note': 'start' is not a number"):
         load(log, units={"note": "V"})
     with pytest.raises(UserError, match="column 'gx': infinite"):

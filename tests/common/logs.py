@@ -132,7 +132,8 @@ def write_plotjuggler(d: Drawn, folder: Path) -> Path:
     return _csv(folder / "plot.csv", ",".join(["__time", *names]), rows)
 
 
-def write_xsens(d: Drawn, folder: Path) -> Path:
+def write_xsens(d: Drawn, folder: Path, first: int = 123456) -> Path:
+    """The clock counts 100 us, modulo 2^32, from `first` on."""
     names = [
         "PacketCounter",
         "SampleTimeFine",
@@ -140,7 +141,7 @@ def write_xsens(d: Drawn, folder: Path) -> Path:
         *(f"Gyr_{a}" for a in "XYZ"),
         "Temperature",
     ]
-    ticks = 123456 + np.rint(d.t * 1e4).astype(np.int64)
+    ticks = (first + np.rint(d.t * 1e4).astype(np.int64)) % 2**32
     rows = [
         _ints(np.arange(d.t.size) % 65536),
         _ints(ticks),

@@ -199,7 +199,7 @@ def _reading_logs(command: Callable[..., None]) -> Callable[..., None]:
                 "scale": parse_scales(option["scale"] or ()),
                 "no_time": option["no_time"],
                 "skip_bad": option["skip_bad"],
-                "source": option["source"] or (),
+                "sources": option["source"] or (),
                 "dbc": option["dbc"],
             },
         )

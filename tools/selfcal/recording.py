@@ -308,7 +308,7 @@ def load(
     *,
     no_time: bool = False,
     skip_bad: bool = False,
-    source: Sequence[str] = (),
+    sources: Sequence[str] = (),
     dbc: Path | str | None = None,
 ) -> Recording:
     """Read a recording; of several files, or sensors of a log, one, joined by their time stamps.
@@ -319,13 +319,14 @@ def load(
     `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
     is left out if it cannot be read.
     `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
-    `source`: names of the sensors to read of a log that has several. `dbc`: what a log of CAN frames is decoded by.
+    `sources`: names of the sensors to read of a log that has several, or one name. `dbc`: what decodes CAN frames.
     The recording's `notes` are printed on stderr.
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
     """
     paths = list_of(path)
     columns, units = columns or {}, units or {}
+    sources = [sources] if isinstance(sources, str) else sources
     by_name: Mapping[str, Scale] = {"": (float(scale), None)} if isinstance(scale, int | float) else scale or {}
     if rate is not None and not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
@@ -338,11 +339,15 @@ def load(
     found = [
         part
         for one, header in zip(paths, headers, strict=True)
-        for part in _load(one, rate, header, skip_bad, source, hints)
+        for part in _load(one, rate, header, skip_bad, sources, hints)
     ]
     recording = found[0] if len(found) == 1 else _joined(paths, found, headers[0])
     _check_gravity(recording, headers[0])
-    recording = replace(recording, options=_options(rate, columns, units, by_name, no_time, skip_bad, source, dbc))
+    recording = replace(
+        recording,
+        notes=(*recording.notes, *_rates(recording)),
+        options=_options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
+    )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
     return recording
@@ -355,7 +360,7 @@ def _options(
     scale: Mapping[str, Scale],
     no_time: bool,
     skip_bad: bool,
-    source: Sequence[str],
+    sources: Sequence[str],
     dbc: Path | str | None,
 ) -> tuple[tuple[str, str], ...]:
     """How a recording is read, as the command line says it."""
@@ -365,7 +370,7 @@ def _options(
     for name, (size, unit) in scale.items():
         text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
         given.append(("--scale", f"{name}={text}" if name else text))
-    given += [("--source", name) for name in source]
+    given += [("--source", name) for name in sources]
     given += [] if dbc is None else [("--dbc", str(dbc))]
     given += [(option, "") for option, wanted in (("--no-time", no_time), ("--skip-bad", skip_bad)) if wanted]
     return tuple(given)
@@ -441,12 +446,14 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) 
         assert one.started_s is not None and main.started_s is not None
         shift = one.started_s - main.started_s
         notes += one.notes
+        clocks: dict[int, Clock] = {}
         for name, column in one.columns.items():
             if name in columns and len(files) == 1 and name not in header.sensors:
                 continue  # each sensor's own temperature
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")
-            clock = replace(one.clock_of(name), start_s=one.clock_of(name).start_s + shift)
+            own = one.clock_of(name)
+            clock = clocks.setdefault(id(column.clock), replace(own, start_s=own.start_s + shift))
             if clock.alike(main.clock):
                 columns[name] = replace(column, clock=None)
             elif name in header.sensors:
@@ -457,7 +464,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) 
         main,
         path=paths,
         columns=columns,
-        notes=(*dict.fromkeys(notes), *_rates(columns, main.rate_hz)),
+        notes=tuple(dict.fromkeys(notes)),
         paths=tuple(files) if len(files) > 1 else (),
     )
 
@@ -472,11 +479,15 @@ def _of_clock(clock: Clock) -> list[str]:
     return [told] if spread > _NO_GRID else []
 
 
-def _rates(columns: Mapping[str, Column], rate_hz: float) -> list[str]:
-    """A line on the axes that have clocks of their own."""
-    own = [(name, one.clock.rate_hz) for name, one in columns.items() if one.clock is not None]
-    told = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in own)
-    return [f"axes with a rate of their own: {told}; the others {rate_hz:.6g} Hz"] if own else []
+def _rates(recording: Recording) -> list[str]:
+    """A line on columns that are sampled at times of their own."""
+    if all(one.clock is None for one in recording.columns.values()):
+        return []
+    alike: dict[tuple[int, float], list[str]] = {}
+    for name, one in recording.columns.items():
+        alike.setdefault((id(one.clock), recording.clock_of(name).rate_hz), []).append(name)
+    told = "; ".join(f"{', '.join(names)} at {rate:.6g} Hz" for (_, rate), names in alike.items())
+    return [f"columns sampled at different times: {told}"]
 
 
 def _check_gravity(recording: Recording, header: _Header) -> None:
@@ -615,11 +626,16 @@ class _Header:
         self.dated = ""
         #: Columns whose unit the user states, or scales.
         self.decided = {*stated, *(scale if "" not in scale else sensors)}
+        #: Names that the user gives of columns, here or in the file, and that are there.
+        self.found: set[str] = set()
+        #: Columns of a table that lack a unit, or the size of a count: heading, name here, and the usual unit.
+        self.without_unit: list[tuple[str, str, str]] = []
+        self.without_size: list[tuple[str, str, str]] = []
 
     def of_part(self, several: bool) -> _Header:
         """The same for one of the file's parts."""
         one = copy(self)
-        one.several, one.notes = several, []
+        one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
         return one
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
@@ -660,6 +676,7 @@ class _Header:
                 what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
+        self.without_unit, self.without_size = [], []
         found: list[_Field] = []
         for place, key in enumerate(keys):
             name, unit = split(key)
@@ -681,6 +698,8 @@ class _Header:
             if not (name == "t" and self.no_time):
                 lsb = entry.get("lsb", None if size == 1.0 else size)
                 found += self._field(key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates)
+        if self.without_unit or self.without_size:
+            raise UserError(f"{self.path}: {where}{self._what_to_state()}")
         names = [field.name for field in found]
         fields = [field for field in found if not field.optional or names.count(field.name) == 1]
         names = [field.name for field in fields]
@@ -700,7 +719,7 @@ class _Header:
         """Raise UserError for an option about a column that is not there."""
         for option, wanted in (("--unit", self.stated), ("--scale", self.scale)):
             for name in wanted:
-                if name and name not in names and not (name == "t" and self.no_time):
+                if name and name not in names and name not in self.found and not (name == "t" and self.no_time):
                     raise UserError(f"{self.path}: {where}there is no column '{name}' for {option}")
 
     def _renamed(self, keys: Sequence[str], where: str) -> dict[str, str]:
@@ -718,11 +737,46 @@ class _Header:
             renamed[matches[0]] = name
         return renamed
 
+    def _of(self, options: Mapping[str, Any], key: str, name: str) -> Any:
+        """What an option says of a column, by its name here, or a name that the file alone has; None: nothing."""
+        for given in (name, *self._own_names(key)):
+            if given in options:
+                self.found.add(given)
+                self.decided.add(name)
+                return options[given]
+        return None
+
+    def _own_names(self, key: str) -> list[str]:
+        """A heading, without its unit, and the matrix that it is a column of; none that means a column here."""
+        name = split(key)[0]
+        matrix, _, number = name.rpartition(":")
+        here = {"t", *self.sensors, *dict(SIDE_CHANNELS.values())}
+        return [one for one in (key, name, *([matrix] if number.isdigit() else [])) if one not in here]
+
+    def _what_to_state(self) -> str:
+        """The options to type for the columns without a unit or a size, by the file's own names."""
+        if len(self.without_unit) == 1 and self.without_unit[0][0] == self.without_unit[0][1]:
+            name, _, unit = self.without_unit[0]
+            return f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}"
+        typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(self.without_unit)]
+        typed += [f"--scale {name}=SIZE[{unit}]" for name, unit in self._by_own_names(self.without_size)]
+        of = [(self.without_unit, "no unit"), (self.without_size, "counts of a size that the log does not state")]
+        lacks = "; ".join(f"{what}: {', '.join(short(key) for key, _, _ in keys)}" for keys, what in of if keys)
+        return f"columns with {lacks}; give {' '.join(typed)}, or the units that they are in"
+
+    def _by_own_names(self, columns: Sequence[tuple[str, str, str]]) -> list[tuple[str, str]]:
+        """For each option to type the name, quoted, and the unit. Columns of one matrix and kind share an option."""
+        typed: dict[str, str] = {}
+        for key, name, unit in columns:
+            own = [one for one in self._own_names(key) if "=" not in one]
+            typed[shlex.quote(own[-1] if own and split(key)[0] != name else name)] = unit
+        return list(typed.items())
+
     def _field(
         self, key: str, name: str, unit: Any, lsb: Any, where: str, *, mapped: bool, dates: bool
     ) -> list[_Field]:
         column = f"{self.path}: {where}column '{name}'"
-        stated = self.stated.get(name)
+        stated, scaled = self._of(self.stated, key, name), self._of(self.scale, key, name)
         if isinstance(unit, str):
             unit = units.plain(unit)
         if stated is not None:
@@ -730,7 +784,7 @@ class _Header:
             if unit is not None and unit != stated and units.known(str(unit)):
                 self.notes.append(f"column '{name}' is in {unit} by its heading, taken as {stated} by --unit")
             unit = stated
-        asked = mapped or name in self.stated or name in self.scale
+        asked = mapped or stated is not None or scaled is not None
         optional = not asked and name != "t" and name not in self.sensors
         dates = dates and name == "t" and unit is None
         unit = "s" if dates else unit
@@ -742,25 +796,27 @@ class _Header:
             example = dict(SIDE_CHANNELS.values()).get(name)
             if example is not None:
                 what = f"has the unit '{short(str(unit))}'" if unit is not None else "has no unit"
-                self.notes.append(f"column '{name}' {what} and is left out: write {name}[{example}]")
+                self.notes.append(
+                    f"column '{name}' {what} and is left out: write {name}[{example}], or give --unit {name}={example}"
+                )
             return []
         if unit is None:
             example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
-            raise UserError(
-                f"{column} has no unit: write {name}[{example}] in the header or give --unit {name}={example}"
-            )
+            self.without_unit.append((key, name, example))
+            return []
         if not known:
             known_units = f"(known: {', '.join(units.RECORDING_UNITS)})"
             raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}")
         size = 1.0
         if unit == units.LSB:
-            given = self.scale.get(name, self.scale.get(""))
+            given = self.scale.get("") if scaled is None else scaled
             if given is None:
-                raise UserError(f"{column} is in LSB: give the size of one with --scale {name}=SIZE[unit]")
+                self.without_size.append((key, name, _LSB_UNITS.get(name, "UNIT")))
+                return []
             size, unit = given[0], units.plain(given[1]) if given[1] else _LSB_UNITS.get(name)
             if unit is None or not units.known(unit) or unit == units.LSB:
                 raise UserError(f"{column} is in LSB: --scale needs a unit, --scale {name}={size:g}[unit]")
-        elif name in self.scale:
+        elif scaled is not None:
             raise UserError(f"{column} is in {unit}: --scale is for columns in LSB")
         elif lsb is not None:
             size = _number(lsb)
@@ -1028,7 +1084,8 @@ def _checked(
         unknown = np.isnan(stamps.values)
         if unknown.any():
             fail_time(int(np.argmax(unknown)), "no time stamp (an empty cell or NaN)")
-        time, wraps = unwrapped(units.convert(stamps.values - stamps.values[0], stamps.unit, "s"))
+        since = units.convert(stamps.values - stamps.values[0], stamps.unit, "s")
+        time, wraps = unwrapped(since, next(_tick_s(field) for field in fields if field.name == "t"))
         if wraps:
             header.notes.append(
                 f"column 't' wraps {wraps} time{'s' if wraps > 1 else ''} like a 32-bit counter: undone"
@@ -1041,6 +1098,11 @@ def _checked(
     return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time, places)
 
 
+def _tick_s(field: _Field) -> float:
+    """A count of a column of stamps, s."""
+    return units.factor(field.unit, "s") * field.lsb
+
+
 def _with_stamps(fields: Sequence[_Field], table: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
     """The rows of raw columns whose stamps can be true; all of them where too many cannot."""
     every = np.arange(table[0].size)
@@ -1048,7 +1110,7 @@ def _with_stamps(fields: Sequence[_Field], table: Sequence[NDArray[np.float64]])
         if field.name == "t" and np.isfinite(raw).any() and not np.isinf(raw).any():
             known = np.flatnonzero(np.isfinite(raw))
             seconds = units.convert(raw[known] - raw[known[0]], field.unit, "s")
-            sound = np.delete(known, damaged_stamps(unwrapped(seconds * field.lsb)[0]))
+            sound = np.delete(known, damaged_stamps(unwrapped(seconds * field.lsb, _tick_s(field))[0]))
             return sound if few(every.size - sound.size, every.size) else every
     return every
 
@@ -1134,7 +1196,7 @@ def _on_clocks(
     told = ", ".join(f"{name} {count}" for name, count in missing.items() if count)
     if told:
         header.notes.append(f"of {rows} rows cells without a number, taken as missing samples: {told}")
-    notes = (*header.notes, *_of_clock(main), *_rates(made, main.rate_hz))
+    notes = (*header.notes, *_of_clock(main))
     return Recording(
         path,
         main.rate_hz,

@@ -20,8 +20,9 @@ from selfcal.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
 
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
-#: Span of a 32-bit counter of microseconds, of milliseconds, s.
-_WRAPS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
+#: Counts of a counter that wraps, and the least count, and another that is not in the column's own unit, s. (One of ns
+#: would wrap every 4 s: such a step back is a restart.)
+_WRAPS_AT, _TICKS = 2.0**32, (1e-6, 1e-3)
 #: Median steps that a wrap may lie in a gap of.
 _WRAP_GAP = 1000.0
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
@@ -103,15 +104,17 @@ class Clock:
         )
 
 
-def unwrapped(time: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Stamps [n], s from the first, with the wraps of a 32-bit counter undone, and their number."""
+def unwrapped(time: NDArray[np.float64], tick_s: float) -> tuple[NDArray[np.float64], int]:
+    """Stamps [n], s from the first, with the wraps of a 32-bit counter undone, and their number. `tick_s`: a count of
+    their column, s."""
     back = np.flatnonzero(np.diff(time) < 0.0)
     if not back.size or time.size < 3:
         return time, 0
     steps = np.diff(time)
     most = _WRAP_GAP * float(np.median(np.abs(steps)))
-    for span in _WRAPS:
-        if ((steps[back] + span > 0.0) & (steps[back] + span <= min(most, 0.5 * span))).all():
+    for span in (_WRAPS_AT * tick for tick in (max(tick_s, _TICKS[0]), *_TICKS)):
+        on = steps[back] + span
+        if np.ptp(time) < span and ((on > 0.0) & (on <= min(most, 0.5 * span))).all():
             turns = np.zeros(time.size)
             turns[back + 1] = span
             return time + np.cumsum(turns), int(back.size)

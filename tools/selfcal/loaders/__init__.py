@@ -76,7 +76,7 @@ class Reading(TypedDict, total=False):
     scale: Mapping[str, Scale] | float | None
     no_time: bool
     skip_bad: bool
-    source: Sequence[str]
+    sources: Sequence[str]
     dbc: Path | str | None
 
 

@@ -8,6 +8,7 @@ blocks: no more of it than one is in memory.
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import math
 import re
@@ -51,6 +52,8 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
 _NO_TEXT = re.compile("[\0\udc80-\udcff]")
+#: Texts in UTF-16, by the mark that they begin with.
+_WIDE = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 #: Lines that may be skipped at least, and their share at most, before a file is no recording.
 _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
@@ -442,7 +445,20 @@ def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
 
 
 def _of_no_text(path: Path, line: int, sign: str) -> str:
-    return f"{path}: line {line}: not text (byte 0x{ord(sign) & 0xFF:02x}); it must be UTF-8"
+    return f"{path}: line {line}: not text (byte 0x{ord(sign) & 0xFF:02x}); it must be UTF-8, or UTF-16 with its mark"
+
+
+class _Wide:
+    """The bytes of a text in UTF-16 as UTF-8. What is no text stays so; half a sign at the end is cut off."""
+
+    def __init__(self, stream: BinaryIO | _Wide, begin: bytes) -> None:
+        self._stream, self._begin = stream, begin
+        self._decoder = codecs.getincrementaldecoder(_WIDE[begin])("surrogatepass")
+
+    def read(self, size: int) -> bytes:
+        """Up to some `size` bytes; none at the end alone."""
+        block, self._begin = self._begin + self._stream.read(size // 2), b""
+        return self._decoder.decode(block).encode("utf-8", "surrogatepass")
 
 
 class _Lines:
@@ -451,7 +467,8 @@ class _Lines:
     `no_text`: the last block has bytes that are no text; without `skip_bad` they are a UserError."""
 
     def __init__(self, path: Path, stream: BinaryIO, packed: int, skip_bad: bool) -> None:
-        self.path, self.stream = path, stream
+        self.path = path
+        self.stream: BinaryIO | _Wide = stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
         self._packed, self._unpacked = packed, 0
@@ -461,7 +478,7 @@ class _Lines:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
         while not self.unfinished:
             with reading(self.path, f"not a whole {'gzip' if self.path.suffix.lower() == '.gz' else 'zip'} file"):
-                block = self.stream.read(BLOCK_BYTES)
+                block = self._block()
             data = self._carry + block
             end = data.rfind(b"\n") + 1 if block else len(data)
             self.unfinished = not block and bool(data)
@@ -481,6 +498,15 @@ class _Lines:
             if not block:
                 break
         return []
+
+    def _block(self) -> bytes:
+        """The next bytes of the text, in UTF-8; none at the end."""
+        if self._start and not self._carry:
+            begin = self.stream.read(2)
+            if begin not in _WIDE:
+                return begin + self.stream.read(BLOCK_BYTES)
+            self.stream = _Wide(self.stream, begin)
+        return self.stream.read(BLOCK_BYTES)
 
     def _text(self, data: bytes) -> str:
         skip = 3 if self._start and data.startswith(b"\xef\xbb\xbf") else 0
