@@ -6,7 +6,6 @@ written by it.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
@@ -23,7 +22,7 @@ import pytest
 from scipy.stats import binom
 
 from selfcal.errors import UserError
-from selfcal.loaders import FORMATS, Format, child, format_of
+from selfcal.loaders import FORMATS, child, format_of
 from selfcal.loaders.table import Hints
 from selfcal.recording import Recording, load, parse_pairs, parse_scales
 from selfcal.verbs.convert import convert
@@ -51,25 +50,9 @@ def drawn() -> logs.Drawn:
     return logs.Drawn(seconds=8.0, seed=2)
 
 
-def forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
-    """As the product's child, without the start of a new Python for each file."""
-    number = os.fork()
-    if number == 0:
-        code = 70
-        try:
-            for stream in (1, 2):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-            child.answer(one.module, path, place, hints)
-            code = 0
-        finally:
-            os._exit(code)
-    status = os.waitpid(number, 0)[1]
-    return os.waitstatus_to_exitcode(status)
-
-
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(child, "_spawned", forked)
+def quick(forked: None) -> None:
+    """No new Python for each file."""
 
 
 def in_si(recording: Recording, name: str) -> np.ndarray:

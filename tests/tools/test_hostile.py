@@ -93,7 +93,7 @@ def verdict(read: Callable[[], Any], path: Path) -> str:
         said = str(error)
         assert said.startswith(str(path)), said
         assert "\n" not in said and len(said) < 1000, said
-        assert "too large for this machine" not in said, said
+        assert "too large for this machine" not in said and "(signal" not in said, said
     assert time.monotonic() - start < SLOWEST
     return said
 
@@ -165,6 +165,7 @@ LOADERS = ("log.csv", "semicolons.txt", "log.csv.gz", "log.npz", "lsb.npz", "pla
 UNITLESS = (".mat", ".rda", ".rdata", ".rds")
 
 
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("name", LOADERS)
 def test_changed_recordings(tmp_path: Path, name: str) -> None:
     files = sound_files(tmp_path)
@@ -293,6 +294,7 @@ def test_headers_that_take_long(tmp_path: Path, line: str) -> None:
         verdict(lambda: load(path, rate=1.0), path)
 
 
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("name", ["log.rda", "log.mat"])
 def test_a_bomb_of_arrays(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """More unpacked than is allowed is not unpacked."""

@@ -392,10 +392,10 @@ def _load(
             parts = _text_parts(path, rate, header, skip_bad)
         else:
             check_library(path, form)
-            if form.library and not form.here:
-                tables = tables_of(path, form, hints)
-            else:
+            if form.here:
                 tables = import_module(f"selfcal.loaders.{form.module}").read(path, hints)
+            else:
+                tables = tables_of(path, form, hints)
             parts = [part for table in tables for part in _table_parts(path, rate, header, table, len(tables) > 1)]
         if not parts or (len(tables) > 1 and not any(part.axes for part in parts)):
             there = ", ".join(f"{one.source}: {', '.join(one.members)}" for one in tables)

@@ -84,7 +84,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
     for name, one in found.items():
         group = model.group_of(name).name
         for k, regressor in enumerate(one.state.regressors):
-            if regressor.name in stated:
+            if regressor.name in stated or not regressor.entry:
                 continue
             key = regressor_key(regressor.name)
             own = CAUSES[regressor.cause].entry(_settled(one, regressor), record)

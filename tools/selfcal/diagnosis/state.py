@@ -36,7 +36,8 @@ NONE = Terms()
 
 @dataclass(frozen=True)
 class Regressor:
-    """A column that is in an axis' model. `entry` is the model file's (without prior), `unit` the column's."""
+    """A column that is in an axis' model. `entry` is the model file's (without prior), empty where it
+    cannot state the column; `unit` the column's."""
 
     name: str
     cause: str

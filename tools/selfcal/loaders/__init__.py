@@ -1,7 +1,7 @@
 """Formats of recordings: a row each. The library that reads a format is imported only for a file of it.
 
-A format is a module of this folder with `read(path, hints)`, which gives the tables of a file. One that reads by a
-library of others runs in a child process (`child.py`). Text is read by `text_table.py`. `headings.py` knows what other
+A format is a module of this folder with `read(path, hints)`, which gives the tables of a file. It runs in a child
+process (`child.py`). Text is read by `text_table.py`. `headings.py` knows what other
 programs call their columns, `sources.py` chooses among several sensors of a log.
 """
 
@@ -30,8 +30,8 @@ class Format:
     """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
 
     `module` reads it. `library` is the import name of what it takes beside numpy and scipy, and `extra` the group of
-    `pip install` that brings the library, "" where every installation has it. A library works in a process of its own,
-    unless its module bounds it and it works `here`.
+    `pip install` that brings the library, "" where every installation has it. `here`: sizes are checked before anything
+    is read, and columns are read when they are wanted, so it needs no process of its own.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Format:
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
-    Format("an npz file", (".npz",), "npz"),
+    Format("an npz file", (".npz",), "npz", here=True),
     Format("a MATLAB file", (".mat",), "matlab"),
-    Format("an R file", (".rda", ".rdata", ".rds"), "r_data", library="rdata", extra="r", here=True),
+    Format("an R file", (".rda", ".rdata", ".rds"), "r_data", library="rdata", extra="r"),
     Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags"),
     Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap"),
     Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog"),

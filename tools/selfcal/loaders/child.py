@@ -1,6 +1,6 @@
-"""A file is read by a library of others in a child process, within bounds of time and memory.
+"""A binary file is read in a child process, within bounds of time and memory.
 
-The parent gets arrays and one line of JSON, or one line that says why there are none. The library may end by a signal,
+The parent gets arrays and one line of JSON, or one line that says why there are none. The reader may end by a signal,
 or never: the parent goes on.
 """
 
@@ -50,7 +50,8 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
         raise UserError(
             f"{path}: not {'a' if one.name[1] != 'n' else 'an'}{one.name[one.name.index(' ') :]} that reads"
         )
-    raise UserError(f"{path}: not a sound {one.name.split(' ', 1)[1]}: {one.library} fails at it (signal {-code})")
+    what = one.name.split(" ", 1)[1]
+    raise UserError(f"{path}: not a sound {what}: {one.library or 'its reader'} fails at it (signal {-code})")
 
 
 def _table(place: Path, number: int, entry: dict[str, Any]) -> Table:
@@ -98,8 +99,8 @@ def answer(module: str, path: Path, place: Path, hints: Hints) -> None:
     """In the child: read, within the bounds, and write the answer into the folder `place`."""
     seconds = int(_seconds(path)) + 1
     most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
+    _bound(resource.RLIMIT_AS, most, most)
+    _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         with reading(path, "cannot be read"):
@@ -107,6 +108,13 @@ def answer(module: str, path: Path, place: Path, hints: Hints) -> None:
     except UserError as error:
         found = {"error": str(error)}
     (place / "answer.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _bound(kind: int, soft: int, hard: int) -> None:
+    """Set a limit of this process, or keep a lower one that it has."""
+    given = resource.getrlimit(kind)[1]
+    most = hard if given == resource.RLIM_INFINITY else min(hard, given)
+    resource.setrlimit(kind, (min(soft, most), most))
 
 
 def _read(module: str, path: Path, hints: Hints) -> list[tuple[int, Table]]:
