@@ -12,9 +12,14 @@
  * so the interpolated thing is always the likelihood alone. */
 #include "report.h"
 
+/* ln of the density in ln(parameter) where prior_shape() is 0. */
 static selfcal_real_t ln_prior_density(const selfcal_prior_t *prior) {
     const selfcal_real_t hi = (selfcal_real_t)prior->ln_max, width = hi - (selfcal_real_t)prior->ln_min;
-    return prior->uniform ? -hi - r_log(-r_expm1(-width)) : -r_log(width);
+    if (prior->law == SELFCAL_UNIFORM) {
+        return -hi - r_log(-r_expm1(-width));
+    }
+    /* 8 / sqrt(2 pi) over the part of the normal within 4 sd */
+    return (prior->law == SELFCAL_LOG_NORMAL ? R(1.1605664) : R(0.0)) - r_log(width);
 }
 
 static void finish_hypothesis(selfcal_work_t *work, selfcal_posterior_t *posterior) {

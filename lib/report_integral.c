@@ -122,10 +122,8 @@ static sums_t sum_cut(const selfcal_work_t *work, const side_t side[2], unsigned
                 const selfcal_real_t moved = ln[j] - middle; /* e^moved of no cell so wide that it falls to 0 */
                 dev[j] = r_fma(moved / (R(1.0) + r_fmax(-moved, R(0.0))), R(1.0) + dev[j], dev[j]);
             }
-            /* A uniform prior of density 1/(max - min) in the parameter is e^(ln parameter) of that in its
-             * logarithm. */
-            if (s->prior->uniform) {
-                w *= r_exp(ln[j]);
+            if (s->prior->law != SELFCAL_LOG_UNIFORM) {
+                w *= r_exp(prior_shape(s->prior, ln[j]));
             }
         }
         if (!(w > R(0.0))) {
@@ -172,7 +170,7 @@ static sums_t sum_cell(selfcal_work_t *work, const selfcal_real_t ln_value[], se
         s->off = r_expm1(ln_value[p] - work->search.best_ln[p]);
         s->cut = s->ln_value + reach.from - half[j] < (selfcal_real_t)s->prior->ln_min ||
                  s->ln_value + reach.to + half[j] > (selfcal_real_t)s->prior->ln_max;
-        whole = whole && !s->cut && !s->prior->uniform;
+        whole = whole && !s->cut && s->prior->law == SELFCAL_LOG_UNIFORM;
     }
     for (unsigned j = 0; j < sides && whole; j++) {
         const unsigned p = j == 0U ? SELFCAL_N : work->scratch.grid.row.drift;
@@ -240,8 +238,8 @@ static void sum_part(selfcal_work_t *work, uint16_t count, part_t *part) {
     const selfcal_real_t wide = (range.hi - range.lo) / (selfcal_real_t)count;
     const selfcal_real_t high = (work->search.range[1].hi - work->search.range[1].lo) / (selfcal_real_t)work->sum.rows;
     selfcal_real_t density = wide * high * cell_weight(work->sum.rows, work->row);
-    if (row->prior[SELFCAL_ALPHA].uniform && hypothesis->alpha != NULL) {
-        density *= r_exp(row->ln_alpha);
+    if (hypothesis->alpha != NULL && row->prior[SELFCAL_ALPHA].law != SELFCAL_LOG_UNIFORM) {
+        density *= r_exp(prior_shape(&row->prior[SELFCAL_ALPHA], row->ln_alpha));
     }
     memset(part, 0, sizeof *part);
     cell_t before, cell, after;

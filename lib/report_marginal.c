@@ -217,7 +217,8 @@ void selfcal_histogram_estimate(selfcal_work_t *work, unsigned p, selfcal_estima
         flags |= SELFCAL_AT_MAX;
     }
     /* The sd of a log-uniform prior is its width over sqrt(12), taken for a uniform one as well. */
-    if (flags == 0U && (prior->measured || ln_sd < R(0.5) * (hi - lo) / R(3.4641016))) {
+    const selfcal_real_t sds = prior->law == SELFCAL_LOG_NORMAL ? R(8.0) : R(3.4641016);
+    if (flags == 0U && (prior->measured || ln_sd * sds < R(0.5) * (hi - lo))) {
         flags |= SELFCAL_IDENTIFIED;
     }
     if (work->sum.off_grid > 0.01 * work->sum.mass) {

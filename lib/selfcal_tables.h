@@ -102,11 +102,15 @@ typedef enum {
     SELFCAL_PARAMETERS = 4
 } selfcal_parameter_t;
 
-/* Proper prior of one parameter between two limits: uniform in its logarithm, or uniform in itself. */
+/* Between two limits: uniform in the logarithm, or in the parameter itself, or normal in the logarithm. The mean of the
+ * normal is the middle of the limits, which lie 4 sd away: they hold all but 6e-5 of it. */
+typedef enum { SELFCAL_LOG_UNIFORM = 0, SELFCAL_UNIFORM = 1, SELFCAL_LOG_NORMAL = 2 } selfcal_prior_law_t;
+
+/* Proper prior of one parameter. */
 typedef struct {
     float ln_min, ln_max; /* ln of the parameter in the units above, within 46 of 0: 1e-20 to 1e20 */
-    bool uniform;         /* false: log-uniform */
-    bool measured;        /* the limits are those of an earlier record: the parameter counts as identified at once */
+    selfcal_prior_law_t law;
+    bool measured; /* the limits are those of an earlier record: the parameter counts as identified at once */
 } selfcal_prior_t;
 
 typedef struct {

@@ -44,12 +44,12 @@ static const selfcal_real_t fit_16[256] = {
 static const selfcal_grid_t grid_16 = {16U, fit_16};
 
 static const selfcal_axis_t axes[] = {
-    {{{-6.90775528F, -0.693147181F, false, false}, {-10.8197783F, -3.91202301F, false, false}, {-7.60090246F, -0.693147181F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 10.0F, 300.0F, 1000U}, /* gx, deg/s */
-    {{{-6.90775528F, -0.693147181F, false, false}, {-10.8197783F, -3.91202301F, false, false}, {-7.60090246F, -0.693147181F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 10.0F, 300.0F, 1000U}, /* gy, deg/s */
-    {{{-6.90775528F, -0.693147181F, false, false}, {-10.8197783F, -3.91202301F, false, false}, {-7.60090246F, -0.693147181F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 10.0F, 300.0F, 1000U}, /* gz, deg/s */
-    {{{-9.21034037F, -2.99573227F, false, false}, {-12.7168983F, -5.80914299F, false, false}, {-9.21034037F, -2.30258509F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 20.0F, 176.58F, 1000U}, /* ax, m/s^2 */
-    {{{-9.21034037F, -2.99573227F, false, false}, {-12.7168983F, -5.80914299F, false, false}, {-9.21034037F, -2.30258509F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 20.0F, 176.58F, 1000U}, /* ay, m/s^2 */
-    {{{-9.21034037F, -2.99573227F, false, false}, {-12.7168983F, -5.80914299F, false, false}, {-9.21034037F, -2.30258509F, false, false}, {-8.51719319F, -1.60943791F, false, false}}, 20.0F, 176.58F, 1000U}, /* az, m/s^2 */
+    {{{-6.90775528F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-10.8197783F, -3.91202301F, SELFCAL_LOG_UNIFORM, false}, {-7.60090246F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 10.0F, 300.0F, 1000U}, /* gx, deg/s */
+    {{{-6.90775528F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-10.8197783F, -3.91202301F, SELFCAL_LOG_UNIFORM, false}, {-7.60090246F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 10.0F, 300.0F, 1000U}, /* gy, deg/s */
+    {{{-6.90775528F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-10.8197783F, -3.91202301F, SELFCAL_LOG_UNIFORM, false}, {-7.60090246F, -0.693147181F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 10.0F, 300.0F, 1000U}, /* gz, deg/s */
+    {{{-9.21034037F, -2.99573227F, SELFCAL_LOG_UNIFORM, false}, {-12.7168983F, -5.80914299F, SELFCAL_LOG_UNIFORM, false}, {-9.21034037F, -2.30258509F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 20.0F, 176.58F, 1000U}, /* ax, m/s^2 */
+    {{{-9.21034037F, -2.99573227F, SELFCAL_LOG_UNIFORM, false}, {-12.7168983F, -5.80914299F, SELFCAL_LOG_UNIFORM, false}, {-9.21034037F, -2.30258509F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 20.0F, 176.58F, 1000U}, /* ay, m/s^2 */
+    {{{-9.21034037F, -2.99573227F, SELFCAL_LOG_UNIFORM, false}, {-12.7168983F, -5.80914299F, SELFCAL_LOG_UNIFORM, false}, {-9.21034037F, -2.30258509F, SELFCAL_LOG_UNIFORM, false}, {-8.51719319F, -1.60943791F, SELFCAL_LOG_UNIFORM, false}}, 20.0F, 176.58F, 1000U}, /* az, m/s^2 */
 };
 
 static const selfcal_law_t law_constant = {0U, false, {{SELFCAL_WALK, 0.0F, 0.0F, false, false}}};

@@ -83,7 +83,7 @@ static void measure(const char *name, const selfcal_model_t *model, bool fast, b
 static void measure_sum(const char *name, unsigned law, bool fast) {
     static const selfcal_real_t fit[SUM_GRID * SUM_GRID] = {0}; /* for reports, which there are none of */
     static const selfcal_grid_t grid = {SUM_GRID, fit};
-    static const selfcal_prior_t ratio = {-1.0F, 1.0F, false, false};
+    static const selfcal_prior_t ratio = {-1.0F, 1.0F, SELFCAL_LOG_UNIFORM, false};
     selfcal_prior_t prior[AXES][SELFCAL_PARAMETERS];
     selfcal_model_t model = record_narrow_model(fast, axis);
     for (unsigned a = 0; a < AXES; a++) {

@@ -50,10 +50,10 @@ typedef struct {
 } store_t;
 
 static selfcal_axis_t axis_table[SELFCAL_AXES_MAX];
-static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {{-6.9F, -0.7F, false, false},
-                                                                {-10.0F, -3.0F, false, false},
-                                                                {-7.0F, -1.0F, false, false},
-                                                                {-2.0F, 2.0F, false, false}};
+static const selfcal_prior_t some_priors[SELFCAL_PARAMETERS] = {{-6.9F, -0.7F, SELFCAL_LOG_UNIFORM, false},
+                                                                {-10.0F, -3.0F, SELFCAL_LOG_UNIFORM, false},
+                                                                {-7.0F, -1.0F, SELFCAL_LOG_UNIFORM, false},
+                                                                {-2.0F, 2.0F, SELFCAL_LOG_UNIFORM, false}};
 static selfcal_prior_t of_ratio[SELFCAL_AXES_MAX][SELFCAL_PARAMETERS];
 static selfcal_hypothesis_t hypothesis_table[SELFCAL_HYPOTHESES_MAX];
 static selfcal_law_t law_table[NAMED_LAWS];
@@ -171,7 +171,7 @@ static void make_model(input_t *in, bool any_sums) {
                 a->prior[p].ln_min = moderate(in);
                 a->prior[p].ln_max = moderate(in);
             }
-            a->prior[p].uniform = (kind >> 5 & 1U) != 0U;
+            a->prior[p].law = (selfcal_prior_law_t)((kind >> 5 & 1U) * (1U + (limits >> 4 & 1U)));
         }
         a->bias_sd = (kind >> 6 & 1U) != 0U ? 10.0F : 1e-3F;
         a->range = (limits >> 2 & 1U) != 0U ? 5.0F : 0.0F;

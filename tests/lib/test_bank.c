@@ -123,10 +123,11 @@ static void models_that_contradict_themselves_are_refused(void) {
         bad.dt_s = intervals[i];
         TEST_ASSERT_EQUAL(SELFCAL_BAD_MODEL, selfcal_init(&other, &bad, memory, sizeof memory));
     }
-    static const selfcal_prior_t priors[] = {{-47.0F, 0.0F, false, false}, {0.0F, 47.0F, false, false},
-                                             {1.0F, 1.0F, false, false},   {NAN, 1.0F, false, false},
-                                             {0.0F, NAN, false, false},    {-INFINITY, 0.0F, true, false},
-                                             {0.0F, INFINITY, true, false}};
+    static const selfcal_prior_t priors[] = {
+        {-47.0F, 0.0F, SELFCAL_LOG_UNIFORM, false}, {0.0F, 47.0F, SELFCAL_LOG_UNIFORM, false},
+        {1.0F, 1.0F, SELFCAL_LOG_UNIFORM, false},   {NAN, 1.0F, SELFCAL_LOG_UNIFORM, false},
+        {0.0F, NAN, SELFCAL_LOG_UNIFORM, false},    {-INFINITY, 0.0F, SELFCAL_UNIFORM, false},
+        {0.0F, INFINITY, SELFCAL_UNIFORM, false}};
     for (unsigned i = 0; i < sizeof priors / sizeof priors[0]; i++) {
         selfcal_axis_t axis[AXES];
         memcpy(axis, model.axis, sizeof axis);

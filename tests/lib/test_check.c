@@ -98,14 +98,14 @@ static void a_model_at_its_limits_is_sound(void) {
     selfcal_axis_t axes[AXES];
     memcpy(axes, selfcal_model.axis, sizeof axes);
     for (unsigned axis = 0; axis < AXES; axis++) {
-        axes[axis].prior[SELFCAL_N] = (selfcal_prior_t){41.0F, 46.0F, false, false};
+        axes[axis].prior[SELFCAL_N] = (selfcal_prior_t){41.0F, 46.0F, SELFCAL_LOG_UNIFORM, false};
         axes[axis].range = 0.0F;
     }
     model.axis = axes;
     model.dt_s = 1e-6F;
     for (float ln_k = -46.0F; ln_k <= -26.0F; ln_k += 0.5F) {
         for (unsigned axis = 0; axis < AXES; axis++) {
-            axes[axis].prior[SELFCAL_K] = (selfcal_prior_t){ln_k, ln_k + 5.0F, false, false};
+            axes[axis].prior[SELFCAL_K] = (selfcal_prior_t){ln_k, ln_k + 5.0F, SELFCAL_LOG_UNIFORM, false};
         }
         TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_init(&bank, &model, memory.bytes, BYTES));
         for (int i = 0; i < 60 * BLOCK; i++) {

@@ -2,7 +2,8 @@
 #include "../../lib/report_integral.c"
 #include "unity.h"
 
-static const selfcal_prior_t x_prior = {-1.37F, 2.21F, false, false}, y_prior = {0.43F, 9.0F, false, false};
+static const selfcal_prior_t x_prior = {-1.37F, 2.21F, SELFCAL_LOG_UNIFORM, false},
+                             y_prior = {0.43F, 9.0F, SELFCAL_LOG_UNIFORM, false};
 
 void setUp(void) {}
 

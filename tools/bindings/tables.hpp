@@ -12,8 +12,8 @@
 #include "selfcal.h"
 
 using GridTuple = std::tuple<uint16_t, std::vector<double>>; // nodes, fit[nodes * nodes]
-using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<bool>, double, double, uint32_t>;
-using PriorTuple = std::tuple<double, double, bool, bool>;     // ln_min, ln_max, uniform, measured
+using AxisTuple = std::tuple<std::vector<double>, std::vector<double>, std::vector<int>, double, double, uint32_t>;
+using PriorTuple = std::tuple<double, double, int, bool>;      // ln_min, ln_max, law, measured
 using TermTuple = std::tuple<int, double, double, bool, bool>; // kind, deviation, bandwidth, stated, by_ratio
 using LawTuple = std::tuple<std::vector<TermTuple>, bool>;     // terms, coloured_noise
 using HypothesisTuple = std::tuple<LawTuple, double, std::optional<GridTuple>, std::optional<GridTuple>,
@@ -41,13 +41,13 @@ class Tables {
            const std::vector<HypothesisTuple> &hypotheses, uint32_t id,
            const std::optional<RegressorsTuple> &regressors, double half_life_s,
            const std::tuple<double, bool, bool> &handling) {
-        for (const auto &[lo, hi, uniform, bias_sd, range, stuck] : axes) {
+        for (const auto &[lo, hi, laws, bias_sd, range, stuck] : axes) {
             selfcal_axis_t axis{};
-            if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS ||
-                uniform.size() != SELFCAL_PARAMETERS)
+            if (lo.size() != SELFCAL_PARAMETERS || hi.size() != SELFCAL_PARAMETERS || laws.size() != SELFCAL_PARAMETERS)
                 throw std::invalid_argument("an axis needs one prior a parameter");
             for (size_t p = 0; p < SELFCAL_PARAMETERS; p++)
-                axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]), uniform[p], false};
+                axis.prior[p] = {static_cast<float>(lo[p]), static_cast<float>(hi[p]),
+                                 static_cast<selfcal_prior_law_t>(laws[p]), false};
             axis.bias_sd = static_cast<float>(bias_sd);
             axis.range = static_cast<float>(range);
             axis.stuck_limit = stuck;
@@ -129,8 +129,9 @@ class Tables {
         for (const std::vector<PriorTuple> &axis : priors) {
             if (axis.size() != SELFCAL_PARAMETERS || priors.size() != axes_.size())
                 throw std::invalid_argument("a hypothesis needs one prior a parameter for every axis, or none");
-            for (const auto &[lo, hi, uniform, measured] : axis)
-                table->push_back({static_cast<float>(lo), static_cast<float>(hi), uniform, measured});
+            for (const auto &[lo, hi, law, measured] : axis)
+                table->push_back(
+                    {static_cast<float>(lo), static_cast<float>(hi), static_cast<selfcal_prior_law_t>(law), measured});
         }
         return table->data();
     }

@@ -14,7 +14,7 @@ K^2 tau / 3.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -166,6 +166,33 @@ class Fit:
         return np.asarray(np.einsum("dt,de,et->t", self.jacobian, self.covariance, self.jacobian))
 
 
+def _around(
+    of: Law, ln_estimate: _Floats, dt_s: float, white: float, block: int
+) -> tuple[Callable[[_Floats], Terms], list[tuple[Terms, Terms]]]:
+    """The terms at given ln parameters, and those a step to either side of `ln_estimate` in each."""
+
+    def at(ln_theta: _Floats) -> Terms:
+        theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
+        terms = terms_of(of, theta, dt_s, block)
+        return replace(terms, variance=terms.variance * white)
+
+    return at, [(at(ln_estimate + step), at(ln_estimate - step)) for step in np.eye(ln_estimate.size) * _STEP]
+
+
+def information_of(
+    of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
+) -> _Floats:
+    """What `n` readings every `dt_s` say of ln of each parameter, [d, d].
+
+    Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
+    ln_estimate = np.log([parameters[name] for name in of.parameters])
+    _, sides = _around(of, ln_estimate, dt_s, white, block)
+    k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
+    omega = 2.0 * math.pi * k / n
+    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * _STEP)
+    return np.asarray((slopes * np.gradient(k)) @ slopes.T, np.float64)
+
+
 def fit_of(
     law: str,
     parameters: Mapping[str, float],
@@ -176,28 +203,17 @@ def fit_of(
     white: float = 1.0,
     block: int = 1,
 ) -> Fit:
-    """The curve at `parameters` that `n` readings have determined, beside the group's priors. The information in them
-    is Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum. `white` multiplies
-    the white noise's variance. A reading is the mean of `block` samples."""
+    """The curve at `parameters` that `n` readings have determined, beside the group's priors. `white` multiplies the
+    white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
-    names = of.parameters
-    ln_estimate = np.log([parameters[name] for name in names])
-
-    def at(ln_theta: _Floats) -> Terms:
-        theta = dict(zip(names, np.exp(ln_theta).tolist(), strict=True))
-        terms = terms_of(of, theta, dt_s, block)
-        return replace(terms, variance=terms.variance * white)
-
-    k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
-    steps = np.eye(len(names)) * _STEP
-    sides = [(at(ln_estimate + step), at(ln_estimate - step)) for step in steps]
-    omega = 2.0 * math.pi * k / n
-    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * _STEP)
-    information = (slopes * np.gradient(k)) @ slopes.T
-    prior = [12.0 / math.log(group.priors[name].max / group.priors[name].min) ** 2 for name in names]
+    ln_estimate = np.log([parameters[name] for name in of.parameters])
+    information = information_of(of, parameters, dt_s, n, white, block)
+    prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
+    at, sides = _around(of, ln_estimate, dt_s, white, block)
     jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
+    covariance = np.linalg.inv(information + np.diag(prior))
     terms = at(ln_estimate)
-    return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.linalg.inv(information + np.diag(prior)))
+    return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
 
 
 def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:

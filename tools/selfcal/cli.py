@@ -453,6 +453,9 @@ def fleet(
     verdicts: Verdicts = None,
     json: Json = None,
     report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page of the batch")] = None,
+    write_model: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the model with the batch as a new unit's priors")
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
     ] = None,
@@ -482,6 +485,7 @@ def fleet(
         verdicts=verdicts,
         json=json,
         report=report,
+        write_model=write_model,
         workers=workers,
         scheduler=scheduler,
         results=results,

@@ -34,7 +34,7 @@ class Identified:
     """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
     known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
     its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the
-    `summary`."""
+    `summary`. `halved_after`: see summary.py."""
 
     unit: str
     group_unit: str
@@ -44,6 +44,7 @@ class Identified:
     scored: Scored | None = None
     sampled: Sampled | None = None
     summary: Mapping[str, Number] = field(default_factory=dict)
+    halved_after: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def adequate(self) -> bool:
@@ -144,6 +145,7 @@ def to_document(
                 "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
                 "allan": _allan(axis),
                 **regressors_entry(axis.scored),
+                **({"halved_after_s": dict(axis.halved_after)} if axis.halved_after else {}),
             }
             for name, axis in found.items()
         },

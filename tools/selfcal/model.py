@@ -8,10 +8,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from selfcal import units
 from selfcal.errors import UserError, short, shown
@@ -52,6 +54,10 @@ LARGEST = 1e18
 SMALLEST = 1e-20
 #: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
+#: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
+LOG_NORMAL_REACH = 4.0
+#: Its sd: below, a float no longer tells the limits of large logarithms apart.
+LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
@@ -72,12 +78,48 @@ MOST_COLUMNS = 6
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of one parameter: `normal` (mean 0, `sd`), or `log_uniform` / `uniform` from `min` to `max`."""
+    """Prior of one parameter: `normal` (mean 0, `sd`), or `log_uniform` / `uniform` from `min` to `max`.
+
+    `log_normal`: the logarithm is normal about the middle of its limits, which lie LOG_NORMAL_REACH `sd` away."""
 
     law: str
     min: float = math.nan
     max: float = math.nan
     sd: float = math.nan
+
+    @staticmethod
+    def log_normal(median: float, sd: float) -> Prior:
+        """About a median; `sd` of the logarithm."""
+        reach = math.exp(LOG_NORMAL_REACH * sd)
+        return Prior("log_normal", median / reach, median * reach, sd)
+
+    @property
+    def median(self) -> float:
+        """The middle of the limits in the logarithm."""
+        return math.sqrt(self.min * self.max)
+
+    @property
+    def ln_sd(self) -> float:
+        """sd of the logarithm; of a uniform prior that of a log-uniform one, as the library has it."""
+        return self.sd if self.law == "log_normal" else math.log(self.max / self.min) / math.sqrt(12.0)
+
+    def ln_density(self, ln_value: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ln of the density in ln(parameter) [m] between the limits."""
+        if self.law == "log_normal":
+            within = math.log(math.erf(LOG_NORMAL_REACH / math.sqrt(2.0)) * math.sqrt(2.0 * math.pi) * self.sd)
+            return -0.5 * ((ln_value - math.log(self.median)) / self.sd) ** 2 - within
+        if self.law == "log_uniform":
+            return np.full(np.shape(ln_value), -math.log(math.log(self.max / self.min)))
+        return ln_value - math.log(self.max - self.min)
+
+    def at(self, u: float) -> float:
+        """The value below which the prior has the probability `u`."""
+        if self.law == "log_normal":
+            below = NormalDist().cdf(-LOG_NORMAL_REACH)
+            return self.median * math.exp(self.sd * NormalDist().inv_cdf(below + (1.0 - 2.0 * below) * u))
+        if self.law == "log_uniform":
+            return self.min * math.pow(self.max / self.min, u)
+        return self.min + (self.max - self.min) * u
 
 
 @dataclass(frozen=True)
@@ -415,23 +457,32 @@ class _Reader:
             raise self.fail(f"{where}.unit", str(error)) from None
 
     def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
-        fields = self.only(tree, ("law", "min", "max", "sd"), where)
+        fields = self.only(tree, ("law", "min", "max", "median", "sd"), where)
         law = self.entry(fields, "law", where)
         if bias:
             if law != "normal":
                 raise self.fail(where, "the bias prior must have law: normal")
             return Prior("normal", sd=self.number(self.entry(fields, "sd", where), f"{where}.sd"))
-        if law not in ("log_uniform", "uniform"):
-            raise self.fail(where, f"unknown law {shown(law)} (log_uniform or uniform)")
-        low = self.number(self.entry(fields, "min", where), f"{where}.min")
-        high = self.number(self.entry(fields, "max", where), f"{where}.max", low=low)
+        if law == "log_normal":
+            self.only(tree, ("law", "median", "sd"), where)
+            median, sd = (self.number(self.entry(fields, key, where), f"{where}.{key}") for key in ("median", "sd"))
+            if not LOG_NORMAL_SD[0] <= sd <= LOG_NORMAL_SD[1]:
+                raise self.fail(f"{where}.sd", f"must be {LOG_NORMAL_SD[0]:g} to {LOG_NORMAL_SD[1]:g}, not {sd:g}")
+            prior = Prior.log_normal(median, sd)
+        elif law in ("log_uniform", "uniform"):
+            self.only(tree, ("law", "min", "max"), where)
+            low = self.number(self.entry(fields, "min", where), f"{where}.min")
+            prior = Prior(law, low, self.number(self.entry(fields, "max", where), f"{where}.max", low=low))
+        else:
+            raise self.fail(where, f"unknown law {shown(law)} (log_uniform, uniform or log_normal)")
+        low, high = prior.min, prior.max
         least, most = RATIO_LIMITS
         if where.rpartition(".")[2] in RATIOS and not (least <= low and high <= most):
             raise self.fail(where, f"must lie within {least:g} to {most:g}")
         if not -LN_LIMIT <= np.float32(math.log(low)) < np.float32(math.log(high)) <= LN_LIMIT:
             reach = f"{math.exp(-LN_LIMIT):.0e} to {math.exp(LN_LIMIT):.0e}"
             raise self.fail(where, f"min and max must differ, within {reach}, not {low!r} to {high!r}")
-        return Prior(law, min=low, max=high)
+        return prior
 
     def group(self, name: str, tree: Any, laws: Mapping[str, Law]) -> Group:
         where = f"groups.{name}"

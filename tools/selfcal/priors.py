@@ -100,6 +100,8 @@ def prior_tree(prior: Prior) -> dict[str, Any]:
     """A prior as a model file has it."""
     if prior.law == "normal":
         return {"law": prior.law, "sd": prior.sd}
+    if prior.law == "log_normal":
+        return {"law": prior.law, "median": prior.median, "sd": prior.sd}
     return {"law": prior.law, "min": prior.min, "max": prior.max}
 
 
@@ -218,6 +220,7 @@ def laid(
 
 def _limits(law: str, low: float, high: float) -> Prior:
     """Rounded limits, within those of any prior."""
+    law = "uniform" if law == "uniform" else "log_uniform"
     least, most = math.exp(0.99 * -LN_LIMIT), math.exp(0.99 * LN_LIMIT)
     return Prior(law, min=min(max(rounded(low), least), most / 2.0), max=max(min(rounded(high), most), least * 2.0))
 

@@ -26,6 +26,8 @@ _Floats = NDArray[np.float64]
 
 #: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
+#: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
+MOST_REST, _HALVINGS = 100.0, 8
 #: Laws of smaller probability do not count.
 _LEAST = 1e-3
 #: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
@@ -87,7 +89,7 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
     if float(w[q > 0.0].sum()) >= _SURE:
         found["quantization_noise"] = _number(q, w)
     prior = group.priors["K"]
-    widest = HALF_90 * math.log(prior.max / prior.min) / math.sqrt(12.0)  # of ln(q95 / q05): half the prior's sd
+    widest = HALF_90 * prior.ln_sd  # of ln(q95 / q05): half the prior's sd
     if has_walk < _SURE:
         found["rrw"] = _without(found["rrw"], NO_WALK)
     elif open_drifts > 0.5 * drifts or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
@@ -96,6 +98,35 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
         found["bias_instability"] = _without(
             found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
         )
+    return found
+
+
+def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:
+    """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
+
+    By the Fisher information at the medians, beside the priors. None: not even MOST_REST times the record does."""
+    law = max(result.probability, key=lambda one: result.probability[one])
+    estimates = result.parameters[law]
+    open_ = [name for name, estimate in estimates.items() if not estimate.identified]
+    medians = {name: estimate.median for name, estimate in estimates.items()}
+    if not open_ or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+        return {}
+
+    def variance(times: float) -> dict[str, float]:
+        fit = fit_of(law, medians, group, dt_s, times * n, np.ones(1), block=block)
+        return dict(zip(estimates, np.diag(fit.covariance).tolist(), strict=True))
+
+    now = variance(1.0)
+    found: dict[str, float | None] = {}
+    for name in open_:
+        low, high = 0.0, math.log(MOST_REST)
+        if not variance(MOST_REST)[name] <= 0.25 * now[name]:
+            found[name] = None
+            continue
+        for _ in range(_HALVINGS):
+            at = 0.5 * (low + high)
+            low, high = (low, at) if variance(math.exp(at))[name] <= 0.25 * now[name] else (at, high)
+        found[name] = n * dt_s * math.expm1(high)
     return found
 
 

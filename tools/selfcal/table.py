@@ -16,6 +16,8 @@ from selfcal.document import as_typed
 from selfcal.errors import called, printable
 from selfcal.laws import RATIOS
 from selfcal.priors import OF_RECORD
+from selfcal.summary import MOST_REST
+from selfcal.verdicts import duration_words
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
 TABLE_WIDTH = 140
@@ -111,7 +113,13 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
         for key, number in (axis.get("summary") or {}).items():
             if not number["identified"]:
                 found.setdefault((_NUMBERS[key][0], number["reason"]), []).append(name)
-    return [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]
+    lines = [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]
+    for name, axis in axes.items():
+        for parameter, rest_s in axis.get("halved_after_s", {}).items():
+            times = f"not even {MOST_REST:g} times this rest halves"
+            how = times if rest_s is None else f"another {duration_words(rest_s)} would halve"
+            lines.append(f"{name}: {how} the interval of {parameter}")
+    return lines
 
 
 def since(recording: Mapping[str, Any]) -> str:

@@ -6,6 +6,7 @@ import functools
 import math
 import zlib
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from selfcal import _library32
 from selfcal.errors import UserError
 from selfcal.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
-from selfcal.model import NOT_HANDLED, Group, Handling, Model, Regressor
+from selfcal.model import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
 from selfcal.regressors import channels_of, sources_of
 from selfcal.units import same_kind
 
@@ -25,8 +26,20 @@ MOST_BLOCK = 1_000_000
 ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
 
 
-#: ln limits, whether uniform, whether measured: `selfcal_prior_t`.
-PriorRow = tuple[float, float, bool, bool]
+class PriorLaw(IntEnum):
+    """`selfcal_prior_law_t`."""
+
+    LOG_UNIFORM = 0
+    UNIFORM = 1
+    LOG_NORMAL = 2
+
+    def __repr__(self) -> str:
+        """As when there were two: a model's checksum stays."""
+        return ("False", "True", "log_normal")[self]
+
+
+#: ln limits, law, whether measured: `selfcal_prior_t`.
+PriorRow = tuple[float, float, PriorLaw, bool]
 
 
 @dataclass(frozen=True)
@@ -60,13 +73,13 @@ def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> N
 
 @dataclass(frozen=True)
 class AxisTable:
-    """One axis: ln limits of each parameter's prior (order of PARAMETERS), whether it is uniform, and the read-out."""
+    """One axis: ln limits and law of each parameter's prior (order of PARAMETERS), and the read-out."""
 
     name: str
     unit: str
     ln_min: tuple[float, ...]
     ln_max: tuple[float, ...]
-    uniform: tuple[bool, ...]
+    law: tuple[PriorLaw, ...]
     bias_sd: float
     range: float
     stuck_limit: int
@@ -91,8 +104,8 @@ class RegressorTable:
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """One hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors (ln
-    limits, whether uniform, whether measured) in the order of PARAMETERS."""
+    """One hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors in the
+    order of PARAMETERS."""
 
     name: str
     law: Law
@@ -180,7 +193,8 @@ class Tables:
             *([self.half_life_s] if self.half_life_s else []),
             *([self.handling] if self.handling != NOT_HANDLED else []),
         )
-        return zlib.crc32(repr((self.dt_s, self.block, self.axes, hypotheses, *extras)).encode())
+        text = repr((self.dt_s, self.block, self.axes, hypotheses, *extras))
+        return zlib.crc32(text.replace(" law=(", " uniform=(").encode())  # its name when the first checksums were made
 
 
 def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
@@ -240,7 +254,7 @@ def make_tables(
                 unit=group.unit,
                 ln_min=tuple(math.log(p.min) for p in priors),
                 ln_max=tuple(math.log(p.max) for p in priors),
-                uniform=tuple(p.law == "uniform" for p in priors),
+                law=tuple(_law(p) for p in priors),
                 bias_sd=group.priors["bias"].sd,
                 range=group.range,
                 stuck_limit=group.stuck_limit,
@@ -307,7 +321,11 @@ def _priors(group: Group, law: str) -> tuple[PriorRow, ...]:
     """In each place the prior of the parameter that the law has there, else that of the axis."""
     of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
     chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
-    return tuple((math.log(p.min), math.log(p.max), p.law == "uniform", False) for p in chosen)
+    return tuple((math.log(p.min), math.log(p.max), _law(p), False) for p in chosen)
+
+
+def _law(prior: Prior) -> PriorLaw:
+    return PriorLaw[prior.law.upper()]
 
 
 def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:

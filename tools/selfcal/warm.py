@@ -20,7 +20,7 @@ from selfcal.laws import PARAMETERS, PLACES, RATIOS
 from selfcal.limits import read_text, reading
 from selfcal.model import LONGEST_TEXT, Model
 from selfcal.result import HALF_90
-from selfcal.tables import HypothesisTable, PriorRow, RegressorTable, Tables
+from selfcal.tables import HypothesisTable, PriorLaw, PriorRow, RegressorTable, Tables
 
 #: Half the width of a measured prior, in sd of what is expected of ln(parameter); sd of that prior over this sd.
 REACH = 4.0
@@ -73,11 +73,13 @@ def warmed(tables: Tables, start: Start | None) -> Tables:
 def _hypothesis(h: HypothesisTable, tables: Tables, known: list[AxisStart | None]) -> HypothesisTable:
     rows = []
     for at, (axis, one) in enumerate(zip(tables.axes, known, strict=True)):
-        plain = zip(axis.ln_min, axis.ln_max, axis.uniform, len(PARAMETERS) * (False,), strict=True)
+        plain = zip(axis.ln_min, axis.ln_max, axis.law, len(PARAMETERS) * (False,), strict=True)
         row: list[PriorRow] = list(h.priors[at] if h.priors else plain)
         for parameter, (low, high) in (one.limits.get(h.name, {}) if one is not None else {}).items():
-            least, most, uniform, _ = row[PLACES[parameter]]
-            row[PLACES[parameter]] = (max(least, low), min(most, high), uniform, True)
+            least, most, law, _ = row[PLACES[parameter]]
+            if law == PriorLaw.LOG_NORMAL:
+                law = PriorLaw.LOG_UNIFORM  # the posterior has the normal in it
+            row[PLACES[parameter]] = (max(least, low), min(most, high), law, True)
         rows.append(tuple(row))
     return replace(h, priors=tuple(rows))
 

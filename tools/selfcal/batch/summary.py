@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaln
 
+from selfcal import units as unit_module
 from selfcal.batch.population import (
     FALSE_ALARM,
     FEWEST,
@@ -25,7 +26,7 @@ from selfcal.batch.population import (
 )
 from selfcal.batch.table import Unit, bias_of
 from selfcal.laws import RATIOS
-from selfcal.model import Model
+from selfcal.model import Model, Prior
 from selfcal.result import HALF_90
 
 #: Nats that one unit may weigh in the choice of the batch's law: an odd one decides nothing.
@@ -36,6 +37,8 @@ OTHER_LAW = 12.0
 COMMON = 0.1
 #: Relative difference of two lattices.
 LATTICE = 0.05
+#: Of a recording beside a log-normal prior, at least: else it says nothing of the quantity.
+LEAST_WEIGHT = 0.1
 #: What groups units, by the attribute of a source.
 KINDS = ("station", "day", "lot")
 
@@ -69,7 +72,7 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
         if unit.error is None:
             devices.setdefault(unit.device, []).append(unit)
     names = list(devices)
-    groupings = [(kind, [_group(kind, devices[name][-1]) for name in names]) for kind in KINDS]
+    groupings = [(kind, [group_of(kind, devices[name][-1]) for name in names]) for kind in KINDS]
     laws = _laws(devices)
     found = populations(list(_measured(devices, laws, model)), groupings)
     shared = _shared(devices, groupings)
@@ -82,11 +85,12 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     return Batch(devices, found, dict(sorted(unlike.items())), shared)
 
 
-def _group(kind: str, unit: Unit) -> str:
+def group_of(kind: str, unit: Unit) -> str:
+    """The name of the unit's station, day or lot; "" for none."""
     return unit.recorded_at[:10] if kind == "day" else str(getattr(unit.source, kind))
 
 
-def _sound(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
+def sound_of(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
     """The results of an axis by device, of the devices that have one."""
     found = {
         name: [unit.axes[axis] for unit in units if axis in unit.axes and "error" not in unit.axes[axis]]
@@ -95,7 +99,8 @@ def _sound(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[M
     return {name: axes for name, axes in found.items() if axes}
 
 
-def _axes(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
+def axes_of(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
+    """All axes of the devices."""
     return list(dict.fromkeys(axis for units in devices.values() for unit in units for axis in unit.axes))
 
 
@@ -109,9 +114,9 @@ def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
 def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
     """The law that the batch has, by axis: the one with the greatest evidence over all units."""
     found = {}
-    for axis in _axes(devices):
+    for axis in axes_of(devices):
         total: Counter[str] = Counter()
-        for axes in _sound(devices, axis).values():
+        for axes in sound_of(devices, axis).values():
             for one in axes:
                 for law, nats in _behind(one).items():
                     total[law] -= min(nats, MOST_NATS)  # type: ignore[assignment]
@@ -124,21 +129,20 @@ def _measured(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], mo
     """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
     place = {name: k for k, name in enumerate(devices)}
     for axis, law in laws.items():
-        sound = _sound(devices, axis)
+        sound = sound_of(devices, axis)
         unit = _unit(sound)
         sound = {name: axes for name, axes in sound.items() if axes[-1]["bias_now"]["unit"] == unit}
         at = np.array([place[name] for name in sound], np.intp)
         parameters = list(next(iter(sound.values()))[0]["parameters"][law])
         for name in parameters:
-            prior = model.group_of(axis).priors.get(name)
-            flat = prior is not None and prior.law == "uniform"
-            known = [_joined([one["parameters"][law][name] for one in axes], flat) for axes in sound.values()]
+            of = next(iter(sound.values()))[0]["parameters"][law][name]["unit"]
+            prior = _prior(model, axis, name, of)
+            known = [_joined([one["parameters"][law][name] for one in axes], prior) for axes in sound.values()]
             kept = np.array([one is not None and one[2] for one in known])
             if kept.sum() < max(FEWEST, 0.5 * kept.size):
                 continue  # the batch does not identify it
             there = [k for k, one in enumerate(known) if one is not None]
             y, s = np.array([known[k][:2] for k in there], np.float64).T  # type: ignore[index]
-            of = next(iter(sound.values()))[0]["parameters"][law][name]["unit"]
             yield Measured(f"{axis}.{name}", "1" if name in RATIOS else of, law, y, s, at[there])
         bias = [bias_of(axes[-1]) for axes in sound.values()]
         y = np.array([one["median"] for one in bias])
@@ -152,17 +156,36 @@ def _unit(sound: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     return counted.most_common(1)[0][0]
 
 
-def _joined(estimates: Sequence[Mapping[str, Any]], flat: bool) -> tuple[float, float, bool] | None:
-    """ln of a quantity, its error, and whether a recording identifies it; None: no recording measures it.
+def _prior(model: Model, axis: str, name: str, unit: str) -> Prior | None:
+    """The prior that an axis's parameter was identified under, in `unit`; None if the model has none."""
+    group = model.group_of(axis)
+    prior = group.priors.get(name)
+    if prior is None or name in RATIOS:
+        return prior
+    factor = unit_module.factor(unit_module.parameter_unit(name, group.unit), unit)
+    return replace(prior, min=factor * prior.min, max=factor * prior.max)
 
-    `flat`: its prior is uniform, which in the logarithm leans upwards by s^2."""
+
+def _joined(estimates: Sequence[Mapping[str, Any]], prior: Prior | None) -> tuple[float, float, bool] | None:
+    """ln of a quantity by the recordings alone, its error, and whether one identifies it; None: none measures it.
+
+    A uniform `prior` leans upwards by s^2 in the logarithm. A log-normal one is one more measurement."""
     found = []
     for one in estimates:
         median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
         if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf or one["off_grid"]:
             continue
         s = math.log(q95 / q05) / (2.0 * HALF_90)
-        found.append((math.log(median) - (s**2 if flat else 0.0), s))
+        y = math.log(median)
+        if prior is not None and prior.law == "uniform":
+            y -= s**2
+        if prior is not None and prior.law == "log_normal":
+            own = s**-2 - prior.sd**-2
+            if own < LEAST_WEIGHT * prior.sd**-2:
+                continue
+            y = (y * s**-2 - math.log(prior.median) * prior.sd**-2) / own
+            s = own**-0.5
+        found.append((y, s))
     if not found:
         return None
     weight = np.array([s**-2 for _, s in found])
@@ -183,8 +206,8 @@ def _marked(
 ) -> Iterator[tuple[str, str]]:
     """Devices with what few others have: marks of the readings, another lattice, another law, a cause."""
     known = {(one.kind, one.name, one.cause) for one in shared}
-    for axis in _axes(devices):
-        sound = _sound(devices, axis)
+    for axis in axes_of(devices):
+        sound = sound_of(devices, axis)
         if len(sound) < FEWEST:
             continue
         lattice = [axes[-1]["lattice"] for axes in sound.values() if "lattice" in axes[-1]]
@@ -206,7 +229,7 @@ def _marked(
                 found.setdefault(f"law {law}", []).append((name, words))
             for unit_ in devices[name]:
                 for cause in unit_.causes(axis):
-                    if not any((kind, _group(kind, unit_), cause) in known for kind in KINDS):
+                    if not any((kind, group_of(kind, unit_), cause) in known for kind in KINDS):
                         found.setdefault(f"cause {cause}", []).append((name, f"{axis} {cause}"))
         for marked in found.values():
             told = dict(marked)

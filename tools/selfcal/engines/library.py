@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from selfcal import _coarse, _dense, _fixed, _library32, _library64
 from selfcal.errors import OutsidePriors, UserError
 from selfcal.laws import PLACES
 from selfcal.result import AxisResult, Estimate
-from selfcal.tables import Grid, Tables
+from selfcal.tables import AxisTable, Grid, PriorRow, Tables
 
 
 def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
@@ -32,13 +33,21 @@ def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] 
     return [column.reference for column in columns], sd, mean
 
 
+def _axis(a: AxisTable) -> tuple[list[float], list[float], list[int], float, float, int]:
+    return list(a.ln_min), list(a.ln_max), [int(law) for law in a.law], a.bias_sd, a.range, a.stuck_limit
+
+
+def _rows(rows: Sequence[Sequence[PriorRow]]) -> list[list[tuple[float, float, int, bool]]]:
+    return [[(low, high, int(law), measured) for low, high, law, measured in row] for row in rows]
+
+
 def arguments(tables: Tables) -> tuple[Any, ...]:
     """The model as the bindings take it (bindings/tables.hpp)."""
     return (
         tables.dt_s,
         tables.block,
-        [(list(a.ln_min), list(a.ln_max), list(a.uniform), a.bias_sd, a.range, a.stuck_limit) for a in tables.axes],
-        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
+        [_axis(axis) for axis in tables.axes],
+        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), _rows(h.priors)) for h in tables.hypotheses],
         tables.id,
         _regressors(tables),
         tables.half_life_s,

@@ -150,7 +150,7 @@ def _posterior(
             sd,
             block,
         )
-        ln_prior = sum(_ln_density(prior, x[:, d]) for d, prior in enumerate(priors))
+        ln_prior = sum(prior.ln_density(x[:, d]) for d, prior in enumerate(priors))
         own = np.diagonal(covariance, axis1=1, axis2=2)[:, own_from:]
         drift, gained = _later(of, drift_of, second, ahead_s)
         now = np.hstack([drift, np.broadcast_to(constant, (len(x), constant.size))])
@@ -199,18 +199,11 @@ def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Fl
     return np.column_stack(taken or [np.ones(drift.size)]), gained
 
 
-def _ln_density(prior: Prior, x: _Floats) -> _Floats:
-    """ln of the prior density in x = ln(parameter), x [m]."""
-    if prior.law == "log_uniform":
-        return np.full(len(x), -math.log(math.log(prior.max / prior.min)))
-    return x - math.log(prior.max - prior.min)
-
-
 def _prior_sd(prior: Prior) -> float:
     """Standard deviation of ln(parameter) under its prior."""
+    if prior.law != "uniform":
+        return prior.ln_sd
     a, b = math.log(prior.min), math.log(prior.max)
-    if prior.law == "log_uniform":
-        return (b - a) / math.sqrt(12.0)
     x = np.linspace(a, b, 4001)
     density = np.exp(x - b)
     density /= np.trapezoid(density, x)

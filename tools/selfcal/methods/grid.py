@@ -110,5 +110,4 @@ def ln_density(prior: Prior, ln_value: Floats) -> Floats:
     """ln of the prior density in the parameter's logarithm, -inf outside."""
     low, high = ln_limits(prior)
     inside = (ln_value >= low - 1e-9) & (ln_value <= high + 1e-9)
-    flat = -math.log(high - low) if prior.law == "log_uniform" else ln_value - math.log(prior.max - prior.min)
-    return np.where(inside, flat, -np.inf)
+    return np.where(inside, prior.ln_density(ln_value), -np.inf)

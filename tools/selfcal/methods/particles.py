@@ -100,6 +100,8 @@ def transition(problem: Problem, law: str, ln_theta: Floats) -> tuple[Floats, Fl
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> Floats:
+    if prior.law == "log_normal":
+        return np.log([prior.at(u) for u in rng.random(PARTICLES).tolist()])
     if prior.law == "uniform":
         return np.asarray(np.log(rng.uniform(prior.min, prior.max, PARTICLES)))
     return np.asarray(rng.uniform(math.log(prior.min), math.log(prior.max), PARTICLES))

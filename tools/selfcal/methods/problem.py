@@ -112,8 +112,7 @@ def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str
 
 def ln_moments(prior: Prior) -> tuple[float, float]:
     """Mean and sd of a parameter's logarithm between the limits of its prior."""
-    low, high = math.log(prior.min), math.log(prior.max)
-    return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
+    return math.log(prior.median), prior.ln_sd
 
 
 def root(square: float) -> Value:

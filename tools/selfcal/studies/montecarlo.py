@@ -24,7 +24,7 @@ from selfcal.allan import terms_of
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError
 from selfcal.laws import Law, named
-from selfcal.model import Group, Model, Prior
+from selfcal.model import Group, Model
 from selfcal.spread import Row, record_seeds, spread
 from selfcal.table import TABLE_WIDTH
 from selfcal.tables import Tables, bank_block, make_tables
@@ -97,14 +97,8 @@ def settings_of(model: Model) -> str:
 
 def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
     """Parameters of a law and the bias, drawn from the group's priors."""
-    truth = {name: _draw(group.priors[name], rng) for name in group.laws[law].parameters}
+    truth = {name: group.priors[name].at(float(rng.random())) for name in group.laws[law].parameters}
     return {**truth, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
-
-
-def _draw(prior: Prior, rng: np.random.Generator) -> float:
-    if prior.law == "uniform":
-        return float(rng.uniform(prior.min, prior.max))
-    return math.exp(rng.uniform(math.log(prior.min), math.log(prior.max)))
 
 
 def has_nodes(law: Law, truth: Mapping[str, float], tables: Tables) -> bool:

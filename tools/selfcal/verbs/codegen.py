@@ -314,11 +314,11 @@ def _grid(grid: Grid) -> str:
 
 def _priors(priors: Iterable[PriorRow]) -> str:
     flag = ("false", "true")
-    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, {flag[uniform]}, {flag[known]}}}" for lo, hi, uniform, known in priors)
+    return ", ".join(f"{{{_f(lo)}, {_f(hi)}, SELFCAL_{law.name}, {flag[known]}}}" for lo, hi, law, known in priors)
 
 
 def _axis(axis: AxisTable) -> str:
-    priors = _priors((*limits, False) for limits in zip(axis.ln_min, axis.ln_max, axis.uniform, strict=True))
+    priors = _priors((*limits, False) for limits in zip(axis.ln_min, axis.ln_max, axis.law, strict=True))
     readout = f"{_f(axis.bias_sd)}, {_f(axis.range)}, {axis.stuck_limit}U"
     return f"    {{{{{priors}}}, {readout}}}, /* {axis.name}, {axis.unit} */"
 

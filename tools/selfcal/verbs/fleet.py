@@ -10,6 +10,8 @@ from typing import Any, Unpack
 from rich.console import Console
 
 from selfcal.batch.files import sources_of
+from selfcal.batch.prior_file import lines_of as lines_of_priors
+from selfcal.batch.prior_file import write_model as write_priors
 from selfcal.batch.record import ByContent, Options, examined, killed, settings_of
 from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import Unit, check_table, rows_of, write_table
@@ -40,6 +42,7 @@ def fleet(
     verdicts: Path | str | None = None,
     json: Path | str | None = None,
     report: Path | str | None = None,
+    write_model: Path | str | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
@@ -62,13 +65,13 @@ def fleet(
     changed file is done anew. The other options are those of `identify`, for each recording.
     Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
     and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
-    `report`: the page to write.
+    `report`: the page to write. `write_model`: the model file with the batch's priors (batch/prior_file.py).
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     check_table(output)
     dbc = reading.get("dbc")
     check_options(limits, junit, verdicts)
-    check_writable(output, junit, verdicts, json, report, inputs=(model, units_table, dbc, limits))
+    check_writable(output, junit, verdicts, json, report, write_model, inputs=(model, units_table, dbc, limits))
     check(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
@@ -80,7 +83,7 @@ def fleet(
     bounds = None if limits is None else Limits.load(limits, loaded)
     folder = Path(f"{output}.parts") if results is None else Path(results)
     given = {Path(str(one)).resolve() for one in patterns}
-    outputs = [Path(one) for one in (output, junit, verdicts, json, report) if one is not None]
+    outputs = [Path(one) for one in (output, junit, verdicts, json, report, write_model) if one is not None]
     for one in outputs:
         if one.resolve() in given:
             raise UserError(f"{one}: is one of the recordings: give it a name of its own")
@@ -122,6 +125,8 @@ def fleet(
         write(judged, junit, verdicts)
     summary = summed_up(batch, loaded)
     document = {**_document(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
+    if write_model is not None:
+        document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
     if json is not None:
         write_json(document, json)
     if report is not None:

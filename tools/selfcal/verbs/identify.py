@@ -34,7 +34,7 @@ from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
 from selfcal.results import Identification
-from selfcal.summary import summarize
+from selfcal.summary import halved_after, summarize
 from selfcal.tables import make_tables
 from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
@@ -336,8 +336,9 @@ def identify_axis(
     if not regressors:
         judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit, tables.dt_s)
         curve = curve_of_samples(samples) if draw else None
-        numbers = summarize(results[0], group, tables.dt_s, blocks.mean.size, tables.block)
-        return Identified(unit, group.unit, in_unit(results[0], group.unit, unit), judged, kept, None, curve, numbers)
+        of = results[0], group, tables.dt_s, blocks.mean.size, tables.block
+        known = in_unit(results[0], group.unit, unit)
+        return Identified(unit, group.unit, known, judged, kept, None, curve, summarize(*of), halved_after(*of))
     if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
         raise OutsidePriors
     inside = combine(choices, results, model.hypotheses, group.unit)
@@ -347,8 +348,8 @@ def identify_axis(
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
     curve = curve_of_samples(samples - explained) if draw else None
     scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
-    numbers = summarize(inside.result, group, tables.dt_s, blocks.mean.size, tables.block)
-    return Identified(unit, group.unit, scored.result, judged, kept, scored, curve, numbers)
+    of = inside.result, group, tables.dt_s, blocks.mean.size, tables.block
+    return Identified(unit, group.unit, scored.result, judged, kept, scored, curve, summarize(*of), halved_after(*of))
 
 
 def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:

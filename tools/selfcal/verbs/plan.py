@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from selfcal import units
+from selfcal.allan import information_of
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError, printable, short
-from selfcal.laws import PLACES, RATIOS, Law
+from selfcal.laws import PLACES, Law
 from selfcal.model import Model
 from selfcal.plot import COLORS, check_picture, save_picture
 from selfcal.result import HALF_90
@@ -47,6 +48,8 @@ LEAST_SHARE = 0.1
 FASTER, WORTH = 10.0, 0.8
 #: Smallest number of a metric: an interval of no width has no logarithm.
 TINY = 1e-12
+#: Readings at least of which an information is taken.
+_FEWEST = 8
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _LAW = re.compile(rf"law decided {_NUMBER} ?%")
 _SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) within {_NUMBER} (\S+)")
@@ -291,42 +294,16 @@ def _rates(
 def _half_interval(
     law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float
 ) -> float | None:
-    """Half of the 90 % interval of ln of a parameter, by the Fisher information of the spectrum (Whittle's
-    likelihood); None for a law with an oscillation or coloured noise."""
-    if law.has_oscillation or law.coloured_noise or set(truth) & set(RATIOS):
+    """Half of the 90 % interval of ln of a parameter, by the Fisher information; None where the record has none."""
+    n = duration_s * rate_hz
+    if n < _FEWEST:
         return None
-    f = np.geomspace(0.5 / duration_s, 0.5 * rate_hz, 1500) if duration_s * rate_hz > 2.0 else np.array([0.5 * rate_hz])
-    names = list(law.parameters)
-    step = 1e-4
-    ln = {name: math.log(truth[name]) for name in names}
-    gradient = np.array(
-        [
-            (np.log(_spectrum(law, {**ln, name: ln[name] + step}, f)) - np.log(_spectrum(law, ln, f))) / step
-            for name in names
-        ]
-    )
-    width = np.gradient(f) * duration_s if f.size > 1 else np.ones(1)
-    information = (gradient * width) @ gradient.T
     try:
-        variance = float(np.linalg.inv(information)[names.index(parameter), names.index(parameter)])
+        covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
     except np.linalg.LinAlgError:
         return None
+    variance = float(covariance[law.parameters.index(parameter), law.parameters.index(parameter)])
     return HALF_90 * math.sqrt(variance) if variance > 0.0 else None
-
-
-def _spectrum(law: Law, ln: Mapping[str, float], f: Floats) -> Floats:
-    """Two-sided density of a reading, by ln of the parameters."""
-    w = 2.0 * math.pi * f
-    total = np.full(f.size, math.exp(2.0 * ln["N"]))
-    drift = next((math.exp(value) for name, value in ln.items() if name in ("K", "sigma_m", "B")), 0.0)
-    for term in law.terms:
-        deviation = term.deviation * drift
-        if term.kind == "walk":
-            total = total + (deviation / w) ** 2
-        else:
-            rate = term.bandwidth if term.stated else term.bandwidth * math.exp(ln["alpha"])
-            total = total + 2.0 * deviation**2 * rate / (rate**2 + w**2)
-    return total
 
 
 def _picture(document: Mapping[str, Any], path: Path | str) -> None:

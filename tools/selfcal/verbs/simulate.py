@@ -17,7 +17,7 @@ from selfcal.diagnosis.cause import Channels, Key, Setting, is_count
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.errors import UserError, printable
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
-from selfcal.model import Group, Model, Prior
+from selfcal.model import Group, Model
 from selfcal.output import check_place
 from selfcal.tables import bank_block
 
@@ -185,7 +185,7 @@ def truth_of(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         law = _pick(model.hypotheses, random.uniform())
         drawn = {"bias": priors["bias"].sd * random.normal()}
         more = [parameter for parameter in priors if parameter not in ("bias", *PARAMETERS)]
-        drawn |= {parameter: _draw(priors[parameter], random.uniform()) for parameter in (*PARAMETERS, *more)}
+        drawn |= {parameter: priors[parameter].at(random.uniform()) for parameter in (*PARAMETERS, *more)}
         law = fields.get("hypothesis", law)
         drawn |= {key: value for key, value in fields.items() if key != "hypothesis"}
         truth[name] = {"hypothesis": law, "unit": model.group_of(name).unit, "bias": drawn["bias"]}
@@ -213,13 +213,6 @@ def _pick(probability: Mapping[str, float], u: float) -> str:
         if u < 0.0:
             return name
     return next(reversed(list(probability)))
-
-
-def _draw(prior: Prior, u: float) -> float:
-    """The value below which the prior has the probability `u`."""
-    if prior.law == "log_uniform":
-        return prior.min * math.pow(prior.max / prior.min, u)
-    return prior.min + (prior.max - prior.min) * u
 
 
 def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:

@@ -1,0 +1,110 @@
+"""`fleet --write-model`: the batch as the priors of a module's model file.
+
+A new unit's parameter is drawn from the population: log-normal about its mean. Its sd has the spread between units, how
+well the batch tells this spread and the mean, and what sets lots apart. A station's or a day's own part is no unit's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from selfcal import units
+from selfcal.batch.population import Population
+from selfcal.batch.summary import Batch, axes_of, group_of, sound_of
+from selfcal.errors import UserError
+from selfcal.laws import RATIOS
+from selfcal.model import LOG_NORMAL_SD, Model, Prior, read_yaml
+from selfcal.output import write_text
+from selfcal.priors import prior_tree
+
+#: Significant digits of a prior.
+DIGITS = 4
+
+
+def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[str, Prior]]:
+    """Write the file of `model` with the batch's priors to `path`; return these, by axis and parameter.
+
+    Each axis has own priors of the parameters that the batch identifies. The odds of the laws are those of the axes of
+    the units, with one more of each law. All else is the model's.
+    Raises UserError where the batch has no population.
+    """
+    tree = read_yaml(model.path, "model file")
+    found: dict[str, dict[str, Prior]] = {}
+    for one in batch.populations:
+        axis, _, parameter = one.measured.name.rpartition(".")
+        if one.measured.logarithm:
+            found.setdefault(axis, {})[parameter] = _prior(one, axis, parameter, batch, model)
+    if not found:
+        raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
+    for group in model.groups:
+        own = tree["groups"][group.name].get("own_priors") or {}
+        own |= {axis: {**own.get(axis, {}), **_trees(found[axis])} for axis in group.axes if axis in found}
+        if own:
+            tree["groups"][group.name]["own_priors"] = own
+    for law, odds in _odds(model, batch).items():
+        stated = tree["hypotheses"][law]
+        tree["hypotheses"][law] = {**stated, "probability": odds} if isinstance(stated, dict) else odds
+    Model.of_tree(tree, Path(path))
+    head = f"# Priors of {len(batch.devices)} units, by `selfcal fleet`.\n"
+    write_text(path, head + yaml.safe_dump(tree, sort_keys=False, width=120))
+    return found
+
+
+def lines_of(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterator[str]:
+    """A line for each prior."""
+    for axis, own in priors.items():
+        for name, prior in own.items():
+            unit = units.parameter_unit(name, model.group_of(axis).unit)
+            yield f"prior of a new unit: {axis}.{name}: {prior.median:.4g} {unit}, sd of ln {prior.sd:.2g}"
+
+
+def _trees(priors: Mapping[str, Prior]) -> dict[str, Any]:
+    return {
+        name: {key: value if isinstance(value, str) else _rounded(value) for key, value in prior_tree(prior).items()}
+        for name, prior in priors.items()
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _prior(population: Population, axis: str, parameter: str, batch: Batch, model: Model) -> Prior:
+    """The log-normal prior of a new unit's parameter, in the unit of the axis's group."""
+    measured, fit = population.measured, population.fit
+    mean = float(fit.weight @ fit.mean)
+    variance = float(fit.weight @ (fit.t**2 + fit.variance + (fit.mean - mean) ** 2))
+    shift = _of_lots(population, batch)
+    unit = units.parameter_unit(parameter, model.group_of(axis).unit)
+    factor = 1.0 if parameter in RATIOS else units.factor(measured.unit, unit)
+    sd = math.sqrt(variance + float(np.var(shift)))
+    return Prior.log_normal(
+        factor * math.exp(mean + float(np.mean(shift))), min(max(sd, LOG_NORMAL_SD[0]), LOG_NORMAL_SD[1])
+    )
+
+
+def _of_lots(population: Population, batch: Batch) -> np.ndarray:
+    """By how much each unit [n] is off for its lot: its own, unlike a station's or a day's part."""
+    last = [unit[-1] for unit in batch.devices.values()]
+    shift = np.zeros(population.measured.at.size)
+    for apart in population.apart:
+        if apart.kind == "lot" or any(name.startswith("lot ") for name in apart.also):
+            inside = [group_of(apart.kind, last[at]) == apart.name for at in population.measured.at.tolist()]
+            shift += apart.offset * np.array(inside, float)
+    return shift
+
+
+def _odds(model: Model, batch: Batch) -> dict[str, float]:
+    """Odds of each law: the probabilities of all axes of all units, and one more."""
+    total = dict.fromkeys(model.hypotheses, 1.0)
+    for name in axes_of(batch.devices):
+        for results in sound_of(batch.devices, name).values():
+            for law, probability in results[-1]["hypotheses"].items():
+                total[law] += probability
+    return {law: _rounded(odds) for law, odds in total.items()}
