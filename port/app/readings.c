@@ -11,15 +11,10 @@
 #define HEADER(name) QUOTED(name.h) /* NOLINT(bugprone-macro-parentheses): the name of a file */
 #include HEADER(SENSOR)
 
-/* No image of a model that the sensor cannot keep: the compiler states why, if it can, else the linker finds no such
- * function. */
+/* No image of a model that the sensor cannot keep: the compiler states why. */
 #define TEXT_OF(what) #what
 #define TEXT(what) TEXT_OF(what)
-#ifdef __GNUC__
 #define REFUSED(what) __attribute__((error(what)))
-#else
-#define REFUSED(what)
-#endif
 extern void the_sensor_has_not_this_rate(void) REFUSED("the model's rate is " TEXT(
     SELFCAL_MODEL_RATE_HZ) " Hz, the " TEXT(SENSOR) " has " OF(SENSOR, rates) ": set sensor.rate_hz in the model file");
 extern void the_sensor_has_not_this_channel(void) REFUSED(
