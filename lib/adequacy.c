@@ -149,7 +149,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
     }
 }
 
-/* ---------------------------------------------------------------------------------------------------------- filter */
+/* --- filter --- */
 
 /* The filter goes on under a new law: in units of its sigma_v. What a channel was before counts for its value now. */
 static void carry_over(selfcal_watch_t *watch) {
@@ -313,7 +313,7 @@ static void add_epoch(selfcal_sums_t *all, const selfcal_sums_t *epoch) {
     }
 }
 
-/* ------------------------------------------------------------------------------------------------------- judgement */
+/* --- judgement --- */
 
 typedef struct {
     selfcal_judgement_t *judgement;
@@ -384,7 +384,7 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
     told->state = found.most > R(1.0) ? SELFCAL_INADEQUATE : SELFCAL_ADEQUATE;
 }
 
-/* ---------------------------------------------------------------------------------------------------- bank samples */
+/* --- bank samples --- */
 
 /* The means of the interval's inputs less their values at the start of the epoch. */
 static void inputs_of(selfcal_adequacy_t *self, size_t inputs, selfcal_real_t mean[]) {

@@ -8,13 +8,11 @@
  *
  * Two rearrangements keep float exact enough:
  * - With beta = 1 - phi and g = phi K + beta, x' = x + g nu - beta y: beta down to 1e-7 keeps its digits, and a sample
- * costs
- *   one subtraction and two fused multiply-adds besides its two sums.
+ *   costs one subtraction and two fused multiply-adds besides its two sums.
  * - The Riccati recursion runs on d = P - p_inf, d' = phi^2 (r d + (r - 1) P p_inf) / ((1 + p_inf) (r + P)): its
- * rounding is
- *   relative to d, which dies out, whereas P' itself would settle some 1e-7/g off (3e-4 relative at g = 1e-4). So does
- *   u, u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf: e' = (1 - g) e - (g - g_inf) u_inf, where g - g_inf =
- *   phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
+ *   rounding is relative to d, which dies out, whereas P' itself would settle some 1e-7/g off (3e-4 relative at
+ *   g = 1e-4). So does u, u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf:
+ *   e' = (1 - g) e - (g - g_inf) u_inf, where g - g_inf = phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
  */
 #include "bank.h"
 

@@ -84,7 +84,7 @@ void selfcal_take(selfcal_t *self, const float sample[], const float regressors[
 /* Regressors that an axis has, a bit each. */
 uint8_t selfcal_regressors_mask(const selfcal_model_t *model, uint8_t axis);
 
-/* ------------------------------------------------------------------------------------------------- a block's sums
+/* --- a block's sums ---
  * intake_float.c and intake_fixed.c: of every axis, cleared; with a sample of the axes in `live`; the mean of the block
  * less the origin, with the sum of squares about that mean; whether they can be what samples made of them. */
 void selfcal_intake_start(selfcal_t *self);
@@ -92,7 +92,7 @@ void selfcal_intake_add(selfcal_t *self, const float sample[], uint32_t live);
 selfcal_real_t selfcal_intake_level(const selfcal_t *self, uint8_t axis, selfcal_wide_t *scatter);
 bool selfcal_intake_sound(const selfcal_t *self, uint8_t axis);
 
-/* ------------------------------------------------------------------------------------------------- kernels */
+/* --- kernels --- */
 
 /* Part of the batch without a gap inside. */
 typedef struct {
@@ -156,8 +156,7 @@ bool selfcal_kernel_node_sound(const selfcal_t *self, size_t j);
 /* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
 
-/* ---------------------------------------------------------------------------------------- innovations of several
- * series */
+/* --- innovations of several series --- */
 
 /* One series through a span. */
 typedef struct {
@@ -184,7 +183,7 @@ bool selfcal_kernel_readings_sound(const selfcal_t *self);
 /* The same sums of a node of several states, `index` among those and `j` among all. */
 reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t index, size_t axis);
 
-/* ------------------------------------------------------------------------------------------ what a model may name */
+/* --- what a model may name --- */
 
 /* bank_forget.c, for a model that forgets. */
 struct selfcal_forgetting_code {
@@ -255,7 +254,7 @@ static inline bool is_state_node(const selfcal_t *self, const selfcal_node_t *no
     return self->terms != NULL && !node->level && node->gains.moving.c == R(0.0);
 }
 
-/* ------------------------------------------------------------------------------------------------- converged nodes */
+/* --- converged nodes --- */
 
 /* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */
 static inline selfcal_sum_t steady_inv_s(const selfcal_node_t *node) {

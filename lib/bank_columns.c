@@ -21,7 +21,7 @@ static size_t columns_of(const selfcal_t *self) {
     return self->model->regressors->count;
 }
 
-/* ------------------------------------------------------------------------------------------------------------ bank */
+/* --- bank --- */
 
 static bool valid_regressors(const selfcal_model_t *model) {
     const selfcal_regressors_t *regressors = model->regressors;
@@ -180,8 +180,7 @@ static void gap_columns(selfcal_t *self, size_t j, selfcal_wide_t less) {
     }
 }
 
-/* -------------------------------------------------------------------------------------------------- normal
- * equations */
+/* --- normal equations --- */
 
 #define UNKNOWNS_MAX (1 + SELFCAL_REGRESSORS_MAX)
 
@@ -456,7 +455,7 @@ selfcal_status_t selfcal_log_likelihood(selfcal_t *self, uint8_t axis, uint16_t 
     return selfcal_log_likelihood_subset(self, axis, node, 0U, sigma_v, ln_p);
 }
 
-/* ---------------------------------------------------------------------------------------------------------- report */
+/* --- report --- */
 
 static void field_with_columns(const selfcal_work_t *work, uint16_t index, selfcal_wide_t least,
                                selfcal_field_t *result) {

@@ -1,33 +1,30 @@
 /* The kernel in integers, for parts without an FPU: every axis of one node through a span.
  *
- * INPUT SCALING y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis, chosen by the data since
- * no model
- *   knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps (one is 5e-7 to
- *   1e-6 sigma). Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the step doubles, as
- *   often as it takes; where the readings keep below 2^17 steps it shrinks again by 16. x, B and C are rescaled with
- *   it. So nothing saturates; selfcal_scale() tells how often it happened. What the range and the priors make of it is
- *   in the generated SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise, sigma <=
- *   sqrt(2) range.
+ * INPUT SCALING  y and the drift x are int32 in steps of 2^exponent unit, one exponent an axis. The data choose it,
+ *   since no model knows the noise: the first batch sets it so that the white noise seen there is 2^20 to 2^21 steps
+ *   (one is 5e-7 to 1e-6 sigma). Where |y| would pass LIMIT = 3 * 2^25 steps (48 to 96 sigma of drift and offset) the
+ *   step doubles, as often as it takes; where the readings keep below 2^17 steps it shrinks again by 16. x, B and C are
+ *   rescaled with it. So nothing saturates; selfcal_scale() counts these events. What the range and the priors make of
+ *   it is in the generated SELFCAL_MODEL_EXPONENTS: by |y| < 2 range, 2^exponent <= 4 range / LIMIT; by the noise,
+ *   sigma <= sqrt(2) range.
  * HEAD-ROOM  Each function states its own; all rest on
- *     |y| <= LIMIT < 2^26.6                by selfcal_kernel_load()
- *     |x| < LIMIT + 2^24 x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and 0, up to the
- *                                          rounding: one step a sample against the pull of g, less than 2^24 steps for
- *                                          g >= 2^-23
+ *     |y| <= LIMIT < 2^26.6                  by selfcal_kernel_load()
+ *     |x| < LIMIT + 2^24                     x' = (1 - g) x + (g - beta) y with beta <= g <= 1 keeps x among the y and
+ *                                            0, up to the rounding: one step a sample against the pull of g, less than
+ *                                            2^24 steps for g >= 2^-23
  *     |nu| = |y - x| < 2 LIMIT + 2^24 < 2^28
- *     u/s < 2^(11 - b_bits), 1/s <= 2^10   s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
- *     a span has 16 samples at most.
+ *     u/s < 2^(11 - b_bits), 1/s <= 2^10     s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
+ *     a span                                 has 16 samples at most
  *   None of it depends on the length of the record: sums that fill up make room for themselves (SUMS).
  *   tests/lib/fixed/test_fixed.c drives each there under UBSan.
- * GUARD BITS Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move
- * each
- *   ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has grown,
- *   that much more.
- * SUMS int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in
- * 2^16 steps^2:
- *   a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the next batch once
- *   |B| or C has reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real records that is
- *   never: C takes 2^35 samples, and the count is 32 bits. How long a record keeps its accuracy is another matter:
- *   GUARD BITS, selfcal_tables.h at SELFCAL_FIXED.
+ * GUARD BITS  Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move
+ *   each ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has
+ *   grown, that much more.
+ * SUMS  int64. B in 2^-(6 + b_bits) steps: a sample adds < 2^(28 + 6 + 11) = 2^45, at r = 1 in real records 2^28. C in
+ *   2^16 steps^2: a sample adds < 2^(56 + 10 - 16) = 2^50, at r = 1 in real records 2^26. The step doubles with the
+ *   next batch once |B| or C has reached 2^61, which halves B and quarters C: neither passes 2^61 + 2^54. In real
+ *   records that is never: C takes 2^35 samples, and the count is 32 bits. How long a record keeps its accuracy is
+ *   another matter: GUARD BITS, selfcal_tables.h at SELFCAL_FIXED.
  *
  * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for
  * all. >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
@@ -46,8 +43,7 @@
 /* The step grows by 2 to this many at a time: shifts stay within their types. */
 #define MOST_COARSER 30
 
-/* --------------------------------------------------------------------------------------------------- numbers from
- * float */
+/* --- numbers from float --- */
 
 /* The shift with which a value has `bits` bits before the binary point: 2^(bits - 1) <= |value| 2^shift < 2^bits. At
  * most 62. */
@@ -68,8 +64,7 @@ static int b_bits(const selfcal_node_t *node) {
     return -mantissa_shift(R(1.0) + p, 1);
 }
 
-/* --------------------------------------------------------------------------------------------------------------
- * scales */
+/* --- scales --- */
 
 static int32_t larger(int32_t a, int32_t b) {
     return a > b ? a : b;
@@ -175,7 +170,7 @@ static inline void add_sums(selfcal_t *self, size_t k, size_t axis, int64_t b, i
     }
 }
 
-/* ------------------------------------------------------------------------------------------------------- any node */
+/* --- any node --- */
 
 static uint32_t at_most_63(int shift) {
     return shift < 63 ? (uint32_t)shift : 63U;
@@ -236,8 +231,7 @@ void selfcal_kernel_run(selfcal_t *self, size_t j, const gains_t *gains) {
     }
 }
 
-/* --------------------------------------------------------------------------------------------------------- level
- * nodes */
+/* --- level nodes --- */
 
 /* Predicting nu needs one product a sample and node:
  *   nu_i = d_i + nu_(i-1) - g nu_(i-1),   d_i = y_i - y_(i-1) + beta y_(i-1),
@@ -367,8 +361,7 @@ void selfcal_kernel_level(selfcal_t *self, span_t span, size_t from, size_t to) 
     }
 }
 
-/* ----------------------------------------------------------------------------------------------------------- the
- * rest */
+/* --- the rest --- */
 
 static selfcal_total_t faded(selfcal_total_t sum, selfcal_wide_t keep) {
     return (selfcal_total_t)(keep * (selfcal_wide_t)sum + (sum < 0 ? -0.5 : 0.5));
@@ -435,8 +428,7 @@ reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t
     return sums;
 }
 
-/* ---------------------------------------------------------------------------------------------------------
- * invariants */
+/* --- invariants --- */
 
 #define MOST_SUM ((int64_t)1 << 62)
 #define MOST_X (LIMIT + (1L << 24))

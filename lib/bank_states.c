@@ -64,8 +64,7 @@ static void init_states(selfcal_t *self, unsigned char *memory) {
     self->terms->bc = self->terms->x + nodes * series_of(self) * SELFCAL_TERMS_MAX;
 }
 
-/* -------------------------------------------------------------------------------------------------------------
- * gains */
+/* --- gains --- */
 
 /* Whether two of the states are an oscillation's: never in a build without room for them. */
 static bool has_pair(const selfcal_term_node_t *node) {
@@ -379,8 +378,7 @@ static void state_gains_varying(const selfcal_batch_t *batch, selfcal_node_t *no
     term->steady = rests;
 }
 
-/* ------------------------------------------------------------------------------------------------------------
- * filter */
+/* --- filter --- */
 
 /* One series, `y` [SELFCAL_BATCH] or all 1 if NULL, through a span; `x` are its states. Sums are taken to twice the
  * digits. */
@@ -510,8 +508,7 @@ static void run_states_gap(selfcal_t *self, size_t j, uint32_t count) {
     }
 }
 
-/* --------------------------------------------------------------------------------------------------------------
- * views */
+/* --- views --- */
 
 /* The terms now, from the filter's prediction for the next interval: over that, and covariance beside it. */
 typedef struct {
@@ -659,8 +656,7 @@ static bool states_sound(const selfcal_t *self) {
     return true;
 }
 
-/* ---------------------------------------------------------------------------------------------------------------
- * laws */
+/* --- laws --- */
 
 /* Of a term's deviation and bandwidth. */
 #define FACTOR_MIN 1e-3F

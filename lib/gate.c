@@ -6,17 +6,17 @@
  * accelerometer's spoils |g|. And what their detector gains from a known level, a second test gains from the level of
  * the rest before.
  *
- * A window holds n samples y_i of each of A axes. At rest y_i = m + v_i, v_i ~ N(0, sigma^2) white, the level m
- * unknown.
+ * A window holds n samples y_i of each of A axes. At rest y_i = m + v_i, v_i ~ N(0, sigma^2) white, with an
+ * unknown level m.
  *
- * (i) Shaken? H0: one level m per axis for the window. H1: any signal. Twice the ln of the ratio of the maximised
- * likelihoods is
- *         T1 = sum over axes, samples of (y_i - mean)^2 / sigma^2, chi-square with A (n - 1) degrees of freedom at
- *         rest.
+ * (i)  Shaken? H0: one level m per axis for the window. H1: any signal. Twice the ln of the ratio of the maximised
+ *      likelihoods is
+ *          T1 = sum over axes, samples of (y_i - mean)^2 / sigma^2
+ *      and at rest chi-square with A (n - 1) degrees of freedom.
  * (ii) Moved? H0: the window has the level of the rest before, whose estimate has the variance gamma sigma^2. H1: any
- * levels.
- *         T2 = sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma)), chi-square with A degrees of freedom at
- *         rest.
+ *      levels. The same is then
+ *          T2 = sum over axes of (mean - level)^2 / (sigma^2 (1/n + gamma))
+ *      and at rest chi-square with A degrees of freedom.
  * Mean and scatter of normal samples are independent, so T1 and T2 are: each test gets half of the stated false alarm
  * rate p, and a window of rest is taken for motion with probability p - p^2/4.
  *

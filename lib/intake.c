@@ -10,8 +10,7 @@
  * nu/s is less (|u| <= 1). */
 #include "bank.h"
 
-/* --------------------------------------------------------------------------------------------------------------
- * blocks */
+/* --- blocks --- */
 
 /* Samples that tell an axis's scatter well enough, and how many outliers in a row are so: more are a step or a motion,
  * which is not for a sample to decide. */

@@ -1,18 +1,15 @@
-/* A block's sums in integers, for parts without an FPU: in software floating point a sample's two cost 600
- * instructions.
+/* A block's sums in integers, for parts without an FPU: in software floating point a sample's two
+ * cost 600 instructions.
  *
- * INPUT SCALING By each block's first sample: a step of 2^exponent unit makes it 2^25 to 2^26 steps, so that it and
- * every sample of
- *   a quarter of its size or more are exact and others are rounded to a step, 2^-25 of the first. A sample of ROOM
- *   steps or more makes the step so much coarser that it is half of ROOM to ROOM.
- * HEAD-ROOM |first| <= 2^26 steps, any sample less than ROOM = 2^29, their differences < 9/8 ROOM, a block less than
- * 2^32 samples:
- *   |sum| < 9/8 2^61. Squares are of differences rounded to 2^shift steps, of which they are 2^15 at most: sum_sq <=
- *   2^62. Nothing saturates. (tests/lib/fixed/test_block.c drives each there.)
- * GUARD BITS The mean is off by a step at most, 2^-28 of the block's largest sample, whose own last place is 2^-24 of
- * it. A square's
- *   root is off by 2^-15 of the largest difference at most: the mean square by 2^-14 of the largest times the rms
- *   difference.
+ * INPUT SCALING  By each block's first sample: a step of 2^exponent unit makes it 2^25 to 2^26 steps, so that it and
+ *   every sample of a quarter of its size or more are exact and others are rounded to a step, 2^-25 of the first. A
+ *   sample of ROOM steps or more makes the step so much coarser that it is half of ROOM to ROOM.
+ * HEAD-ROOM  |first| <= 2^26 steps, any sample less than ROOM = 2^29, their differences < 9/8 ROOM, a block less than
+ *   2^32 samples: |sum| < 9/8 2^61. Squares are of differences rounded to 2^shift steps, of which they are 2^15 at
+ *   most: sum_sq <= 2^62. Nothing saturates. (tests/lib/fixed/test_block.c drives each there.)
+ * GUARD BITS  The mean is off by a step at most, 2^-28 of the block's largest sample, whose own last place is 2^-24 of
+ *   it. A square's root is off by 2^-15 of the largest difference at most: the mean square by 2^-14 of the largest
+ *   times the rms difference.
  *
  * >> of a negative number must be arithmetic, as in bank_kernel_fixed.c. */
 #include "bank.h"

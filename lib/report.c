@@ -117,8 +117,7 @@ static void finish_report(const selfcal_work_t *work, selfcal_report_t *report) 
     report->bias_sd = (float)r_sqrt(square / sum - mean * mean);
 }
 
-/* -------------------------------------------------------------------------------------------------------------
- * stages */
+/* --- stages --- */
 
 #define STEP_GATHER 3U /* nodes of one step */
 
@@ -276,8 +275,7 @@ static const stage_t stages[] = {
     step_sum,    step_weights, step_weights, step_bias,  step_estimates, step_evidence, step_whole,
 };
 
-/* --------------------------------------------------------------------------------------------------------------
- * calls */
+/* --- calls --- */
 
 selfcal_status_t selfcal_report_begin(selfcal_work_t *work, selfcal_t *self, uint8_t axis, selfcal_report_t *report) {
     return selfcal_report_begin_subset(work, self, axis, 0U, NULL, report);

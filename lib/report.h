@@ -35,8 +35,7 @@ enum {
     WHOLE
 };
 
-/* --------------------------------------------------------------------------------------------- the hypothesis in
- * hand */
+/* --- the hypothesis in hand --- */
 
 static inline const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {
     return &work->bank->model->hypothesis[work->hypothesis];
@@ -110,8 +109,7 @@ void selfcal_node_step_truth(selfcal_work_t *work);
 /* Some of the hypothesis's node values, less their expectation: the splines carry these. */
 void selfcal_node_step_values(selfcal_work_t *work);
 
-/* --------------------------------------------------------------------------------------------------------
- * expectation */
+/* --- expectation --- */
 
 /* Expected fields of a filter, and which filter it is. The splines hold the rest. */
 typedef struct {
@@ -139,8 +137,7 @@ selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t
 /* The predicted drift variance that a filter converges to, over its sigma_v^2. */
 selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta);
 
-/* -----------------------------------------------------------------------------------------------------------
- * spectrum */
+/* --- spectrum --- */
 
 /* Of ln omega from 1/n to 6, which stands for pi. */
 selfcal_real_t selfcal_spectrum_range(selfcal_real_t weight);
@@ -152,8 +149,7 @@ selfcal_real_t selfcal_spectrum_range(selfcal_real_t weight);
 void selfcal_spectrum_step(selfcal_work_t *work);
 void selfcal_spectrum_solve(selfcal_work_t *work);
 
-/* -------------------------------------------------------------------------------------------------------------
- * spline */
+/* --- spline --- */
 
 /* Values of the six B-splines that are not zero at z (in steps from the first node); the index of the first. Beyond the
  * ends the position is held at the end. */
@@ -164,8 +160,7 @@ uint8_t selfcal_spline_basis(uint16_t nodes, selfcal_real_t z, selfcal_real_t ou
  * spline interpolates is the sum of its node values under them. */
 bool selfcal_spline_step(selfcal_work_t *work, bool transposed, int which);
 
-/* --------------------------------------------------------------------------------------------------------------
- * cells */
+/* --- cells --- */
 
 typedef struct {
     selfcal_real_t ln_rho, profile, ln_sigma;
@@ -211,8 +206,7 @@ void selfcal_cells_parameters(const selfcal_work_t *work, const cell_t *cell,
  * profile as a rule rises as fast to the other side. */
 reach_t selfcal_cells_reach(const selfcal_work_t *work, const selfcal_real_t ln_value[], selfcal_real_t half[2]);
 
-/* ------------------------------------------------------------------------------------------------ search and
- * integral */
+/* --- search and integral --- */
 
 /* One pass over one of the rows a step; true when all ranges are found. */
 void selfcal_search_begin(selfcal_work_t *work);
@@ -222,8 +216,7 @@ bool selfcal_search_step(selfcal_work_t *work);
 void selfcal_integral_begin(selfcal_work_t *work);
 void selfcal_integral_step(selfcal_work_t *work);
 
-/* ----------------------------------------------------------------------------------------------------------
- * marginals */
+/* --- marginals --- */
 
 /* n_eff (delta + e^(-2 delta)/2 - 1/2) at the ends of the sigma_v cells. */
 #define SIGMA_DEPTH R(13.0)
@@ -258,8 +251,7 @@ void selfcal_histogram_deposit(const spread_t *spread, selfcal_real_t middle, se
 
 void selfcal_histogram_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate);
 
-/* ---------------------------------------------------------------------------------------------------------------
- * bias */
+/* --- bias --- */
 
 /* One node a step. */
 void selfcal_bias_step(selfcal_work_t *work);

@@ -1,7 +1,6 @@
 /* Nodes: every node once, and two numbers kept of each: its profile ln-likelihood and ln of sigma_v's conditional mode.
  *
- * Under the priors of the bias and of the coefficients the mode t^ of t = ln sigma_v has no closed form. It is found by
- * turns, with
+ * Under the priors of the bias and of the coefficients the mode t^ of t = ln sigma_v has no closed form. Turns find it:
  *     sigma_v^2 = (residual + noise) / (n - w), w = P0 A/(P0 A + sigma_v^2), noise = (1 - w)^2 A (x0^ - x0 prior)^2,
  * w the share of one sample that the bias takes, 1 under a wide prior. With regressors in use each coefficient takes
  * such a share as well. */

@@ -1,7 +1,6 @@
 /* Spectrum: what the data's spectrum has beyond the supposed one, fitted to the nodes of all laws.
  *
- * The innovations nu = (1 - phi B)/(1 - psi B) y, psi = phi (1 - K), have over data of the spectrum S(omega) the
- * variance
+ * Over data of the spectrum S(omega) the innovations nu = (1 - phi B)/(1 - psi B) y, psi = phi (1 - K), have variance
  *     v = mean over omega of S |1 - phi e^(i omega)|^2 / |1 - psi e^(i omega)|^2.
  * So all that (rho, alpha) sees of the data, of whatever law, is a function of one variable, psi, smoothed along ln(1 -
  * psi) by 1/(1 + e^2x), and the nodes together show it far more closely than their rows and columns seem to. What S has

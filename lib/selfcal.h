@@ -60,7 +60,7 @@ extern "C" {
 
 #define SELFCAL_VERSION "0.2.0"
 
-/* ------------------------------------------------------------------------------------------- status and counters */
+/* --- status and counters --- */
 
 typedef enum {
     SELFCAL_OK = 0,
@@ -96,7 +96,7 @@ typedef struct {
     uint32_t regressor_not_finite;
 } selfcal_counters_t;
 
-/* -------------------------------------------------------------------------------------------------------- report */
+/* --- report --- */
 
 /* Bank samples below which no report is made. */
 #define SELFCAL_REPORT_MIN 3
@@ -150,7 +150,7 @@ typedef struct {
     selfcal_posterior_t hypothesis[SELFCAL_HYPOTHESES_MAX];
 } selfcal_report_t;
 
-/* ----------------------------------------------------------------------------------------------------- judgement */
+/* --- judgement --- */
 
 typedef enum { SELFCAL_NOT_JUDGED = 0, SELFCAL_ADEQUATE = 1, SELFCAL_INADEQUATE = 2 } selfcal_adequacy_state_t;
 
@@ -220,7 +220,7 @@ typedef struct {
  * written. */
 typedef bool (*selfcal_write_t)(void *context, const void *bytes, size_t count);
 
-/* ------------------------------------------------------------------------------------------------------------ pipe
+/* --- pipe ---
  * The way of a sample in one call: gate, columns, bank, judgement, changes, whatever the model names.
  *
  *     selfcal_imu_init(&imu, &selfcal_model_pipe, memory, sizeof memory);

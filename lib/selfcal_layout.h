@@ -79,7 +79,7 @@ typedef struct {
 
 #endif
 
-/* ------------------------------------------------------------------------------------------------------------- bank */
+/* --- bank --- */
 
 /* How a filter's gains move. */
 typedef struct {
@@ -243,7 +243,7 @@ struct selfcal {
  * compiler lays out. */
 #define SELFCAL_SNAPSHOT_MAX(bytes) (32U + sizeof(selfcal_t) + (bytes))
 
-/* ------------------------------------------------------------------------------------------ values of regressors */
+/* --- values of regressors --- */
 
 /* Bins that a window is held in. More: a finer edge of the window, 4 bytes each and column. */
 #define SELFCAL_COLUMN_BINS 32U
@@ -266,7 +266,7 @@ struct selfcal_former {
     selfcal_trail_t trail[SELFCAL_REGRESSORS_MAX];
 };
 
-/* ----------------------------------------------------------------------------------------------------------- report */
+/* --- report --- */
 
 /* By SELFCAL_REPORT_QUALITY: cells a dimension, cells of sigma_v where a limit cuts, bins of a parameter's
  * histogram. */
@@ -409,7 +409,7 @@ struct selfcal_work {
     } scratch;
 };
 
-/* ------------------------------------------------------------------------------------------------------------- gate */
+/* --- gate --- */
 
 /* A level and its variance over sigma^2 of each axis. */
 typedef struct {
@@ -456,7 +456,7 @@ struct selfcal_gate {
     selfcal_wide_t sum_scatter[SELFCAL_AXES_MAX], sum_scatter_sq[SELFCAL_AXES_MAX], sum_level_sq[SELFCAL_AXES_MAX];
 };
 
-/* --------------------------------------------------------------------------------------------------------- adequacy */
+/* --- adequacy --- */
 
 enum {
     SELFCAL_ADEQUACY_CHANNELS = 2, /* temperature, supply */
@@ -529,7 +529,7 @@ struct selfcal_adequacy {
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };
 
-/* ------------------------------------------------------------------------------------------------------------ pipe */
+/* --- pipe --- */
 
 typedef struct {
     selfcal_gate_t gate;
@@ -593,7 +593,7 @@ struct selfcal_imu {
      ((judged) ? SELFCAL_PART(sizeof(selfcal_imu_judge_t)) : 0U) +                                                     \
      ((changes) ? SELFCAL_CHANGES_SIZE(nodes, axes) : 0U))
 
-/* -------------------------------------------------------------------------------------------------------- telemetry */
+/* --- telemetry --- */
 
 struct selfcal_telemetry {
     const selfcal_model_t *model;

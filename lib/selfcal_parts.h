@@ -14,7 +14,7 @@
 extern "C" {
 #endif
 
-/* ------------------------------------------------------------------------------------------------------------- bank */
+/* --- bank --- */
 
 typedef struct selfcal selfcal_t; /* of its members, `position` and `used` may be read: samples of this block */
 
@@ -128,7 +128,7 @@ selfcal_wide_t selfcal_offset(const selfcal_t *self, uint8_t axis);
  * division. */
 selfcal_status_t selfcal_check(const selfcal_t *self);
 
-/* ------------------------------------------------------------------------------------------ values of regressors
+/* --- values of regressors ---
  * For a model whose regressors name their sources. The host's tools form the columns of a recording by the same
  * code. */
 
@@ -159,7 +159,7 @@ selfcal_status_t selfcal_former_resume(selfcal_former_t *self, const selfcal_t *
  * SELFCAL_BAD_ARGUMENT on NULL. */
 selfcal_status_t selfcal_power_on(selfcal_t *self, uint64_t samples);
 
-/* --------------------------------------------------------------------------------------------------------- snapshot
+/* --- snapshot ---
  * Everything a bank knows as a stream of bytes (format in snapshot.c), with a version and a CRC-32. A bank saved and
  * restored goes on bit for bit like one that was never stopped, whatever was under way: a block, a batch, a gap. A
  * snapshot belongs to its model and its build. A report under way and telemetry are not part of it. */
@@ -183,7 +183,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
 selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
                                  const void *snapshot, size_t length);
 
-/* ----------------------------------------------------------------------------------------------------------- report */
+/* --- report --- */
 
 /* Coefficients of the regressors under one hypothesis, unit per unit of each; NaN for those not in use. */
 typedef struct {
@@ -225,7 +225,7 @@ selfcal_status_t selfcal_report(selfcal_work_t *work, selfcal_t *self, uint8_t a
 selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_model_t *model, float elapsed_s,
                                  float *bias, float *sd);
 
-/* -------------------------------------------------------------------------------------------------------- adequacy
+/* --- adequacy ---
  * Whether the model of the last report explains the readings after it. Optional: a program that does not name these
  * functions pays nothing for them. Method: adequacy.c.
  *
@@ -268,7 +268,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
 /* The judgement of the last epoch, and the last change. */
 selfcal_judgement_t selfcal_judgement(const selfcal_adequacy_t *self, const selfcal_t *bank, uint8_t axis);
 
-/* --------------------------------------------------------------------------------------------------------- changes
+/* --- changes ---
  * Steps of the bias and changes of the noise, found while the samples come, for a model whose `handling` says so.
  * Method, false-alarm rates and delays: changes.c.
  *
@@ -289,7 +289,7 @@ selfcal_status_t selfcal_changes_init(selfcal_changes_t *self, selfcal_adequacy_
  * change of variance all noise learned before it is forgotten. */
 uint32_t selfcal_changes_handle(selfcal_adequacy_t *adequacy, selfcal_t *bank);
 
-/* ------------------------------------------------------------------------------------------------------------- gate
+/* --- gate ---
  * Does the sensor rest? A likelihood-ratio test over windows of samples of any axes (gyros, accelerometers, or both).
  * gate.c states the hypotheses, the statistics and their distributions. Independent of selfcal_t. */
 
@@ -367,7 +367,7 @@ void selfcal_gate_shift(selfcal_gate_t *gate, uint8_t axis, float amount);
 #define SELFCAL_GATE_MEASURED_MIN 30U
 selfcal_status_t selfcal_gate_measured(const selfcal_gate_t *gate, uint8_t axis, selfcal_gate_noise_t *noise);
 
-/* -------------------------------------------------------------------------------------------------------- telemetry
+/* --- telemetry ---
  * Reports as classical CAN frames of 8 bytes with 11-bit identifiers. selfcal.dbc describes every item, with its unit
  * and bits. selfcal_frames.h and the decoders are made from the same source.
  * Each frame carries one value and its item number, a counter over all frames of the module, the module time in whole
@@ -466,7 +466,7 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
 /* Makes the next frame; false when there is none. O(1). */
 bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame);
 
-/* --------------------------------------------------------------------------------------------- for tests and tools */
+/* --- for tests and tools --- */
 
 /* Number format of one axis with SELFCAL_FIXED, and how far it is filled. Nothing ever saturates: the step grows. */
 typedef struct {

@@ -13,7 +13,7 @@
 extern "C" {
 #endif
 
-/* ---------------------------------------------------------------------------------------------------- configuration
+/* --- configuration ---
  * Three macros are left to a person; the compiler's command line or selfcal_config.h sets them.
  *   SELFCAL_ASSERT(condition)  what a bug does. As it is: nothing.
  *   SELFCAL_FIXED              defined: samples are processed in integers, for parts without an FPU. Gains, tables
@@ -54,7 +54,7 @@ typedef float selfcal_real_t;
 /* Reports and ln-likelihoods. Double, in software where the FPU has none. No sample touches it. */
 typedef double selfcal_wide_t;
 
-/* --------------------------------------------------------------------------------------------------------- model */
+/* --- model --- */
 
 /* A law is data: the terms of its drift, and the kind of its white noise.
  *   SELFCAL_WALK:   x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                                             (23)

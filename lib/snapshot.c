@@ -53,8 +53,7 @@ static size_t size_of(const selfcal_model_t *model) {
     return HEADER + part[0].bytes + part[1].bytes + part[2].bytes + part[3].bytes + TRAILER;
 }
 
-/* -------------------------------------------------------------------------------------------------------------
- * bytes */
+/* --- bytes --- */
 
 /* Four bits a step: a table of 64 bytes. */
 static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
@@ -106,8 +105,7 @@ static uint32_t layout(void) {
     return crc32(0, (const uint8_t *)facts, sizeof facts); /* of these bytes as they lie: the order of bytes is in it */
 }
 
-/* --------------------------------------------------------------------------------------------------------------
- * save */
+/* --- save --- */
 
 typedef struct {
     selfcal_write_t write;
@@ -173,8 +171,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     return sink.good ? SELFCAL_OK : SELFCAL_WRITE_FAILED;
 }
 
-/* -----------------------------------------------------------------------------------------------------------
- * restore */
+/* --- restore --- */
 
 /* Judges the header and the checksum. */
 static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *bytes, size_t length) {

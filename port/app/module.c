@@ -20,7 +20,7 @@ static app_t app;
 static slots_t slots;
 static const module_board_t *board;
 
-/* ------------------------------------------------------------------------------------------------------------- port */
+/* --- port --- */
 
 static uint32_t port_time_ms(void *context) {
     (void)context;
@@ -39,7 +39,7 @@ static void port_idle(void *context) {
 
 static const port_t port = {NULL, port_time_ms, readings_sample, port_send, port_idle};
 
-/* ----------------------------------------------------------------------------------------------------------- module */
+/* --- module --- */
 
 static void module_tell(void *context, selfcal_module_t *told) {
     (void)context;

@@ -264,7 +264,7 @@ static void stop(sensor_state_t *state) {
     self->tail = self->head; /* what waits may be of a sensor that was no longer set up */
 }
 
-/* ----------------------------------------------------------------------------------------------- interrupt handlers */
+/* --- interrupt handlers --- */
 
 static void start_burst(adis16405_t *self) {
     self->reading = self->common.bus->begin(burst_out, self->burst_in, sizeof burst_out);
@@ -360,7 +360,7 @@ static void done(sensor_state_t *state, bool whole) {
     self->head = head + 1U;
 }
 
-/* -------------------------------------------------------------------------------------------------------- main loop */
+/* --- main loop --- */
 
 /* Either has 12 bits. Temperature: two's complement, 0.14 degC each, 0 at 25 degC. Supply: 2.418 mV each. If the two
  * readings of a burst differ, the value before stands. */

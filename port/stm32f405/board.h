@@ -8,7 +8,7 @@
 
 #include "module.h"
 
-/* --------------------------------------------------------------------------------------------------------- start-up */
+/* --- start-up --- */
 
 typedef struct {
     uint32_t vector; /* exception number: 3 HardFault, 16 + n interrupt n */
@@ -21,7 +21,7 @@ bool board_last_fault(board_fault_t *fault);
 
 void board_reset(void);
 
-/* ------------------------------------------------------------------------------------------------------------ clock */
+/* --- clock --- */
 
 typedef struct {
     uint32_t hclk_hz, pclk1_hz, pclk2_hz;
@@ -48,13 +48,13 @@ void clock_spin_us(uint32_t us);
 
 void systick_handler(void);
 
-/* ----------------------------------------------------------------------------------------------------------- sensor */
+/* --- sensor --- */
 
 extern const sensor_bus_t spi_bus;
 void sensor_ready_handler(void);
 void sensor_done_handler(void);
 
-/* ------------------------------------------------------------------------------------------------------------- wire */
+/* --- wire --- */
 
 /* Either CAN or SLCAN on the USART, chosen at build time: BOARD_CAN_KBITPS, 125 to 1000, or 0 for the USART. */
 #ifndef BOARD_CAN_KBITPS
@@ -99,7 +99,7 @@ void usart_handler(void);
 /* A random number of the RNG's; false: it has none, for want of a clock or by its own checks. 1 ms at most. */
 bool rng_number(uint32_t *number);
 
-/* -------------------------------------------------------------------------------------------- watchdog, reset cause */
+/* --- watchdog, reset cause --- */
 
 /* Reads and clears the reset flags. */
 reset_cause_t watchdog_reset_cause(void);
@@ -108,7 +108,7 @@ reset_cause_t watchdog_reset_cause(void);
 void watchdog_start(void);
 void watchdog_feed(void);
 
-/* ------------------------------------------------------------------------------------------------------------ flash */
+/* --- flash --- */
 
 /* Erasing a slot takes 1 s, 2 s at most, during which the processor stands still. */
 extern const slots_memory_t flash_memory;

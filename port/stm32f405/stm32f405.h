@@ -9,7 +9,7 @@
 #define REG32(address) (*(volatile uint32_t *)(uintptr_t)(address))
 #define BIT(n) (1UL << (n))
 
-/* ------------------------------------------------------------------------------------------ RCC, RM0090 section 7.3 */
+/* --- RCC, RM0090 section 7.3 --- */
 #define RCC_CR REG32(0x40023800U)
 #define RCC_PLLCFGR REG32(0x40023804U)
 #define RCC_CFGR REG32(0x40023808U)
@@ -55,11 +55,11 @@
 #define RCC_CSR_WWDGRSTF BIT(30)
 #define RCC_CSR_LPWRRSTF BIT(31)
 
-/* ------------------------------------------------------------------------------------------ PWR, RM0090 section 5.4 */
+/* --- PWR, RM0090 section 5.4 --- */
 #define PWR_CR REG32(0x40007000U)
 #define PWR_CR_VOS BIT(14) /* scale 1: needed at 168 MHz */
 
-/* ---------------------------------------------------------------------------------------- Flash, RM0090 section 3.9 */
+/* --- Flash, RM0090 section 3.9 --- */
 #define FLASH_ACR REG32(0x40023C00U)
 #define FLASH_KEYR REG32(0x40023C04U)
 #define FLASH_SR REG32(0x40023C0CU)
@@ -84,7 +84,7 @@
 #define FLASH_CR_STRT BIT(16)
 #define FLASH_CR_LOCK BIT(31)
 
-/* ----------------------------------------------------------------------------------------- GPIO, RM0090 section 8.4 */
+/* --- GPIO, RM0090 section 8.4 --- */
 #define GPIOA 0x40020000U
 #define GPIOB 0x40020400U
 #define GPIO_MODER(port) REG32((port) + 0x00U)
@@ -93,13 +93,13 @@
 #define GPIO_BSRR(port) REG32((port) + 0x18U)
 #define GPIO_AFR(port, pin) REG32((port) + 0x20U + 4U * ((pin) / 8U))
 
-/* ------------------------------------------------------------------- SYSCFG and EXTI, RM0090 sections 9.2 and 12.3 */
+/* --- SYSCFG and EXTI, RM0090 sections 9.2 and 12.3 --- */
 #define SYSCFG_EXTICR1 REG32(0x40013808U)
 #define EXTI_IMR REG32(0x40013C00U)
 #define EXTI_RTSR REG32(0x40013C08U)
 #define EXTI_PR REG32(0x40013C14U)
 
-/* ----------------------------------------------------------------------------------------- DMA, RM0090 section 10.5 */
+/* --- DMA, RM0090 section 10.5 --- */
 #define DMA2 0x40026400U
 #define DMA_LISR REG32(DMA2 + 0x00U)
 #define DMA_LIFCR REG32(DMA2 + 0x08U)
@@ -120,7 +120,7 @@
 #define DMA_LISR_STREAM0 0x3DU         /* every flag of stream 0 ... */
 #define DMA_LISR_STREAM3 (0x3DU << 22) /* ... and of stream 3 */
 
-/* -------------------------------------------------------------------------------- TIM2 to TIM5, RM0090 section 18.4 */
+/* --- TIM2 to TIM5, RM0090 section 18.4 --- */
 #define TIM2_CR1 REG32(0x40000000U)
 #define TIM2_EGR REG32(0x40000014U)
 #define TIM2_CNT REG32(0x40000024U)
@@ -129,7 +129,7 @@
 #define TIM_CR1_CEN BIT(0)
 #define TIM_EGR_UG BIT(0)
 
-/* ---------------------------------------------------------------------------------------- IWDG, RM0090 section 21.4 */
+/* --- IWDG, RM0090 section 21.4 --- */
 #define IWDG_KR REG32(0x40003000U)
 #define IWDG_PR REG32(0x40003004U)
 #define IWDG_RLR REG32(0x40003008U)
@@ -139,7 +139,7 @@
 #define IWDG_KR_START 0xCCCCU
 #define IWDG_PR_DIV256 6U
 
-/* ----------------------------------------------------------------------------------------- SPI, RM0090 section 28.5 */
+/* --- SPI, RM0090 section 28.5 --- */
 #define SPI1_CR1 REG32(0x40013000U)
 #define SPI1_CR2 REG32(0x40013004U)
 #define SPI1_SR REG32(0x40013008U)
@@ -158,7 +158,7 @@
 #define SPI_SR_TXE BIT(1)
 #define SPI_SR_BSY BIT(7)
 
-/* --------------------------------------------------------------------------------------- USART, RM0090 section 30.6 */
+/* --- USART, RM0090 section 30.6 --- */
 #define USART1_SR REG32(0x40011000U)
 #define USART1_DR REG32(0x40011004U)
 #define USART1_BRR REG32(0x40011008U)
@@ -175,7 +175,7 @@
 #define USART_CR1_TXEIE BIT(7)
 #define USART_CR1_UE BIT(13)
 
-/* --------------------------------------------------------------------------------------- bxCAN, RM0090 section 32.9 */
+/* --- bxCAN, RM0090 section 32.9 --- */
 #define CAN1 0x40006400U
 #define CAN_MCR REG32(CAN1 + 0x000U)
 #define CAN_MSR REG32(CAN1 + 0x004U)
@@ -224,7 +224,7 @@
 #define CAN_TIR_TXRQ BIT(0)
 #define CAN_TIR_STID_POS 21U
 
-/* ----------------------------------------------------------------------------------------- RNG, RM0090 section 24.4 */
+/* --- RNG, RM0090 section 24.4 --- */
 #define RNG_CR REG32(0x50060800U)
 #define RNG_SR REG32(0x50060804U)
 #define RNG_DR REG32(0x50060808U)
@@ -233,7 +233,7 @@
 #define RNG_SR_CECS BIT(1) /* clock error */
 #define RNG_SR_SECS BIT(2) /* seed error */
 
-/* ------------------------------------------------------- core: SysTick PM0214 4.5, NVIC 4.3, SCB 4.4, FPU 4.6 */
+/* --- core: SysTick PM0214 4.5, NVIC 4.3, SCB 4.4, FPU 4.6 --- */
 #define SYST_CSR REG32(0xE000E010U)
 #define SYST_RVR REG32(0xE000E014U)
 #define SYST_CVR REG32(0xE000E018U)

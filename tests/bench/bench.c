@@ -20,8 +20,7 @@ static selfcal_work_t work;
 static selfcal_report_t report;
 static selfcal_telemetry_t telemetry;
 
-/* ------------------------------------------------------------------------------------------------------------
- * measures */
+/* --- measures --- */
 
 static record_t record;
 static selfcal_model_t model; /* record_model() */

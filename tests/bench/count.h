@@ -1,6 +1,6 @@
 /* Counting on a bench image, and what is printed of it for bench.py:
- *   count NAME TICKS PARTS ROUNDS PER of SysTick, in PARTS measurements (see image_time_t for ROUNDS), for PER units of
- *   work value NAME NUMBER
+ *   count NAME TICKS PARTS ROUNDS PER   of SysTick, in PARTS measurements (ROUNDS: image_time_t), for PER units of work
+ *   value NAME NUMBER
  */
 #ifndef COUNT_H
 #define COUNT_H

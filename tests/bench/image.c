@@ -16,8 +16,7 @@ extern void image_stack(void); /* its address is the stack's */
 
 volatile uint32_t image_rounds;
 
-/* ----------------------------------------------------------------------------------------------------------
- * semihosting */
+/* --- semihosting --- */
 
 enum { SYS_WRITE0 = 0x04, SYS_EXIT_EXTENDED = 0x20 };
 
@@ -49,8 +48,7 @@ void image_exit(uint32_t code) {
     }
 }
 
-/* ----------------------------------------------------------------------------------------------------------------
- * clock */
+/* --- clock --- */
 
 /* In assembly, so that what it adds to a count is known: five instructions. */
 __attribute__((naked)) static void count_round(void) {
@@ -79,8 +77,7 @@ __attribute__((naked, noinline)) void image_known_loop(uint32_t count) {
     __asm__ volatile(".syntax unified\n1: nop\n subs r0, #1\n bne 1b\n bx lr");
 }
 
-/* -------------------------------------------------------------------------------------------------------------
- * start-up */
+/* --- start-up --- */
 
 static void fault(void) {
     image_print("fault\n");

@@ -86,8 +86,7 @@ static selfcal_telemetry_t telemetry;
 static bool has_telemetry;
 static uint32_t crc_table[256];
 
-/* --------------------------------------------------------------------------------------------------------------
- * input */
+/* --- input --- */
 
 static uint8_t byte(input_t *in) {
     return in->at < in->end ? *in->at++ : 0U;
@@ -114,8 +113,7 @@ static float moderate(input_t *in) {
     return ldexpf((float)((b & 15) - 8), (b >> 4) - 8);
 }
 
-/* -------------------------------------------------------------------------------------------------------------
- * model */
+/* --- model --- */
 
 /* Node values to coefficients of the quintic without inner knots: the inverse of the Bernstein polynomials at k/5. */
 static void make_fit(void) {
@@ -267,8 +265,7 @@ static void make_model(input_t *in, bool any_sums) {
     }
 }
 
-/* --------------------------------------------------------------------------------------------------------- what
- * holds */
+/* --- what holds --- */
 
 static bool append(void *context, const void *bytes, size_t count) {
     store_t *store = context;
@@ -406,8 +403,7 @@ static void check_motion(selfcal_motion_t motion) {
     HOLDS(gate.state == motion && gate.counters.alarms <= gate.counters.windows);
 }
 
-/* --------------------------------------------------------------------------------------------------------------
- * calls */
+/* --- calls --- */
 
 static void push(const float sample[]) {
     if (pushes == 0U || effort == 0U) {

@@ -291,8 +291,7 @@ static void any_alignment_will_do(void) {
     }
 }
 
-/* ----------------------------------------------------------------------------------------------------------
- * refusals */
+/* --- refusals --- */
 
 /* `other` holds a bank at work, which a refusal leaves alone. */
 static void refused(selfcal_status_t expected, const store_t *store) {
