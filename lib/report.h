@@ -85,8 +85,7 @@ static inline uint16_t step_part(selfcal_work_t *work, unsigned step, uint16_t w
     return from;
 }
 
-/* ln of a prior's density in ln(parameter), at a value of it between the limits: over that of a log-uniform prior of
- * the value 1, and a factor that ln_prior_density() in report.c has. */
+/* ln of a prior's density in ln(parameter) between its limits, but for a constant: ln_prior_density() in report.c. */
 static inline selfcal_real_t prior_shape(const selfcal_prior_t *prior, selfcal_real_t ln_value) {
     if (prior->law == SELFCAL_LOG_NORMAL) {
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min, hi = (selfcal_real_t)prior->ln_max;

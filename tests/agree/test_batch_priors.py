@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import math
+import shlex
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy import integrate, stats
 
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import identify_axis
-from selfcal.model import Model, Prior
+from selfcal.errors import UserError
+from selfcal.model import DEFAULT, Model, Prior
 from selfcal.recording import save
 from selfcal.result import HALF_90
 from selfcal.tables import make_tables
 from selfcal.verbs.fleet import fleet
 from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
-from conftest import case_records, worst_difference
+from conftest import COMMAND, ROOT, case_records, worst_difference
 
 MODEL = Model.load()
 GROUP = MODEL.group_of("gx")
@@ -150,3 +156,72 @@ def test_a_module_that_begins_with_the_batch_knows_more(tmp_path: Path) -> None:
         assert share >= 0.9 - off, (key, share)
         assert error <= 1.02 * default[key][1], key
     assert batch["K", 60][1] < 0.3 * default["K", 60][1]
+
+
+def test_the_printed_example(tmp_path: Path) -> None:
+    """The README's batch, by its own code: the command prints the lines that stand there."""
+    text = (ROOT / "tools" / "README.md").read_text().partition("### The population")[2]
+    made, command, printed = (text.split("```python\n")[1].split("```")[0], *text.split("\n\n    ")[1:3])
+    if not case_records(0, 1):
+        pytest.skip("SLOW: make cases")
+    (tmp_path / "make.py").write_text(made)
+    subprocess.run([sys.executable, "make.py"], cwd=tmp_path, check=True)
+    words = [*COMMAND, *shlex.split(command.removeprefix(".venv/bin/selfcal "))]
+    found = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=1800)
+    print(found.stdout)
+    assert [line.strip() for line in printed.split("\n\n")[0].splitlines()] == found.stdout.splitlines()
+
+
+def own(place: Path) -> dict[str, dict[str, Any]]:
+    """The written priors of gx."""
+    priors: dict[str, dict[str, Any]] = yaml.safe_load(place.read_text())["groups"]["gyro"]["own_priors"]["gx"]
+    return priors
+
+
+def test_the_written_priors_are_the_batch_s(tmp_path: Path) -> None:
+    """Medians within 4 standard errors, a spread within a factor of two; law and odds of a walk. A batch that is
+    identified by them has the same population: a prior is no second measurement."""
+    place = batch_file(tmp_path, 30, 21)
+    for name, (median, sd) in PARTS.items():
+        found = own(place)[name]
+        assert found["law"] == "log_normal" and 0.5 < found["sd"] / math.hypot(sd, 0.02) < 2.0
+        assert abs(math.log(found["median"] / median)) < 4.0 * math.hypot(sd, 0.1) / math.sqrt(30)
+    odds = yaml.safe_load(place.read_text())["hypotheses"]
+    assert odds["random_walk"] > 20.0 and all(value >= 1.0 for value in odds.values())
+    again = tmp_path / "again.yaml"
+    fleet([str(tmp_path / "b/*.npz")], tmp_path / "t.csv", model=place, write_model=again)
+    for name, found in own(again).items():
+        assert found["median"] == pytest.approx(own(place)[name]["median"], rel=0.02)
+        assert found["sd"] == pytest.approx(own(place)[name]["sd"], rel=0.15)
+
+
+def test_a_lot_that_is_apart_widens_the_prior(tmp_path: Path) -> None:
+    """A new unit may be of any lot: K doubles in one of three, which is a sd of 0.33 of ln. A third of them fixes it
+    within 0.1."""
+    found = own(batch_file(tmp_path, 36, 22, {"A": 1.0, "B": 1.0, "C": 2.0}))
+    spread = math.hypot(PARTS["K"][1], math.log(2.0) * math.sqrt(2.0) / 3.0)
+    assert found["K"]["sd"] == pytest.approx(spread, abs=0.1)
+    assert found["K"]["median"] == pytest.approx(PARTS["K"][0] * 2.0 ** (1.0 / 3.0), rel=0.15)
+    assert found["N"]["sd"] < 0.15
+
+
+def test_what_is_no_prior(tmp_path: Path) -> None:
+    stated = "K: {law: log_uniform, min: 2.0e-5, max: 2.0e-2}"
+    place = tmp_path / "m.yaml"
+    for given, words in (
+        ("K: {law: log_normal, median: 1.0e-3}", "'sd' is missing"),
+        ("K: {law: log_normal, median: 1.0e-3, sd: 9.0}", "must be 0.0001 to 5, not 9"),
+        ("K: {law: log_normal, median: 1.0e-3, sd: 0.1, max: 1.0}", "unknown entry 'max' (known: law, median, sd)"),
+        ("K: {law: log_normal, median: 1.0e-19, sd: 2.0}", "min and max must differ, within"),
+        ("K: {law: log_uniform, min: 2.0e-5, max: 2.0e-2, sd: 1.0}", "unknown entry 'sd' (known: law, min, max)"),
+        ("K: {law: gamma, min: 2.0e-5, max: 2.0e-2}", "(log_uniform, uniform or log_normal)"),
+    ):
+        place.write_text(DEFAULT.read_text().replace(stated, given, 1))
+        with pytest.raises(UserError) as caught:
+            Model.load(place)
+        assert words in str(caught.value), given
+    (tmp_path / "b").mkdir()
+    save(tmp_path / "b/one.npz", {"gx": ("deg/s", np.random.default_rng(1).standard_normal(500))}, 1.0)
+    with pytest.raises(UserError, match="no parameter has a population: it takes five units"):
+        fleet([str(tmp_path / "b/*")], tmp_path / "t.csv", write_model=tmp_path / "batch.yaml")
+    assert not (tmp_path / "batch.yaml").exists()

@@ -216,7 +216,7 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
     """As printed, with the number that stands behind its `print`."""
     (tmp_path / "tests").symlink_to(ROOT / "tests")
     shutil.copy(ROOT / "tools" / "selfcal" / "models" / "default.yaml", tmp_path / "my.yaml")
-    example = blocks(ROOT / "tools" / "README.md", "python")[0]
+    example = blocks(ROOT / "tools" / "README.md", "python")[-1]
     done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
     told = re.search(r"^print.*# ([0-9.]+)$", example, re.MULTILINE)
     assert told is not None and math.isclose(float(done.stdout), float(told[1]), rel_tol=0.02)

@@ -21,7 +21,7 @@ from selfcal.model import Model
 from selfcal.recording import save
 from selfcal.result import AxisResult, Estimate
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.summary import Number, summarize
+from selfcal.summary import Number, halved_after, summarize
 from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
 
@@ -180,3 +180,42 @@ def test_a_narrow_terminal_loses_intervals_and_no_number(tmp_path: Path, monkeyp
         line = next(line for line in console.export_text().splitlines() if "ARW" in line)
         assert line.count("[") == intervals
         assert "°/s/√Hz" in line and line.rstrip().endswith("°/√h")
+
+
+#: Records that leave a parameter open, and the parameter: what is short of 1/alpha, a walk below the white noise.
+OPEN = [
+    ("gauss_markov", {"N": 0.02, "sigma_m": 0.03, "alpha": 0.03}, 600, "alpha"),
+    ("gauss_markov", {"N": 0.02, "sigma_m": 0.02, "alpha": 5e-3}, 1800, "alpha"),
+    ("random_walk", {"N": 0.03, "K": 3e-3}, 120, "K"),
+]
+
+
+@pytest.mark.parametrize(("law", "truth", "n", "parameter"), OPEN)
+def test_the_further_rest_about_halves_the_interval(law: str, truth: dict[str, float], n: int, parameter: str) -> None:
+    """The same records go on for the rest that is stated: in the median the interval's logarithm is 0.15 to 0.75 times
+    as wide. An open interval ends at a limit of the prior, which no information describes."""
+    tables = make_tables(MODEL, 1.0, ("gx",))
+
+    def report(samples: int, seed: int) -> AxisResult:
+        y, _ = simulate_bank_samples(law, truth, 1.0, samples, seed)
+        bank = Bank(tables)
+        bank.push(y[:, None])
+        return bank.report(0)
+
+    ratios = []
+    for seed in range(case_records(40, 120)):
+        before = report(n, seed)
+        rest_s = halved_after(before, GROUP, 1.0, n, 1).get(parameter)
+        if max(before.probability, key=lambda one: before.probability[one]) != law or rest_s is None:
+            continue
+        assert not before.parameters[law][parameter].identified
+        e, after = before.parameters[law][parameter], report(n + math.ceil(rest_s), seed).parameters[law][parameter]
+        ratios.append(math.log(after.q95 / after.q05) / math.log(e.q95 / e.q05))
+    assert len(ratios) >= 3 and 0.15 <= np.median(ratios) <= 0.75, np.median(ratios)
+
+
+def test_a_record_that_identifies_all_asks_for_no_rest() -> None:
+    y, _ = simulate_bank_samples("random_walk", {"N": 0.02, "K": 2e-3}, 1.0, 4000, 3)
+    bank = Bank(make_tables(MODEL, 1.0, ("gx",)))
+    bank.push(y[:, None])
+    assert halved_after(bank.report(0), GROUP, 1.0, 4000, 1) == {}

@@ -117,7 +117,7 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
             times = f"not even {MOST_REST:g} times this rest halves"
-            how = times if rest_s is None else f"another {duration_words(rest_s)} would halve"
+            how = times if rest_s is None else f"another {duration_words(rest_s)} would about halve"
             lines.append(f"{name}: {how} the interval of {parameter}")
     return lines
 
