@@ -13,13 +13,32 @@ import yaml
 
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Model
-from selfcal.verbs.plan import Wish, _half_interval, plan, rows_of
+from selfcal.verbs.plan import LEAST, Wish, _half_interval, plan, rows_of
 
 from conftest import case_records, run
 
-PARTS: dict[str, dict[str, Any]] = {
-    "walk": {"hypothesis": "random_walk", "N": 0.03, "K": 4e-3},
-    "markov": {"hypothesis": "gauss_markov", "N": 0.02, "sigma_m": 0.03, "alpha": 0.03},
+#: Truths and wishes. Of the second walk N is drawn from its prior.
+PARTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "walk": (
+        {"hypothesis": "random_walk", "N": 0.03, "K": 4e-3},
+        ("K within 25 %", "N within 5 %", "bias within 0.03 deg/s", "law decided 95 %"),
+    ),
+    "slow walk": (
+        {"hypothesis": "random_walk", "N": 0.02, "K": 8e-4},
+        ("K within 40 %", "N within 3 %", "bias within 0.01 deg/s", "law decided 95 %"),
+    ),
+    "walk, N drawn": (
+        {"hypothesis": "random_walk", "K": 2e-3},
+        ("K within 30 %", "N within 10 %", "bias within 0.3 deg/s", "law decided 95 %"),
+    ),
+    "markov": (
+        {"hypothesis": "gauss_markov", "N": 0.02, "sigma_m": 0.03, "alpha": 0.03},
+        ("sigma_m within 40 %", "alpha within 60 %", "N within 4 %", "law decided 95 %"),
+    ),
+    "constant": (
+        {"hypothesis": "constant", "N": 0.015},
+        ("N within 5 %", "N within 2 %", "bias within 0.001 deg/s", "law decided 80 %"),
+    ),
 }
 
 
@@ -32,31 +51,33 @@ def part(folder: Path, **truth: Any) -> Path:
     return place
 
 
-@pytest.mark.parametrize(
-    ("name", "wants"),
-    [
-        ("walk", ("K within 25 %", "N within 5 %")),
-        ("markov", ("sigma_m within 40 %", "law decided 95 %")),
-    ],
-)
-def test_the_planned_length_suffices(tmp_path: Path, name: str, wants: tuple[str, ...]) -> None:
-    """It is reached in 80 to 97 % of 200 other records; of fewer, three standard deviations of both counts."""
-    if name == "markov" and not case_records(0, 1):
-        pytest.skip("SLOW: make cases")
+@pytest.mark.parametrize("name", PARTS)
+def test_the_planned_length_suffices(tmp_path: Path, name: str) -> None:
+    """It is reached in 80 to 97 % of 200 other records; of fewer, three standard deviations of both counts. By more
+    where records hardly differ, as in N of a constant bias: then a length 3 % shorter is reached by less."""
+    truth, wants = PARTS[name]
+    if not case_records(0, 1):
+        if name != "walk":
+            pytest.skip("SLOW: make cases")
+        wants = wants[:2]
     records = case_records(60, 200)
-    model = part(tmp_path, **PARTS[name])
+    model = part(tmp_path, **truth)
     document = plan(model, want=wants, records=records)
     off = (0.1, 0.07) if records == 200 else (3.0 * math.sqrt(0.09 * 2 / records),) * 2
     loaded = Model.load(model)
+
+    def share(wish: Wish, samples: int) -> float:
+        metric = [rows_of(loaded, "gz", (wish,), samples, 10**6 + 17 * k)[0]["metrics"][0] for k in range(records)]
+        return float((np.array(metric) <= wish.most).mean())
+
     for text, entry in zip(wants, document["wishes"], strict=True):
         wish = Wish.of(text, "deg/s")
         samples = math.ceil(entry["duration_s"] * loaded.bank_rate_hz)
-        metric = np.array(
-            [rows_of(loaded, "gz", (wish,), samples, 10**6 + 17 * k)[0]["metrics"][0] for k in range(records)]
-        )
-        share = float((metric <= wish.most).mean())
-        print(f"{name}, {text}: {entry['duration_s']:.0f} s, reached by {share:.3f}")
-        assert 0.9 - off[0] <= share <= 0.9 + off[1], (text, share)
+        reached = share(wish, samples)
+        print(f"{name}, {text}: {entry['duration_s']:.0f} s, reached by {reached:.3f}")
+        assert reached >= 0.9 - off[0], (text, reached)
+        if reached > 0.9 + off[1] and samples > LEAST:
+            assert share(wish, math.floor(0.97 * samples)) <= 0.9 + off[1], (text, reached)
     assert document["duration_s"] == max(one["duration_s"] for one in document["wishes"])
 
 
@@ -94,7 +115,7 @@ def test_wishes_that_are_none(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path) -> None:
     """A wish that is soon met; its picture, and the JSON."""
-    part(tmp_path, **PARTS["walk"])
+    part(tmp_path, **PARTS["walk"][0])
     given = ("--want", "bias within 0.1 deg/s", "--records", "20", "--plot", "p.png", "--json", "p.json")
     found = run("plan", "part.yaml", *given, cwd=tmp_path)
     assert found.returncode == 0 and "in all: record 64 s at 1 Hz or faster" in found.stdout, found.stderr

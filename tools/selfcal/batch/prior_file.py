@@ -30,8 +30,8 @@ DIGITS = 4
 def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[str, Prior]]:
     """Write the file of `model` with the batch's priors to `path`; return these, by axis and parameter.
 
-    Each axis has own priors of the parameters that the batch identifies. The odds of the laws are those of the axes of
-    the units, with one more of each law. All else is the model's.
+    Each axis has own priors of the parameters that the batch identifies. The odds of the laws are the batch's, of the
+    axes that it has. All else is the model's.
     Raises UserError where the batch has no population.
     """
     tree = read_yaml(model.path, "model file")
@@ -101,10 +101,14 @@ def _of_lots(population: Population, batch: Batch) -> np.ndarray:
 
 
 def _odds(model: Model, batch: Batch) -> dict[str, float]:
-    """Odds of each law: the probabilities of all axes of all units, and one more."""
-    total = dict.fromkeys(model.hypotheses, 1.0)
-    for name in axes_of(batch.devices):
-        for results in sound_of(batch.devices, name).values():
-            for law, probability in results[-1]["hypotheses"].items():
-                total[law] += probability
-    return {law: _rounded(odds) for law, odds in total.items()}
+    """Prior odds of each law, the mean over the model's axes: of one in the batch the share of the units, one more of
+    each law among them; of any other the model's."""
+    there = set(axes_of(batch.devices))
+    total = dict.fromkeys(model.hypotheses, 0.0)
+    for axis in model.axes:
+        share = dict(model.hypotheses)
+        if axis in there:
+            known = [results[-1]["hypotheses"] for results in sound_of(batch.devices, axis).values()]
+            share = {law: (1.0 + sum(one[law] for one in known)) / (len(known) + len(share)) for law in share}
+        total = {law: total[law] + share[law] for law in total}
+    return {law: _rounded(odds / len(model.axes)) for law, odds in total.items()}
