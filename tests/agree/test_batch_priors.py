@@ -21,9 +21,9 @@ from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Model, Prior
 from selfcal.recording import save
 from selfcal.result import HALF_90
+from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import make_tables
 from selfcal.verbs.fleet import fleet
-from selfcal.verbs.montecarlo import draw, simulate_bank_samples
 
 from conftest import COMMAND, ROOT, case_records, worst_difference
 
