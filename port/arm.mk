@@ -5,6 +5,8 @@ NODE_FLAGS := $(if $(filter command%,$(origin NODE)),-DSELFCAL_NODE=$(NODE))
 # whether samples are processed in integers, stand in the selfcal_config.h beside a model.
 ARM_cortex-m4f := -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
 ARM_cortex-m0 := -mcpu=cortex-m0 -mthumb -fconserve-stack
+# What every program for a core is linked with, beside the library: floats in software that are faster than libgcc's.
+ARM_SOURCES_cortex-m0 := port/cortex-m0/soft_float.c
 ARM_WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
 ARM_COMPILE := -std=c99 -ffp-contract=off -fno-math-errno -ffunction-sections -fdata-sections $(ARM_WARNINGS)
 # Every sample, and the cells of a report, run through ARM_FAST. It is compiled for speed, the rest for size: 4 KB

@@ -3,7 +3,8 @@
 
 include port/arm.mk
 
-QEMU_SOURCES := $(wildcard port/replay/*.c port/qemu/*.c) $(APP_WITHOUT_SENSOR) $(MODEL_DIR)/selfcal_model.c
+QEMU_SOURCES := $(wildcard port/replay/*.c port/qemu/*.c) $(APP_WITHOUT_SENSOR) $(ARM_SOURCES_$(CORE)) \
+                $(MODEL_DIR)/selfcal_model.c
 QEMU_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/replay/*.h port/qemu/*.h) \
                 $(MODEL_DIR)/selfcal_model.h $(MODEL_DIR)/selfcal_config.h
 QEMU_BOARD_cortex-m4f := QEMU_NETDUINOPLUS2

@@ -21,18 +21,20 @@ define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
 $(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
 	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $$(@D) --target $(1)
-$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk
+$(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(ARM_SOURCES_$(1)) $(BENCH)/$(1)/selfcal_model.c port/arm.mk \
+                             port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) MODEL_DIR=$$(@D) OUT=$$(@D)/objects
 	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),\
-	    $(filter-out lib/%,$(BENCH_C)) $$(@D)/selfcal_model.c,$$(@D)/objects)
+	    $(filter-out lib/%,$(BENCH_C)) $(ARM_SOURCES_$(1)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.
 $(BENCH)/$(1)/image.elf: LEFT_OUT := module app% more
 $(BENCH)/$(1)/module.elf: LEFT_OUT := bench paper_float more
 $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf: $(BENCH)/$(1)/objects.stamp tests/bench/image.ld
 	$(BENCH_LINK) $(ARM_$(1)) -Wl,-Map=$$(@:.elf=.map),--defsym=$(MAP_$(1)) \
-	    $$(patsubst %,$$(@D)/objects/%.o,$$(filter-out $$(LEFT_OUT),$(notdir $(BENCH_C:.c=)) selfcal_model)) -lm -o $$@
+	    $$(patsubst %,$$(@D)/objects/%.o,$$(filter-out $$(LEFT_OUT),\
+	    $(notdir $(BENCH_C:.c=) $(ARM_SOURCES_$(1):.c=)) selfcal_model)) -lm -o $$@
 endef
 $(eval $(call BENCH_IMAGE,cortex-m4f))
 $(eval $(call BENCH_IMAGE,cortex-m0))
@@ -43,13 +45,14 @@ MORE_regressors := -DSELFCAL_REGRESSORS_MAX=6
 MORE_sums := -DSELFCAL_TERMS_MAX=3 -DBENCH_SUMS
 define BENCH_MORE
 bench-images: $(BENCH)/$(1)/$(2).elf
-$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(BENCH)/$(1)/selfcal_model.c port/arm.mk port/library.mk \
-                        tests/bench/image.ld
+$(BENCH)/$(1)/$(2).elf: $(BENCH_C) $(BENCH_H) $(ARM_SOURCES_$(1)) $(BENCH)/$(1)/selfcal_model.c port/arm.mk \
+                        port/library.mk tests/bench/image.ld
 	@rm -rf $$(@D)/$(2)
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) MODEL_DIR=$$(@D) OUT=$$(@D)/$(2) \
 	    PROGRAM_FLAGS='$(MORE_$(2))'
 	$$(call arm_objects,$(ARM_$(1)) $(MORE_$(2)) -Ilib -I$$(@D),\
-	    $(addprefix tests/bench/,count.c image.c more.c record.c) $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
+	    $(addprefix tests/bench/,count.c image.c more.c record.c) $(ARM_SOURCES_$(1)) \
+	    $(BENCH)/$(1)/selfcal_model.c,$$(@D)/$(2))
 	$(BENCH_LINK) $(ARM_$(1)) -Wl,--defsym=$(MAP_$(1)) $$(@D)/$(2)/*.o -lm -o $$@
 endef
 $(foreach core,cortex-m4f cortex-m0,$(foreach what,plain regressors sums,$(eval $(call BENCH_MORE,$(core),$(what)))))
