@@ -697,33 +697,28 @@ void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t
         return;
     }
     const selfcal_moving_t now = moving_of(node);
-    const selfcal_wide_t beta = (selfcal_wide_t)node->beta;
-    const selfcal_wide_t phi = 1.0 - beta, per_phi = beta > 0.0 ? 1.0 / phi : 1.0;
-    const selfcal_wide_t p_next = (selfcal_wide_t)node->p_inf + (selfcal_wide_t)now.d;
+    const selfcal_real_t beta = node->beta, phi = R(1.0) - beta, per_phi = beta > R(0.0) ? R(1.0) / phi : R(1.0);
+    const selfcal_real_t p_next = node->p_inf + now.d;
     /* The filter holds the prediction for the next interval, phi times the drift now. */
-    view->drift *= per_phi;
-    view->bias_left = ((selfcal_wide_t)node->u_inf + (selfcal_wide_t)now.e - beta) * per_phi;
-    if (phi > 0.03) {
-        view->drift_var = fmax(p_next - (selfcal_wide_t)node->q, 0.0) * per_phi * per_phi;
+    selfcal_real_t drift = per_phi, bias_left = (node->u_inf + now.e - beta) * per_phi, drift_var;
+    if (phi > R(0.03)) {
+        drift_var = r_fmax(p_next - node->q, R(0.0)) * per_phi * per_phi;
     } else {
         /* P' = phi^2 P(now) + q has lost P(now): it is that after a sample, unless a gap has just let it grow. */
-        const bool gap = (selfcal_wide_t)now.d > 1e-3 * (selfcal_wide_t)node->p_inf;
-        view->drift_var = gap ? p_next : p_next / (1.0 + p_next);
-    }
-    if (self->model->block == 1U) {
-        return;
+        drift_var = now.d > R(1e-3) * node->p_inf ? p_next : p_next / (R(1.0) + p_next);
     }
     /* from the point to the end of the interval */
-    if (beta > 0.0) {
+    if (self->model->block > 1U && beta > R(0.0)) {
         const selfcal_averaged_t of = averaged_at(self, place);
-        const selfcal_wide_t over = (selfcal_wide_t)of.now;
-        view->drift *= over;
-        view->bias_left = 1.0 - over * (1.0 - view->bias_left);
-        view->drift_var =
-            over * over * view->drift_var + (selfcal_wide_t)(r_exp(R(2.0) * place.ln_rho) * of.after / of.gain);
-    } else {
-        view->drift_var += (selfcal_wide_t)(node->q * averaged_walk_after(self->model->block));
+        drift *= of.now;
+        bias_left = R(1.0) - of.now * (R(1.0) - bias_left);
+        drift_var = of.now * of.now * drift_var + r_exp(R(2.0) * place.ln_rho) * of.after / of.gain;
+    } else if (self->model->block > 1U) {
+        drift_var += node->q * averaged_walk_after(self->model->block);
     }
+    view->drift *= (selfcal_wide_t)drift;
+    view->bias_left = (selfcal_wide_t)bias_left;
+    view->drift_var = (selfcal_wide_t)drift_var;
 }
 
 void selfcal_bank_view(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {

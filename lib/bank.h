@@ -62,7 +62,8 @@ void selfcal_bank_now(const selfcal_t *self, uint16_t index, selfcal_node_view_t
  * each of several terms gone it is own[0] + 2 sum d_a own[1 + a] + sum d_a d_b own[..], all pairs as selfcal_decay_t
  * has them. */
 typedef struct {
-    selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
+    selfcal_wide_t mean;
+    selfcal_real_t drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_now_t;
 
 /* sigma_v's mode at a node is found by turns, to this part of its square. */

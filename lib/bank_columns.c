@@ -216,7 +216,9 @@ typedef struct {
     /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
     selfcal_wide_t bent;
     selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
-    selfcal_now_t now;
+    struct { /* selfcal_now_t, wide: columns that go together cancel */
+        selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
+    } now;
 } fit_t;
 
 /* a = L D L' of the first `order` rows; D on the diagonal, L (unit) below it. A pivot at or below `least` of its
@@ -478,18 +480,24 @@ static void field_with_columns(const selfcal_work_t *work, uint16_t index, selfc
     result->share = (selfcal_real_t)(beginning * fit.bent);
 }
 
-/* The coefficients' moments go as those of the bias: their means at the nodes about the first node's, and their own
- * variances. */
+/* The coefficients' moments go as those of the bias: their means at the nodes about those of the first in turn, and
+ * their own variances. */
 static void now_with_columns(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *result) {
     normal_t normal;
     fit_t fit;
     make_normal(work->bank, work->axis, (uint16_t)(work->first_node + k), work->mask, &normal);
     make_fit(&normal, variance, &fit);
-    *result = fit.now;
+    result->mean = fit.now.mean;
+    for (size_t t = 0; t < SELFCAL_TERMS_MAX; t++) {
+        result->drift[t] = (selfcal_real_t)fit.now.drift[t];
+    }
+    for (size_t t = 0; t < sizeof result->own / sizeof result->own[0]; t++) {
+        result->own[t] = (selfcal_real_t)fit.now.own[t];
+    }
     selfcal_coefficients_t *of = work->coefficients == NULL ? NULL : &work->coefficients[work->hypothesis];
     for (uint8_t i = 1; of != NULL && i < normal.order; i++) {
         const uint8_t r = normal.regressor[i];
-        if (k == 0U) {
+        if (work->at == 0U) {
             of->mean[r] = (float)fit.mean[i];
             of->moment[0][r] = of->moment[1][r] = of->moment[2][r] = 0.0;
         }
@@ -504,8 +512,8 @@ static void finish_coefficients(const selfcal_work_t *work) {
     selfcal_coefficients_t *of = work->coefficients == NULL ? NULL : &work->coefficients[work->hypothesis];
     for (uint8_t r = 0; of != NULL && r < SELFCAL_REGRESSORS_MAX; r++) {
         if (((unsigned)work->mask >> r & 1U) != 0U) {
-            const selfcal_wide_t mean = of->moment[0][r] / work->bias.weight;
-            const selfcal_wide_t scatter = of->moment[1][r] / work->bias.weight - mean * mean;
+            const selfcal_wide_t mean = of->moment[0][r] / (selfcal_wide_t)work->bias.weight;
+            const selfcal_wide_t scatter = of->moment[1][r] / (selfcal_wide_t)work->bias.weight - mean * mean;
             of->sd[r] = (float)sqrt(fmax(scatter, 0.0) + fmax(of->moment[2][r] / work->sum.mass_sq, 0.0));
             of->mean[r] = (float)((selfcal_wide_t)of->mean[r] + mean);
         }

@@ -356,13 +356,15 @@ typedef struct {
     selfcal_wide_t first[SELFCAL_PARAMETERS], second[SELFCAL_PARAMETERS];
 } selfcal_integral_t;
 
-/* report_bias.c: x0 + drift now, about the first node's. */
+/* report_bias.c: x0 + drift now, about that of the node of most weight: far from it a float's digits would not do. */
 typedef struct {
-    selfcal_wide_t about, weight, first, second;
-    selfcal_wide_t mean_sq; /* of sigma_v^2 over the mode's */
-    selfcal_wide_t own;     /* its variance at the nodes */
+    uint16_t from; /* that node, the first in turn */
+    selfcal_wide_t about;
+    selfcal_real_t weight, first, second;
+    selfcal_real_t mean_sq; /* of sigma_v^2 over the mode's */
+    selfcal_real_t own;     /* its variance at the nodes */
     /* sums of selfcal_decay_t over the nodes of each alpha */
-    selfcal_wide_t decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
+    selfcal_real_t decay[SELFCAL_ALPHA_MAX][2 * SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
 } selfcal_bias_t;
 
 struct selfcal_work {
