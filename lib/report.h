@@ -113,6 +113,7 @@ void selfcal_node_step_values(selfcal_work_t *work);
 /* Expected fields of a filter, and which filter it is. The splines hold the rest. */
 typedef struct {
     selfcal_wide_t profile, ln_sigma, ln_v;
+    selfcal_real_t rho_sq;
     /* |1 - phi e^(i omega)|^2 = beta_sq + phi distance, |1 - psi e^(i omega)|^2 = p_sq + psi distance */
     selfcal_real_t beta_sq, phi, p_sq, psi;
     selfcal_real_t edge, level; /* see report_spectrum.c */
@@ -125,16 +126,19 @@ typedef struct {
 /* 1 - phi of the drift at an alpha; 0 of a random walk. */
 selfcal_real_t selfcal_expected_beta(const selfcal_work_t *work, selfcal_real_t ln_alpha);
 
-/* `beta`: of the alpha. */
+/* `beta`: of the alpha. `passed`: selfcal_expected_passed() there; NULL before the lines are fitted. */
 void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
-                      expectation_t *e);
+                      const selfcal_real_t passed[], expectation_t *e);
 
-/* ln of a node's mean noise over sigma_v: half of ln(1 + truth.noise_less_1) without drift, more beside one that moves
+/* What the drift of one alpha lets pass of each line's power, whatever its rho. */
+void selfcal_expected_passed(const selfcal_work_t *work, selfcal_real_t beta, selfcal_real_t passed[SELFCAL_LINES]);
+
+/* A node's mean variance of the noise over sigma_v^2: 1 + truth.noise_less_1 without drift, more beside one that moves
  * within a block. */
-selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t beta);
+selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t rho_sq, selfcal_real_t beta);
 
 /* The predicted drift variance that a filter converges to, over its sigma_v^2. */
-selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta);
+selfcal_real_t selfcal_expected_settled(selfcal_real_t rho_sq, selfcal_real_t beta);
 
 /* --- spectrum --- */
 
@@ -194,8 +198,11 @@ selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln
 /* The widest ranges of ln rho and ln alpha that the priors permit. */
 void selfcal_cells_limits(selfcal_work_t *work);
 
-/* The row of cells at an alpha; the cell at a rho; ln of the parameters at its conditional mode. */
+/* The row of cells at an alpha, and what goes for a column of nodes as well; the cell at a rho; its white noise, of
+ * which the profile has none as yet; ln of the parameters at its conditional mode. */
 void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha);
+void selfcal_cells_column(selfcal_work_t *work, selfcal_real_t ln_alpha);
+selfcal_real_t selfcal_cells_white(const selfcal_work_t *work, selfcal_real_t rho_sq, cell_t *cell);
 void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_t *cell);
 void selfcal_cells_parameters(const selfcal_work_t *work, const cell_t *cell,
                               selfcal_real_t ln_value[SELFCAL_PARAMETERS]);
@@ -207,7 +214,9 @@ reach_t selfcal_cells_reach(const selfcal_work_t *work, const selfcal_real_t ln_
 
 /* --- search and integral --- */
 
-/* One pass over one of the rows a step; true when all ranges are found. */
+/* One pass over one of the rows a step; true when all ranges are found. Before it begins it is told of each node of the
+ * hypothesis, one column of rho after the other: node `i` of column `j` as a cell. */
+void selfcal_search_node(selfcal_work_t *work, uint16_t i, uint16_t j, const cell_t *cell);
 void selfcal_search_begin(selfcal_work_t *work);
 bool selfcal_search_step(selfcal_work_t *work);
 

@@ -87,10 +87,9 @@ void selfcal_cells_limits(selfcal_work_t *work) {
     }
 }
 
-void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
+void selfcal_cells_column(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     selfcal_cell_row_t *row = &work->scratch.grid.row;
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
-    const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
     row->ln_alpha = ln_alpha;
     row->beta = selfcal_expected_beta(work, ln_alpha);
     row->half_ln_dt = half_ln_dt(work);
@@ -99,6 +98,16 @@ void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     row->noise_sq = hypothesis->law->coloured_noise ? r_exp(R(2.0) * ln_alpha) : R(1.0);
     row->prior = prior_of(work);
     row->drift = drift_parameter(hypothesis->law);
+    if (work->truth.fitted && has_expectation(work)) {
+        selfcal_expected_passed(work, row->beta, row->passed);
+    }
+}
+
+void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    selfcal_cell_row_t *row = &work->scratch.grid.row;
+    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
+    const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
+    selfcal_cells_column(work, ln_alpha);
     uint16_t taps = 1;
     row->basis_first = 0;
     row->basis[0] = R(1.0);
@@ -118,6 +127,14 @@ void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
             row->ln_sigma[i] = r_fma(row->basis[j], work->scratch.grid.spline[1][at], row->ln_sigma[i]);
         }
     }
+}
+
+selfcal_real_t selfcal_cells_white(const selfcal_work_t *work, selfcal_real_t rho_sq, cell_t *cell) {
+    /* N^2/dt = (1 + left) sigma_v^2, so d(ln N) d(ln K) = d(ln sigma_v) d(ln rho)/(1 + left) */
+    const selfcal_real_t left = work->scratch.grid.row.left_out * rho_sq;
+    cell->ln_white = left > R(0.0) ? R(0.5) * r_log1p(left) : R(0.0);
+    cell->profile -= R(2.0) * cell->ln_white;
+    return left;
 }
 
 void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_t *cell) {
@@ -150,13 +167,10 @@ void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_
         cell->ln_sigma -= r_fmax(beyond, R(0.0)) * bank->rho_step[work->hypothesis];
     }
     expectation_t e;
-    selfcal_expected(work, cell->ln_rho, row->ln_alpha, row->beta, &e);
+    selfcal_expected(work, cell->ln_rho, row->ln_alpha, row->beta, row->passed, &e);
     cell->profile += (selfcal_real_t)e.profile;
     cell->ln_sigma += (selfcal_real_t)e.ln_sigma;
-    /* N^2/dt = (1 + left) sigma_v^2, so d(ln N) d(ln K) = d(ln sigma_v) d(ln rho)/(1 + left) */
-    const selfcal_real_t left = row->left_out * r_exp(R(2.0) * ln_rho);
-    cell->ln_white = R(0.5) * r_log1p(left);
-    cell->profile -= R(2.0) * cell->ln_white;
+    const selfcal_real_t left = selfcal_cells_white(work, e.rho_sq, cell);
     cell->off_grid = cell->off_grid || left * row->noise_sq > LEFT_OUT_MOST * (R(1.0) + left);
 }
 

@@ -8,21 +8,15 @@
 #define NAME(name) name
 #define T selfcal_real_t
 #define T_(x) R(x)
-#define T_exp r_exp
-#define T_log1p r_log1p
 #define T_sqrt r_sqrt
 #include "report_expected.h"
 #undef NAME
 #undef T
 #undef T_
-#undef T_exp
-#undef T_log1p
 #undef T_sqrt
 #define NAME(name) name##_wide
 #define T selfcal_wide_t
 #define T_(x) x
-#define T_exp exp
-#define T_log1p log1p
 #define T_sqrt sqrt
 #include "report_expected.h"
 
@@ -34,53 +28,57 @@ static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_al
     return has_pole(work) ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
+void selfcal_expected_passed(const selfcal_work_t *work, selfcal_real_t beta,
+                             selfcal_real_t passed[SELFCAL_LINES]) {
+    const selfcal_truth_t *truth = &work->truth;
+    for (unsigned m = 0; m < truth->lines; m++) {
+        passed[m] = r_fma(R(1.0) - beta, truth->distance[m], beta * beta) * truth->power[m];
+    }
+}
+
 /* Variance that the lines add, and behind them an edge and a level for each three. */
-static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e) {
+static selfcal_real_t fitted(const selfcal_truth_t *truth, const expectation_t *e, const selfcal_real_t passed[]) {
     selfcal_real_t more = R(0.0), ends = R(0.0);
     const selfcal_real_t *end = &truth->power[truth->lines];
     for (unsigned m = 0; m < truth->lines; m++) {
-        const selfcal_real_t distance = truth->distance[m];
-        const selfcal_real_t passed = r_fma(e->phi, distance, e->beta_sq), held_back = r_fma(e->psi, distance, e->p_sq);
         if (m % 3U == 0U) {
             ends = r_fma(e->edge, end[0], e->level * end[1]);
             end += 2;
         }
-        more += r_fma(passed, truth->power[m], ends) / held_back;
+        more += (passed[m] + ends) / r_fma(e->psi, truth->distance[m], e->p_sq);
     }
     return more;
 }
 
-selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t beta) {
+selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t rho_sq, selfcal_real_t beta) {
     const selfcal_real_t less_1 = work->truth.noise_less_1;
     if (less_1 == R(0.0)) {
-        return R(0.0);
+        return R(1.0);
     }
-    const selfcal_real_t q = r_exp(R(2.0) * ln_rho) * (beta > R(0.0) ? beta * (R(2.0) - beta) : R(1.0));
-    const selfcal_real_t lost = selfcal_averaged_lost(q, beta, work->bank->model->block);
-    return R(0.5) * r_log1p(averaged_noise(R(1.0) + less_1, lost) - R(1.0));
+    const selfcal_real_t q = rho_sq * (beta > R(0.0) ? beta * (R(2.0) - beta) : R(1.0));
+    return averaged_noise(R(1.0) + less_1, selfcal_averaged_lost(q, beta, work->bank->model->block));
 }
 
-/* `beta`: selfcal_expected_beta() the alpha. */
 void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
-                      expectation_t *e) {
+                      const selfcal_real_t passed[], expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
+    memset(e, 0, sizeof *e);
+    e->rho_sq = r_exp(R(2.0) * ln_rho);
     if (!has_expectation(work)) {
-        memset(e, 0, sizeof *e);
         return;
     }
-    e->profile = e->ln_sigma = e->ln_v = 0.0;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
     expected_t real;
-    const selfcal_real_t ln_noise = selfcal_expected_noise(work, ln_rho, beta);
-    ln_rho -= ln_noise;
+    const selfcal_real_t noise = selfcal_expected_noise(work, e->rho_sq, beta);
     if (truth->wide) {
-        wide = expected_wide((selfcal_wide_t)ln_rho, beta_wide(work, ln_alpha), truth);
+        wide = expected_wide(exp(2.0 * (selfcal_wide_t)ln_rho) / (selfcal_wide_t)noise, beta_wide(work, ln_alpha),
+                             truth);
         real.v_less_1 = (selfcal_real_t)wide.v_less_1;
         real.gain = (selfcal_real_t)wide.gain;
         real.p = (selfcal_real_t)wide.p;
     } else {
-        real = expected(ln_rho, beta, truth);
+        real = expected(e->rho_sq / noise, beta, truth);
     }
     const selfcal_real_t h = real.gain / real.p;
     e->beta_sq = beta * beta;
@@ -90,7 +88,7 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
     e->edge = real.gain * h / (R(2.0) - real.p);
     e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
     e->per_v = R(1.0) / (R(1.0) + real.v_less_1);
-    const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
+    const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e, passed), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
     if (truth->wide) { /* digits below 1e-16 do not matter here, and log1p takes 1 KB of flash */
         e->ln_v = log(1.0 + (wide.v_less_1 + (selfcal_wide_t)more));
         e->ln_sigma = 0.5 * (e->ln_v - log(1.0 + wide.s_less_1));
@@ -101,9 +99,11 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
         e->ln_sigma = (selfcal_wide_t)(R(0.5) * (ln_v - r_log1p(real.s_less_1)));
         e->profile = (selfcal_wide_t)(R(-0.5) * n * (ln_v - (selfcal_real_t)truth->ln_v));
     }
-    e->ln_sigma -= (selfcal_wide_t)ln_noise;
+    if (noise != R(1.0)) {
+        e->ln_sigma -= (selfcal_wide_t)(R(0.5) * r_log(noise));
+    }
 }
 
-selfcal_real_t selfcal_expected_settled(selfcal_real_t ln_rho, selfcal_real_t beta) {
-    return settled(ln_rho, beta);
+selfcal_real_t selfcal_expected_settled(selfcal_real_t rho_sq, selfcal_real_t beta) {
+    return settled(rho_sq, beta);
 }

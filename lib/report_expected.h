@@ -6,11 +6,11 @@ typedef struct {
     T gain, p;  /* phi K; 1 - psi */
 } NAME(expected_t);
 
-/* The predicted drift variance that the filter of (rho, 1 - phi = beta), a random walk with a beta of 0, converges to,
+/* The predicted drift variance that the filter of (rho^2, 1 - phi = beta), a random walk with a beta of 0, converges to,
  * over its sigma_v^2. */
-static T NAME(settled)(T ln_rho, T beta) {
+static T NAME(settled)(T rho_sq, T beta) {
     const T one_less_phi_sq = beta * (T_(2.0) - beta);
-    const T q = T_exp(T_(2.0) * ln_rho) * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));
+    const T q = rho_sq * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));
     const T b = one_less_phi_sq - q;
     const T root = T_sqrt(b * b + T_(4.0) * q);
     return b > T_(0.0) ? T_(2.0) * q / (b + root) : T_(0.5) * (root - b);
@@ -19,8 +19,8 @@ static T NAME(settled)(T ln_rho, T beta) {
 /* That filter over white noise and a first-order drift of deviation sqrt(truth->variance) and pole 1 - truth->rate. Its
  * innovations are (1 - phi B)/(1 - psi B) y with psi = phi (1 - K), B the delay; their variance is that of an ARMA(2,1)
  * process, here written so that nothing cancels when the poles are close to 1. */
-static NAME(expected_t) NAME(expected)(T ln_rho, T beta, const selfcal_truth_t *truth) {
-    const T p_inf = NAME(settled)(ln_rho, beta);
+static NAME(expected_t) NAME(expected)(T rho_sq, T beta, const selfcal_truth_t *truth) {
+    const T p_inf = NAME(settled)(rho_sq, beta);
     const T gain = (T_(1.0) - beta) * p_inf / (T_(1.0) + p_inf);
     const T p = gain + beta;
     const T c = (T)truth->rate;

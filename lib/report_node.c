@@ -137,13 +137,23 @@ void selfcal_node_step_truth(selfcal_work_t *work) {
 /* The node values less their expectation. */
 void selfcal_node_step_values(selfcal_work_t *work) {
     const uint16_t nodes = nodes_of(work);
-    for (uint16_t k = step_part(work, STEP_VALUES, nodes); k < work->at; k++) {
+    const uint16_t rows = grid_nodes(hypothesis_of(work)->rho), columns = grid_nodes(hypothesis_of(work)->alpha);
+    for (uint16_t at = step_part(work, STEP_VALUES, nodes); at < work->at; at++) {
+        const uint16_t i = at % rows, j = at / rows, k = (uint16_t)(i * columns + j);
         const selfcal_place_t place = place_of(work, k);
+        const selfcal_cell_row_t *row = &work->scratch.grid.row;
         selfcal_real_t *profile = &work->field[0][work->first_node + k],
                        *ln_sigma = &work->field[1][work->first_node + k];
+        if (i == 0U) {
+            selfcal_cells_column(work, place.ln_alpha);
+        }
         expectation_t e;
-        selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), &e);
-        *profile = (selfcal_real_t)((selfcal_wide_t)(*profile - work->peak) - e.profile);
-        *ln_sigma = (selfcal_real_t)((selfcal_wide_t)*ln_sigma + 0.5 * work->ln_top - e.ln_sigma);
+        selfcal_expected(work, place.ln_rho, place.ln_alpha, row->beta, row->passed, &e);
+        const selfcal_wide_t ln_mode = (selfcal_wide_t)*ln_sigma + 0.5 * work->ln_top;
+        cell_t cell = {.ln_rho = place.ln_rho, .profile = *profile - work->peak, .ln_sigma = (selfcal_real_t)ln_mode};
+        *profile = (selfcal_real_t)((selfcal_wide_t)cell.profile - e.profile);
+        *ln_sigma = (selfcal_real_t)(ln_mode - e.ln_sigma);
+        (void)selfcal_cells_white(work, e.rho_sq, &cell);
+        selfcal_search_node(work, i, j, &cell);
     }
 }

@@ -2,7 +2,7 @@
  *
  * A row's cells reach from where the likelihood begins to count to where it ends, and so do the rows. Either range is
  * found by passes of few samples: each shrinks it to those that count and one more, or lets it grow where the last one
- * counts. */
+ * counts. The nodes say where to begin: their heights are known. */
 #include "report.h"
 
 /* ln-likelihood below a row's peak, or a row's peak below the best, at which a cell or row no longer counts: 4.9 sd of
@@ -53,15 +53,23 @@ static bool next_range(selfcal_range_t *range, const selfcal_real_t height[SAMPL
     return true;
 }
 
-/* Height of a cell's middle at the sigma_v that the limits leave. The search keeps the best of all, which the sums are
+/* Height of a cell's middle at the sigma_v that the limits leave. */
+static selfcal_real_t height_of(const selfcal_work_t *work, const cell_t *cell, selfcal_real_t ln_value[],
+                                reach_t *reach) {
+    selfcal_real_t half[2] = {R(0.0), R(0.0)};
+    selfcal_cells_parameters(work, cell, ln_value);
+    *reach = selfcal_cells_reach(work, ln_value, half);
+    return cell->profile - reach->drop;
+}
+
+/* The same, and the search keeps the best of all, which the sums are
  * counted from. */
 static selfcal_real_t height_at(selfcal_work_t *work, selfcal_real_t ln_rho) {
     cell_t cell;
-    selfcal_real_t ln_value[SELFCAL_PARAMETERS], half[2] = {R(0.0), R(0.0)};
+    reach_t reach;
+    selfcal_real_t ln_value[SELFCAL_PARAMETERS];
     selfcal_cells_make(work, ln_rho, &cell);
-    selfcal_cells_parameters(work, &cell, ln_value);
-    const reach_t reach = selfcal_cells_reach(work, ln_value, half);
-    const selfcal_real_t height = cell.profile - reach.drop;
+    const selfcal_real_t height = height_of(work, &cell, ln_value, &reach);
     if (work->search.best == (selfcal_real_t)-INFINITY) {
         work->sigma.drop[work->hypothesis] = reach.drop; /* until a cell counts: whether the priors exclude it */
     }
@@ -147,6 +155,95 @@ static void widen_row(selfcal_work_t *work) {
     range->hi = r_fmin(range->hi + more, work->search.limit_hi[0]);
 }
 
+static selfcal_real_t depth_of(const selfcal_work_t *work) {
+    return DEPTH + DEPTH_OF_SHORT / work->n_eff;
+}
+
+/* From the node before the first that counts to the node after the last; without end where there is none. */
+static selfcal_range_t counted(const selfcal_real_t height[], selfcal_real_t least, unsigned nodes, selfcal_real_t lo,
+                               selfcal_real_t step) {
+    unsigned first = 0, end = nodes;
+    while (first < nodes && !(height[first] > least)) {
+        first++;
+    }
+    while (end > first && !(height[end - 1U] > least)) {
+        end--;
+    }
+    selfcal_range_t range = {-INFINITY, INFINITY};
+    if (first > 0U && first < nodes) {
+        range.lo = r_fma(step, (selfcal_real_t)(first - 1U), lo);
+    }
+    if (end > first && end < nodes) {
+        range.hi = r_fma(step, (selfcal_real_t)end, lo);
+    }
+    return range;
+}
+
+void selfcal_search_node(selfcal_work_t *work, uint16_t i, uint16_t j, const cell_t *cell) {
+    const selfcal_grid_t *rho = hypothesis_of(work)->rho;
+    if (rho == NULL) {
+        return;
+    }
+    reach_t reach;
+    selfcal_real_t ln_value[SELFCAL_PARAMETERS], *height = work->scratch.grid.row.profile;
+    height[i] = height_of(work, cell, ln_value, &reach);
+    height[i] = height[i] > (selfcal_real_t)-INFINITY ? height[i] : (selfcal_real_t)-INFINITY; /* nor NaN */
+    if (i + 1U == rho->nodes) {
+        selfcal_node_column_t *column = &work->scratch.grid.column[j];
+        column->height = -INFINITY;
+        for (unsigned k = 0; k < rho->nodes; k++) {
+            column->height = r_fmax(column->height, height[k]);
+        }
+        column->range = counted(height, column->height - depth_of(work), rho->nodes,
+                                work->bank->rho_lo[work->hypothesis], work->bank->rho_step[work->hypothesis]);
+    }
+}
+
+static void limit(const selfcal_work_t *work, unsigned dimension, selfcal_range_t *range) {
+    const selfcal_range_t all = {work->search.limit_lo[dimension], work->search.limit_hi[dimension]};
+    range->lo = r_fmax(range->lo, all.lo);
+    range->hi = r_fmin(range->hi, all.hi);
+    if (!(range->lo < range->hi)) {
+        *range = all;
+    }
+}
+
+/* A row of the first pass is looked for where it counts in the columns of nodes beside it. */
+static void begin_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
+    const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
+    const selfcal_node_column_t *column = work->scratch.grid.column, *other = column;
+    if (alpha != NULL) {
+        const selfcal_real_t z = (ln_alpha - work->bank->alpha_lo[work->hypothesis]) /
+                                 work->bank->alpha_step[work->hypothesis];
+        const unsigned last = alpha->nodes - 2U;
+        column += z > R(0.0) ? (z < (selfcal_real_t)last ? (unsigned)z : last) : 0U;
+        other = column + 1;
+    }
+    selfcal_range_t *range = &work->search.range[0];
+    range->lo = r_fmin(column->range.lo, other->range.lo);
+    range->hi = r_fmax(column->range.hi, other->range.hi);
+    limit(work, 0, range);
+    work->search.open = true;
+}
+
+/* Likewise the rows. */
+static void begin_rows(selfcal_work_t *work) {
+    const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
+    selfcal_range_t *range = &work->search.range[1];
+    range->lo = -INFINITY;
+    range->hi = INFINITY;
+    if (alpha != NULL) {
+        selfcal_real_t height[SELFCAL_ALPHA_MAX], best = (selfcal_real_t)-INFINITY;
+        for (unsigned j = 0; j < alpha->nodes; j++) {
+            height[j] = work->scratch.grid.column[j].height;
+            best = r_fmax(best, height[j]);
+        }
+        *range = counted(height, best - depth_of(work), alpha->nodes, work->bank->alpha_lo[work->hypothesis],
+                         work->bank->alpha_step[work->hypothesis]);
+    }
+    limit(work, 1, range);
+}
+
 static void begin_pass(selfcal_work_t *work) {
     work->row = 0;
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
@@ -157,9 +254,8 @@ static void begin_pass(selfcal_work_t *work) {
 
 void selfcal_search_begin(selfcal_work_t *work) {
     selfcal_cells_limits(work);
-    work->search.range[1].lo = work->search.limit_lo[1];
-    work->search.range[1].hi = work->search.limit_hi[1];
-    work->search.depth = DEPTH + DEPTH_OF_SHORT / work->n_eff;
+    begin_rows(work);
+    work->search.depth = depth_of(work);
     work->search.best = -INFINITY;
     work->search.least[0] = 1;
     work->search.pass = 0;
@@ -187,9 +283,7 @@ bool selfcal_search_step(selfcal_work_t *work) {
     if (work->at == 0U) {
         const selfcal_real_t ln_alpha = rows ? sample_at(range, work->row) : R(0.0);
         if (work->search.pass == 0U) {
-            work->search.range[0].lo = work->search.limit_lo[0]; /* nothing is known yet: a row may have two peaks */
-            work->search.range[0].hi = work->search.limit_hi[0];
-            work->search.open = false;
+            begin_row(work, ln_alpha);
         } else {
             widen_row(work);
         }

@@ -107,7 +107,8 @@ static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const bool pole = has_pole(work);
     const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
-    const selfcal_real_t variance = r_exp(R(2.0) * (place.ln_rho - selfcal_expected_noise(work, place.ln_rho, beta)));
+    const selfcal_real_t rho_sq = r_exp(R(2.0) * place.ln_rho);
+    const selfcal_real_t variance = rho_sq / selfcal_expected_noise(work, rho_sq, beta);
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
     selfcal_truth_t *truth = &work->truth;
@@ -165,16 +166,16 @@ static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t
     while (too_slow(work, e, scatter)) {
         work->truth.rate += work->truth.rate;
         work->truth.variance *= R(0.5);
-        selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), e);
+        selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), NULL, e);
     }
 }
 
 /* What gaps and uneven noise add to ln_s of a node, beyond 8 nats as the filters settle and as much for some gaps. */
 static void count_missed(selfcal_work_t *work, uint16_t k, selfcal_place_t place) {
     const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
-    const selfcal_real_t ln_noise = selfcal_expected_noise(work, place.ln_rho, beta);
-    const selfcal_real_t s_less_1 = selfcal_expected_settled(place.ln_rho - ln_noise, beta);
-    const selfcal_real_t ln_s = (selfcal_real_t)work->bank->weight * r_fma(R(2.0), ln_noise, r_log1p(s_less_1));
+    const selfcal_real_t rho_sq = r_exp(R(2.0) * place.ln_rho), noise = selfcal_expected_noise(work, rho_sq, beta);
+    const selfcal_real_t s_less_1 = selfcal_expected_settled(rho_sq / noise, beta);
+    const selfcal_real_t ln_s = (selfcal_real_t)work->bank->weight * (r_log1p(noise - R(1.0)) + r_log1p(s_less_1));
     selfcal_node_view_t node;
     selfcal_bank_ln_s(work->bank, k, &node);
     work->truth.missed = r_fmax(work->truth.missed, r_fabs((selfcal_real_t)node.ln_s - ln_s) - R(16.0));
@@ -196,7 +197,7 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
     }
     const selfcal_real_t scatter = work->scratch.fit.scatter[k];
     expectation_t e;
-    selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), &e);
+    selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), NULL, &e);
     /* What the priors of bias and coefficients add is no function of psi. */
     const selfcal_wide_t off = (selfcal_wide_t)scatter - e.ln_sigma;
     if (at == 0U) {

@@ -329,12 +329,19 @@ typedef struct {
     selfcal_real_t left_out, noise_sq; /* white_left_out(); the square of the ratio of coloured noise, else 1 */
     const selfcal_prior_t *prior;      /* of the hypothesis on the axis */
     selfcal_parameter_t drift;         /* which parameter goes with rho */
+    selfcal_real_t passed[SELFCAL_LINES]; /* selfcal_expected_passed() */
 } selfcal_cell_row_t;
 
 /* Where in ln rho or ln alpha the likelihood counts. */
 typedef struct {
     selfcal_real_t lo, hi;
 } selfcal_range_t;
+
+/* Nodes of one alpha: where they count, a node beyond either way, and the highest. */
+typedef struct {
+    selfcal_range_t range;
+    selfcal_real_t height;
+} selfcal_node_column_t;
 
 #define SELFCAL_SEARCH_SAMPLES 8 /* of one search pass */
 typedef struct {
@@ -403,6 +410,7 @@ struct selfcal_work {
             selfcal_real_t delta_expm1[SELFCAL_SIGMA_CELLS], delta_weight[SELFCAL_SIGMA_CELLS];
             selfcal_range_t found[SELFCAL_SEARCH_SAMPLES]; /* the rows of the search, and how high they are, ln */
             selfcal_real_t height[SELFCAL_SEARCH_SAMPLES];
+            selfcal_node_column_t column[SELFCAL_ALPHA_MAX];
             uint8_t least[SELFCAL_SEARCH_SAMPLES];
             /* of N and the drift parameter, sigma_v at its mode, where no limit cuts it */
             selfcal_real_t modes[2][SELFCAL_HISTOGRAM + 2];
