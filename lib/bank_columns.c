@@ -216,7 +216,7 @@ typedef struct {
     /* tr U^2 + 2 h' U h, h what `noise` is the square of: what the curvature in ln sigma_v lacks of n */
     selfcal_wide_t bent;
     selfcal_wide_t mean[UNKNOWNS_MAX], var[UNKNOWNS_MAX]; /* of the unknowns, given node and sigma_v */
-    struct { /* selfcal_now_t, wide: columns that go together cancel */
+    struct {                                              /* selfcal_now_t, wide: columns that go together cancel */
         selfcal_wide_t mean, drift[SELFCAL_TERMS_MAX], own[1 + SELFCAL_TERMS_MAX + SELFCAL_TERM_PAIRS];
     } now;
 } fit_t;

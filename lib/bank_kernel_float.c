@@ -142,13 +142,14 @@ void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c) {
 
 void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
     const selfcal_node_t *node = &self->node[k / self->model->axes];
-    *b = sum_value(self->b[k]);
-    *c = sum_value(self->c[k]);
+    selfcal_sum_t of_b = self->b[k], of_c = self->c[k];
     if (node->level) {
-        const selfcal_wide_t per_s = 1.0 / (1.0 + (selfcal_wide_t)node->p_inf), u = (selfcal_wide_t)node->u_inf;
-        *c *= per_s;
-        *b *= u > 0.0 ? u * per_s : 1.0;
+        const selfcal_sum_t per_s = one_over_1_and(node->p_inf), u = {node->u_inf, R(0.0)};
+        of_c = two_product(of_c, per_s);
+        of_b = u.hi > R(0.0) ? two_product(of_b, two_product(u, per_s)) : of_b;
     }
+    *b = sum_value(of_b);
+    *c = sum_value(of_c);
     *x = (selfcal_wide_t)self->x[k];
 }
 

@@ -38,9 +38,9 @@ static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_vi
         selfcal_real_t stationary = square / gain;
         if (sum) { /* a walk does not decay: its psi is 0 */
             const selfcal_term_t *term = &law->term[a];
-            stationary = term->kind == SELFCAL_WALK ? R(0.0)
-                                                    : (selfcal_real_t)markov_variance(
-                                                          law, term, (selfcal_wide_t)square, second, dt_s);
+            stationary = term->kind == SELFCAL_WALK
+                             ? R(0.0)
+                             : (selfcal_real_t)markov_variance(law, term, (selfcal_wide_t)square, second, dt_s);
         }
         const selfcal_real_t weighed_fall = weight * now->drift[a];
         selfcal_real_t with_all = R(0.0);
@@ -134,7 +134,8 @@ void selfcal_bias_finish(const selfcal_work_t *work, selfcal_posterior_t *poster
         }
         for (size_t a = 0; a < SELFCAL_TERMS_MAX; a++) {
             posterior->decay[j].mean[a] = (float)(decay[a] * per_weight);
-            posterior->decay[j].var[a] = (float)((decay[SELFCAL_TERMS_MAX + a] + R(2.0) * mean * decay[a]) * per_weight);
+            posterior->decay[j].var[a] =
+                (float)((decay[SELFCAL_TERMS_MAX + a] + R(2.0) * mean * decay[a]) * per_weight);
         }
         for (size_t a = 0; a < SELFCAL_TERM_PAIRS; a++) {
             posterior->decay[j].var_sq[a] = (float)(decay[(size_t)2 * SELFCAL_TERMS_MAX + a] * per_weight);

@@ -4,9 +4,11 @@
 
 /* A range has two thirds of the cells, which are 0.6 sd of a normal one wide if all are 24; more if it is wider than
  * 6.4 nepers, since moments of the parameters themselves need them narrower than 0.4. One row alone has twice as many:
- * no other evens out what a limit cuts off in it. */
+ * no other evens out what a limit cuts off in it. Of rows five sixths will do: at their ends alpha's moments are known
+ * better than by the midpoint rule. */
 #define CELLS_LEAST ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.0) / R(3.0)))
 #define CELLS_PER_NEPER ((selfcal_real_t)SELFCAL_REPORT_CELLS * (R(2.5) / R(24.0)))
+#define ROWS_PER_CELLS (R(5.0) / R(6.0))
 #define ROWS_MOST (SELFCAL_HISTOGRAM < 255U ? SELFCAL_HISTOGRAM : 255U) /* of alpha a bin is a row */
 
 uint8_t selfcal_cells_for_peak(const selfcal_real_t height[], selfcal_real_t least, uint8_t on_two) {
@@ -17,7 +19,7 @@ uint8_t selfcal_cells_for_peak(const selfcal_real_t height[], selfcal_real_t lea
     if (count == 2U) {
         return on_two;
     }
-    return count > 2U ? 16U : 64U;
+    return count > 2U ? 13U : 64U;
 }
 
 uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension) {
@@ -26,7 +28,8 @@ uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension) {
         return 1U;
     }
     const selfcal_range_t *range = &work->search.range[dimension];
-    const selfcal_real_t wanted = r_fmax(CELLS_PER_NEPER * (range->hi - range->lo), CELLS_LEAST);
+    const selfcal_real_t wanted =
+        (dimension == 0U ? R(1.0) : ROWS_PER_CELLS) * r_fmax(CELLS_PER_NEPER * (range->hi - range->lo), CELLS_LEAST);
     unsigned cells = wanted < (selfcal_real_t)SELFCAL_REPORT_CELLS ? (unsigned)wanted : SELFCAL_REPORT_CELLS;
     if (hypothesis->alpha == NULL) {
         cells = 2U * SELFCAL_REPORT_CELLS;

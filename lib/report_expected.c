@@ -28,8 +28,7 @@ static selfcal_wide_t beta_wide(const selfcal_work_t *work, selfcal_real_t ln_al
     return has_pole(work) ? -expm1(-exp((selfcal_wide_t)ln_alpha) * (selfcal_wide_t)work->bank->model->dt_s) : 0.0;
 }
 
-void selfcal_expected_passed(const selfcal_work_t *work, selfcal_real_t beta,
-                             selfcal_real_t passed[SELFCAL_LINES]) {
+void selfcal_expected_passed(const selfcal_work_t *work, selfcal_real_t beta, selfcal_real_t passed[SELFCAL_LINES]) {
     const selfcal_truth_t *truth = &work->truth;
     for (unsigned m = 0; m < truth->lines; m++) {
         passed[m] = r_fma(R(1.0) - beta, truth->distance[m], beta * beta) * truth->power[m];
@@ -72,8 +71,8 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
     expected_t real;
     const selfcal_real_t noise = selfcal_expected_noise(work, e->rho_sq, beta);
     if (truth->wide) {
-        wide = expected_wide(exp(2.0 * (selfcal_wide_t)ln_rho) / (selfcal_wide_t)noise, beta_wide(work, ln_alpha),
-                             truth);
+        wide =
+            expected_wide(exp(2.0 * (selfcal_wide_t)ln_rho) / (selfcal_wide_t)noise, beta_wide(work, ln_alpha), truth);
         real.v_less_1 = (selfcal_real_t)wide.v_less_1;
         real.gain = (selfcal_real_t)wide.gain;
         real.p = (selfcal_real_t)wide.p;
@@ -88,7 +87,8 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
     e->edge = real.gain * h / (R(2.0) - real.p);
     e->level = h * h * beta / r_fma(n, beta, R(2.0) * h);
     e->per_v = R(1.0) / (R(1.0) + real.v_less_1);
-    const selfcal_real_t more = truth->fitted ? r_fmax(fitted(truth, e, passed), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
+    const selfcal_real_t more =
+        truth->fitted ? r_fmax(fitted(truth, e, passed), R(-0.99) * (R(1.0) + real.v_less_1)) : R(0.0);
     if (truth->wide) { /* digits below 1e-16 do not matter here, and log1p takes 1 KB of flash */
         e->ln_v = log(1.0 + (wide.v_less_1 + (selfcal_wide_t)more));
         e->ln_sigma = 0.5 * (e->ln_v - log(1.0 + wide.s_less_1));

@@ -6,8 +6,8 @@ typedef struct {
     T gain, p;  /* phi K; 1 - psi */
 } NAME(expected_t);
 
-/* The predicted drift variance that the filter of (rho^2, 1 - phi = beta), a random walk with a beta of 0, converges to,
- * over its sigma_v^2. */
+/* The predicted drift variance that the filter of (rho^2, 1 - phi = beta) converges to, over its sigma_v^2. Of a random
+ * walk beta is 0. */
 static T NAME(settled)(T rho_sq, T beta) {
     const T one_less_phi_sq = beta * (T_(2.0) - beta);
     const T q = rho_sq * (beta > T_(0.0) ? one_less_phi_sq : T_(1.0));

@@ -301,11 +301,6 @@ void selfcal_integral_step(selfcal_work_t *work) {
         work->sum.second[p] += (selfcal_wide_t)part.sum.second[j];
     }
     if (hypothesis->alpha != NULL) {
-        const selfcal_wide_t dev =
-            expm1((selfcal_wide_t)row->ln_alpha - (selfcal_wide_t)work->search.best_ln[SELFCAL_ALPHA]);
-        const selfcal_wide_t weighed = (selfcal_wide_t)part.sum.mass * dev;
-        work->sum.first[SELFCAL_ALPHA] += weighed;
-        work->sum.second[SELFCAL_ALPHA] += weighed * dev;
         work->scratch.grid.histogram[SELFCAL_ALPHA][work->row] +=
             part.sum.mass / cell_weight(work->sum.rows, work->row);
     }

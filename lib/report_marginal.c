@@ -177,12 +177,56 @@ static void add_modes(selfcal_work_t *work, unsigned p) {
     }
 }
 
+/* First and second moment of alpha about the best, relative, from the masses of its rows. The midpoint rule errs by
+ * step^2/24 of the slope at an end that the limits cut, of mass times deviation. Three rows give mass and slope there;
+ * the deviation's is known, and counts where the mass is even enough to be continued. */
+static void alpha_moments(const selfcal_work_t *work, selfcal_real_t moment[2]) {
+    const selfcal_real_t step = selfcal_histogram_step(work, SELFCAL_ALPHA), lo = work->sum.range_lo[SELFCAL_ALPHA],
+                         best = work->search.best_ln[SELFCAL_ALPHA],
+                         *mass = work->scratch.grid.histogram[SELFCAL_ALPHA];
+    static const selfcal_real_t of_slope[3] = {R(2.0) / R(24.0), R(-3.0) / R(24.0), R(1.0) / R(24.0)};
+    const unsigned rows = work->sum.rows;
+    moment[0] = moment[1] = R(0.0);
+    bool even[2];
+    for (unsigned end = 0; end < 2U; end++) {
+        const selfcal_real_t *m = end == 0U ? mass : &mass[rows - 1U];
+        const ptrdiff_t next = end == 0U ? 1 : -1;
+        even[end] = false;
+        if (rows > 2U) {
+            const selfcal_real_t there = (R(15.0) * m[0] - R(10.0) * m[next] + R(3.0) * m[2 * next]) / R(8.0);
+            even[end] = there > R(0.5) * m[0] && there < R(2.0) * m[0];
+            if (even[end]) {
+                const selfcal_real_t dev = r_expm1((end == 0U ? lo : work->sum.range_hi[SELFCAL_ALPHA]) - best),
+                                     slope = of_slope[0] * m[0] + of_slope[1] * m[next] + of_slope[2] * m[2 * next],
+                                     steep = (end == 0U ? -step : step) * there * (R(1.0) + dev) / R(24.0);
+                moment[0] += slope * dev + steep;
+                moment[1] += (slope * dev + R(2.0) * steep) * dev;
+            }
+        }
+    }
+    for (unsigned i = 0; i < rows; i++) {
+        const selfcal_real_t dev = r_expm1(lo + ((selfcal_real_t)i + R(0.5)) * step - best);
+        selfcal_real_t weight = mass[i];
+        for (unsigned end = 0; end < 2U; end++) {
+            const unsigned from_end = end == 0U ? i : rows - 1U - i;
+            if (!even[end] && rows > 2U && from_end < 3U) {
+                weight = r_fma(of_slope[from_end], mass[i], weight);
+            }
+        }
+        moment[0] = r_fma(weight, dev, moment[0]);
+        moment[1] = r_fma(weight * dev, dev, moment[1]);
+    }
+}
+
 void selfcal_histogram_estimate(selfcal_work_t *work, unsigned p, selfcal_estimate_t *estimate) {
     const selfcal_prior_t *prior = &prior_of(work)[p];
-    const selfcal_real_t centre = r_exp(work->search.best_ln[p]),
-                         mean = (selfcal_real_t)(work->sum.first[p] / work->sum.mass);
-    const selfcal_real_t variance =
-        r_fmax(r_fma(-mean, mean, (selfcal_real_t)(work->sum.second[p] / work->sum.mass)), R(0.0));
+    selfcal_real_t moment[2] = {(selfcal_real_t)work->sum.first[p], (selfcal_real_t)work->sum.second[p]};
+    if (p == SELFCAL_ALPHA) {
+        alpha_moments(work, moment);
+    }
+    const selfcal_real_t per_mass = R(1.0) / (selfcal_real_t)work->sum.mass;
+    const selfcal_real_t centre = r_exp(work->search.best_ln[p]), mean = moment[0] * per_mass;
+    const selfcal_real_t variance = r_fmax(r_fma(-mean, mean, moment[1] * per_mass), R(0.0));
     const selfcal_real_t step = selfcal_histogram_step(work, p);
     selfcal_real_t mass = R(0.0), total = R(0.0), ln_first = R(0.0), ln_second = R(0.0);
     for (int bin = 0; bin < SELFCAL_HISTOGRAM && p != SELFCAL_ALPHA; bin++) {

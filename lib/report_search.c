@@ -213,8 +213,8 @@ static void begin_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
     const selfcal_node_column_t *column = work->scratch.grid.column, *other = column;
     if (alpha != NULL) {
-        const selfcal_real_t z = (ln_alpha - work->bank->alpha_lo[work->hypothesis]) /
-                                 work->bank->alpha_step[work->hypothesis];
+        const selfcal_real_t z =
+            (ln_alpha - work->bank->alpha_lo[work->hypothesis]) / work->bank->alpha_step[work->hypothesis];
         const unsigned last = alpha->nodes - 2U;
         column += z > R(0.0) ? (z < (selfcal_real_t)last ? (unsigned)z : last) : 0U;
         other = column + 1;

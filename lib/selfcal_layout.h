@@ -36,9 +36,6 @@ typedef struct {
 /* Most samples that a span has head-room for. */
 #define SELFCAL_BATCH_ROOM 16
 
-/* Cells that one step of a report sums. As a rule all floats are software here. */
-#define SELFCAL_STEP_CELLS 10U
-
 /* The build, for a snapshot: bytes of a real, and 32 for integers. */
 #define SELFCAL_ARITHMETIC 32U
 
@@ -69,7 +66,6 @@ typedef struct {
 
 #define SELFCAL_STATE_SUMS 0U
 #define SELFCAL_BATCH_ROOM 64
-#define SELFCAL_STEP_CELLS 16U
 #define SELFCAL_ARITHMETIC sizeof(selfcal_real_t)
 
 /* Kernels in selfcal_real_t take the batch as it is. */
@@ -275,6 +271,7 @@ struct selfcal_former {
      : SELFCAL_REPORT_QUALITY == 1 ? (module)                                                                          \
      : SELFCAL_REPORT_QUALITY == 2 ? (host)                                                                            \
                                    : (reference))
+#define SELFCAL_STEP_CELLS 16U /* that one step of a report sums */
 #define SELFCAL_REPORT_CELLS SELFCAL_BY_QUALITY(16, 24, 80, 192)
 #define SELFCAL_SIGMA_CELLS SELFCAL_BY_QUALITY(8, 24, 48, 96)
 #define SELFCAL_HISTOGRAM SELFCAL_BY_QUALITY(32, 64, 128, 512)
@@ -326,9 +323,9 @@ typedef struct {
     selfcal_real_t basis[6]; /* of alpha */
     uint8_t basis_first;
     selfcal_real_t ln_alpha, beta, shift, half_ln_dt;
-    selfcal_real_t left_out, noise_sq; /* white_left_out(); the square of the ratio of coloured noise, else 1 */
-    const selfcal_prior_t *prior;      /* of the hypothesis on the axis */
-    selfcal_parameter_t drift;         /* which parameter goes with rho */
+    selfcal_real_t left_out, noise_sq;    /* white_left_out(); the square of the ratio of coloured noise, else 1 */
+    const selfcal_prior_t *prior;         /* of the hypothesis on the axis */
+    selfcal_parameter_t drift;            /* which parameter goes with rho */
     selfcal_real_t passed[SELFCAL_LINES]; /* selfcal_expected_passed() */
 } selfcal_cell_row_t;
 

@@ -35,6 +35,21 @@ static inline void sum_add_scaled(selfcal_sum_t *sum, selfcal_sum_t scale, selfc
     sum_add(sum, product, r_fma_exact(scale.lo, value, r_fma_exact(scale.hi, value, -product)));
 }
 
+/* 1/(1 + x) */
+static inline selfcal_sum_t one_over_1_and(selfcal_real_t x) {
+    const selfcal_sum_t whole = two_sum(R(1.0), x);
+    const selfcal_real_t hi = R(1.0) / whole.hi;
+    const selfcal_sum_t result = {hi, hi * r_fma_exact(-hi, whole.lo, r_fma_exact(-hi, whole.hi, R(1.0)))};
+    return result;
+}
+
+static inline selfcal_sum_t two_product(selfcal_sum_t a, selfcal_sum_t b) {
+    const selfcal_real_t product = a.hi * b.hi;
+    const selfcal_sum_t result = {product,
+                                  r_fma_exact(a.hi, b.lo, r_fma_exact(a.lo, b.hi, r_fma_exact(a.hi, b.hi, -product)))};
+    return result;
+}
+
 static inline selfcal_wide_t sum_value(selfcal_sum_t sum) {
     return (selfcal_wide_t)sum.hi + (selfcal_wide_t)sum.lo;
 }
