@@ -483,23 +483,28 @@ BINARY = (
     *("ros1", "db3", "ulog", "phyphox", "blackbox", "dataflash", "tlog", "mcap_json", "mcap_protobuf", "ros2_mcap"),
     *("hdf5", "mat73", "parquet", "tdms", "mf4"),
 )
+#: Logs of frames, by their suffixes.
+FRAMES = (".blf", ".asc", ".trc")
 
 
-@pytest.mark.parametrize("name", BINARY)
+@pytest.mark.parametrize("name", (*BINARY, *FRAMES))
 def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path) -> None:
     """A recording, or a line that the user can read; in seconds."""
     random = np.random.default_rng([7, len(name)])
-    log = logs.WRITERS[name](logs.Drawn(seconds=0.5, seed=3), tmp_path)
+    drawn = logs.Drawn(seconds=0.5, seed=3)
+    log, dbc = (
+        logs.write_frames(drawn, tmp_path, name) if name in FRAMES else (logs.WRITERS[name](drawn, tmp_path), None)
+    )
     whole = log.read_bytes()
-    one = format_of(log)
-    if one is not None:
-        import_module(f"selfcal.loaders.{one.module}").read(log, {})  # so that each child has the library
+    one = format_of(log, frames=dbc is not None)
+    if one is not None:  # so that each child has the library
+        import_module(f"selfcal.loaders.{one.module}").read(log, {} if dbc is None else {"dbc": str(dbc)})
     refused, copies = 0, case_records(10, 1000)
     for _ in range(copies):
         log.write_bytes(mutated(random, whole))
         begun = time.monotonic()
         try:
-            load(log)
+            load(log, dbc=dbc)
         except UserError as error:
             refused += 1
             assert "\n" not in str(error)

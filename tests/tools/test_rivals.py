@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -244,7 +245,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert document["schema"] == "selfcal.rivals/1"
     entries = document["axes"]["gy"]["rivals"]
     assert list(entries) == ["library", "allan_fit", "ml", "ekf"]
-    assert entries["ekf"]["error"] == "filterpy is not installed: make setup-rivals"
+    assert entries["ekf"]["error"] == f"filterpy is not installed: {sys.executable} -m pip install filterpy"
     assert entries["library"]["weights"]["Bayes"]["gauss_markov"] > 0.99
     sigma_m = entries["ml"]["parameters"]["gauss_markov"]["sigma_m"]
     assert sigma_m["unit"] == "deg/s"
@@ -254,7 +255,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
         assert "error" in entry or (entry["seconds"] > 0.0 and entry["peak_memory_bytes"] >= 0)
     show(document)
     said = capsys.readouterr().out
-    assert "no answer: joint EKF, filterpy: filterpy is not installed: make setup-rivals" in said
+    assert f"no answer: joint EKF, filterpy: {entries['ekf']['error']}" in said
     assert "maximum likelihood, statsmodels" in said
 
 

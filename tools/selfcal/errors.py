@@ -56,6 +56,11 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__}"
 
 
+def install(what: str) -> str:
+    """The line to type for a package that is not installed beside this one: its name, or `selfcal[extra]`."""
+    return f"{shlex.quote(sys.executable)} -m pip install {shlex.quote(what)}"
+
+
 def called() -> str:
     """The command as the user called it, so that a printed line runs when it is pasted."""
     name = sys.argv[0]

@@ -30,7 +30,7 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from selfcal.errors import UserError, first_line, note, printable
+from selfcal.errors import UserError, first_line, install, note, printable
 from selfcal.output import whole
 from selfcal.progress import EVERY_S
 
@@ -242,7 +242,7 @@ def _cluster(
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
     if importlib.util.find_spec("distributed") is None:
-        raise UserError("--scheduler needs dask.distributed: make setup-cluster")
+        raise UserError(f"--scheduler needs dask.distributed: {install('distributed')}")
     import distributed
 
     try:
@@ -286,7 +286,7 @@ class Store:
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         if importlib.util.find_spec("pyarrow") is None:
-            raise UserError("--results needs pyarrow: make setup-cluster")
+            raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
         self.folder = folder
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
         try:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from selfcal.dbc_file import PLACE_NAMES, Names
 from selfcal.document import finite
-from selfcal.errors import UserError
+from selfcal.errors import UserError, install
 from selfcal.live import told_of
 from selfcal.units import parameter_unit
 from selfcal.wire import AXES, AxisReport, axis_unit
@@ -134,7 +134,7 @@ class _Foxglove:
         try:
             import foxglove
         except ImportError as error:
-            typed = f"{sys.executable} -m pip install 'selfcal[foxglove]'"
+            typed = install("selfcal[foxglove]")
             raise UserError(f"--stream foxglove: foxglove-sdk is not installed: {typed}") from error
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}

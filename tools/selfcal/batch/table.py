@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcal.batch.files import Source, stem
-from selfcal.errors import UserError
+from selfcal.errors import UserError, install
 from selfcal.output import whole
 from selfcal.result import HALF_90
 
@@ -89,7 +89,7 @@ def check_table(path: Path | str) -> None:
     if Path(path).suffix not in SUFFIXES:
         raise UserError(f"{path}: the table's name ends in {' or '.join(SUFFIXES)}")
     if Path(path).suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise UserError(f"{path}: Parquet needs pyarrow: make setup-all, or write a .csv")
+        raise UserError(f"{path}: Parquet needs pyarrow: {install('pyarrow')}, or write a .csv")
 
 
 def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:

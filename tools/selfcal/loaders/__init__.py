@@ -8,13 +8,12 @@ programs call their columns, `sources.py` chooses among several sensors of a log
 from __future__ import annotations
 
 import importlib.util
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, install
 
 if TYPE_CHECKING:
     from selfcal.recording import Scale
@@ -121,5 +120,5 @@ def format_of(path: Path, *, frames: bool = False) -> Format | None:
 def check_library(path: Path, one: Format) -> None:
     """Raise UserError, with the line to type, where the library of a format is not installed."""
     if one.library and importlib.util.find_spec(one.library) is None:
-        typed = f"{sys.executable} -m pip install 'selfcal{f'[{one.extra}]' if one.extra else ''}'"
+        typed = install(f"selfcal[{one.extra}]" if one.extra else "selfcal")
         raise UserError(f"{path}: is {one.name}, and {one.library} is not installed: {typed}")

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 
+from selfcal.errors import install
 from selfcal.methods.problem import Answer, Problem
 
 
@@ -33,7 +34,7 @@ class Rival:
         """Why it cannot run here, with the next step; empty if it can."""
         if not self.package or importlib.util.find_spec(self.package) is not None:
             return ""
-        return f"{self.package} is not installed: make setup-rivals"
+        return f"{self.package} is not installed: {install(self.package)}"
 
 
 RIVALS = {

@@ -66,7 +66,10 @@ def paper(
             told += with_reason(section4.figures_5_and_6(default, real, True), folder / EXPLAINED)
         else:
             missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
-            note(f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone")
+            note(
+                f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone;"
+                " name their folder with --data DIR"
+            )
             told.append(
                 Told(
                     "Figs 5, 6, real",
