@@ -11,18 +11,19 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from selfcal.diagnosis.extend import extended
+from selfcal.diagnosis.extend import _regressors, extended
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
-from selfcal.diagnosis.state import State
+from selfcal.diagnosis.state import Regressor, State
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import load
 from selfcal.verbs.codegen import codegen
@@ -265,3 +266,11 @@ def test_the_noise_level_is_that_of_the_recording(lag1: float, tmp_path: Path) -
     simulate(tmp_path / "extended.yaml", again, seed=8)
     first, second = (float(np.std(np.diff(load(path).columns["gx"].values))) for path in (log, again))
     assert second / first == pytest.approx(1.0, abs=0.06)
+
+
+def test_a_column_without_an_entry_is_no_regressor() -> None:
+    """A cause may have a column that no model file states: the file has its effect alone."""
+    column = Regressor("toy", "ramp", np.arange(8.0), "1", {})
+    found: Any = {"gx": SimpleNamespace(state=SimpleNamespace(regressors=(column,)))}
+    record: Any = None
+    assert _regressors(Model.load(), record, found) == []

@@ -241,7 +241,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             )
     if not console.is_terminal:
         console.width = max(console.width, 140)
-    console.print(table)
+    if table.row_count:
+        console.print(table)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
     if not any(changes_of(axis) for axis in document["axes"].values()):
         which = [name for name in document["axes"] if name not in errors] if errors else []
