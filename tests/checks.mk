@@ -47,8 +47,8 @@ tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -
 TIDY_CPU_cortex-m4f := -mcpu=cortex-m4
 TIDY_CPU_cortex-m0 := -mcpu=cortex-m0
 check-tidy: $(MODEL)/selfcal_model.c $(BOARDS:%=check-tidy-%)
-	$(call tidy,$(TIDY) $(filter-out $(MODEL)/%,$(C_ALL)) -- -std=c99 $(INCLUDES))
-	$(call tidy,$(TIDY) $(wildcard lib/*.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED -DSELFCAL_TERMS_MAX=3)
+	$(call tidy,$(TIDY) $(filter-out $(MODEL)/% %_fixed.c,$(C_ALL)) -- -std=c99 $(INCLUDES) -DSELFCAL_TERMS_MAX=3)
+	$(call tidy,$(TIDY) $(wildcard lib/*_fixed.c) -- -std=c99 $(INCLUDES) -DSELFCAL_FIXED -DSELFCAL_TERMS_MAX=3)
 .PHONY: $(BOARDS:%=check-tidy-%)
 $(BOARDS:%=check-tidy-%): check-tidy-%: $(BUILD)/%/model/selfcal_model.c
 	$(call tidy,$(TIDY) $(TIDY_ARM) $(call EMBEDDED,$*) -- \

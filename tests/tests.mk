@@ -66,7 +66,7 @@ campaigns: setup-dev
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
 	    tests/port/test_firmware_faults.py tests/port/test_firmware_commands.py tests/port/test_firmware_m0.py \
-	    tests/tools/test_hostile.py
+	    tests/port/test_firmware_icm42688.py tests/port/test_module_gain.py tests/tools/test_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)

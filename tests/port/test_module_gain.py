@@ -7,13 +7,14 @@ model less that of the base model. `identify` gives the host's gain, `replay` th
 from __future__ import annotations
 
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from firmware import MANY
+from firmware import some
 
 from selfcal.model import DEFAULT
 from selfcal.verbs.diagnose import diagnose
@@ -37,8 +38,6 @@ EFFECTS = {
     "square": ["temperature:coefficient=0.1,square=0.1,axis=gx"],
     "two": ["temperature:coefficient=0.1,axis=gx", "supply:coefficient=4,axis=gx"],
 }
-#: What `make test` runs; `make campaigns` runs all.
-SHORT = ("lag", "periodic", "colored_noise")
 #: A part of the gain, beside half a nat: both are below what decides a hypothesis. The Cortex-M0 has coarser nodes.
 SHARE = {"host": 0.01, "cortex-m4f": 0.01, "cortex-m0": 0.03}
 #: Laws that are sums of terms. On the Cortex-M0 one of them has room beside the random walk.
@@ -71,8 +70,13 @@ def evidence(document: dict[str, Any]) -> float:
     return float(np.logaddexp.reduce(list(document["axes"]["gx"]["log_evidence"].values())))
 
 
-@pytest.mark.parametrize("target", SHARE)
-@pytest.mark.parametrize("cause", EFFECTS if MANY > 1 else SHORT)
+@pytest.mark.parametrize(
+    ("cause", "target"),
+    some(
+        tuple(product(EFFECTS, SHARE)),
+        *(("lag", "cortex-m4f"), ("periodic", "host"), ("colored_noise", "cortex-m0")),
+    ),
+)
 def test_the_module_gains_what_the_host_gains(cause: str, target: str, tmp_path: Path) -> None:
     if target != "host" and shutil.which("qemu-system-arm") is None:
         pytest.skip("qemu-system-arm is missing: make setup")
