@@ -95,8 +95,7 @@ static inline selfcal_real_t prior_shape(const selfcal_prior_t *prior, selfcal_r
     return prior->law == SELFCAL_UNIFORM ? ln_value : R(0.0);
 }
 
-/* --------------------------------------------------------------------------------------------------------------
- * nodes */
+/* --- nodes --- */
 
 /* Of the hypothesis's node k. */
 void selfcal_node_field(const selfcal_work_t *work, uint16_t k, selfcal_field_t *field);
