@@ -10,6 +10,7 @@ import socket
 import struct
 import subprocess
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,21 @@ CASE_RECORDS = int(os.environ.get("SELFCAL_CASES", "0"))
 COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
 #: The command in a printed line, which runs when it is pasted.
 CALLED = "selfcal" if shutil.which("selfcal") == COMMAND[0] else shlex.quote(COMMAND[0])
+
+
+#: Where the CPU seconds of each test go, a line each: set by tests/run.py.
+SECONDS = os.environ.get("SELFCAL_SECONDS")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """The CPU seconds of a test, those of its programs included."""
+    before = sum(os.times()[:4])
+    result = yield
+    if SECONDS:
+        with Path(SECONDS).open("a", encoding="utf-8") as file:
+            file.write(f"{sum(os.times()[:4]) - before:.2f} {item.nodeid}\n")
+    return result
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

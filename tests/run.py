@@ -27,6 +27,8 @@ TIMEOUT = {"check": 1800, "c": 600, "bench": 300, "fuzz": 300, "pytest": 3000}
 FUZZ_SECONDS = {"float": 12, "fixed": 8}
 #: What the suites after the checks run.
 BUILT = ("c-tests", "bench-images", "firmware-images", *(f"build/fuzz/{kernel}/fuzz_api" for kernel in FUZZ_SECONDS))
+#: Tests that are named with their CPU time; build/seconds.txt has all.
+LONGEST = 12
 #: At once; the machine that this is to be quick on has two cores.
 WORKERS = 2
 #: Left out of `make quick`: the slowest of the checks.
@@ -174,8 +176,10 @@ def fuzz_kernel(kernel: str) -> Count:
 
 def pytest(quick: bool) -> Count:
     """The Python tests; their output is shown as it comes. A worker that is done takes tests from the other."""
-    report = BUILD / "pytest.xml"
+    report, seconds = BUILD / "pytest.xml", BUILD / "seconds.txt"
     report.unlink(missing_ok=True)
+    seconds.unlink(missing_ok=True)
+    os.environ["SELFCAL_SECONDS"] = str(seconds)
     command = [sys.executable, "-m", "pytest", "-q", f"-n{WORKERS}", "--dist=worksteal"]
     chosen = [f"tests/{test}" for test in QUICK] if quick else ["tests"]
     try:
@@ -192,6 +196,7 @@ def pytest(quick: bool) -> Count:
     if not report.is_file():
         print("FAILED pytest: no report")
         return Count(failed=1)
+    longest(seconds)
     total = Count()
     for suite in ElementTree.parse(report).iter("testsuite"):
         tests, failed, errors, skipped = (int(suite.get(key, 0)) for key in ("tests", "failures", "errors", "skipped"))
@@ -199,6 +204,15 @@ def pytest(quick: bool) -> Count:
     if code != 0 and total.failed == 0:
         total.failed = 1
     return total
+
+
+def longest(seconds: Path) -> None:
+    """Prints the tests that take most CPU time, and the sum of all (tests/conftest.py)."""
+    lines = seconds.read_text(encoding="utf-8").splitlines() if seconds.exists() else []
+    rows = sorted(((float(time), test) for time, _, test in (line.partition(" ") for line in lines)), reverse=True)
+    print(f"{sum(time for time, _ in rows):.0f} CPU s in {len(rows)} tests; the longest:")
+    for cpu_s, test in rows[:LONGEST]:
+        print(f"{cpu_s:8.1f} {test}")
 
 
 def main() -> None:
