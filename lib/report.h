@@ -136,9 +136,6 @@ void selfcal_expected_passed(const selfcal_work_t *work, selfcal_real_t beta, se
  * within a block. */
 selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t rho_sq, selfcal_real_t beta);
 
-/* The predicted drift variance that a filter converges to, over its sigma_v^2. */
-selfcal_real_t selfcal_expected_settled(selfcal_real_t rho_sq, selfcal_real_t beta);
-
 /* --- spectrum --- */
 
 /* Of ln omega from 1/n to 6, which stands for pi. */

@@ -103,7 +103,3 @@ void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal
         e->ln_sigma -= (selfcal_wide_t)(R(0.5) * r_log(noise));
     }
 }
-
-selfcal_real_t selfcal_expected_settled(selfcal_real_t rho_sq, selfcal_real_t beta) {
-    return settled(rho_sq, beta);
-}

@@ -17,28 +17,68 @@ static selfcal_real_t permitted(const selfcal_prior_t *prior, selfcal_real_t *mi
     return hi > lo ? (hi - lo) / width : R(0.0);
 }
 
-/* Whether nodes or lines are too far apart for a record so long. What the data put into a node's sums looks, as a
- * function of ln rho or ln alpha, like white noise smoothed by 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2): at
- * the nodes' Nyquist frequency pi/h that is e^(-pi^2/2h), of alpha 3/8 of it. It grows as sqrt(n); the nodes of a grid
- * of two dimensions show what lies between its rows and columns, and between the nodes of a random walk beside it, so
- * that lines leave little of it; on such a grid no more comes after some 10^4 samples. Of a law without an expectation
- * all of the ln-likelihood is left to the splines, which grows as n. The limits are measured, on records over the whole
- * prior, n = 100 to 10^5 on 8 to 24 nodes: below them 98 in 100 kept all three tolerances (the Cortex-M0's 14 x 7: 388
- * of 390 of 4100 and 4400, then 8 of 120 of 6000 did not). What uneven noise or time adds to the ln-likelihood is as
- * smooth and left to the splines whole, with lines that are forced to explain it besides: a nat of it near the best
- * node weighs as 18. Of 106 records with gaps up to there 2 were beyond the tolerances, by 0.008 nat at most. */
-static bool too_coarse(const selfcal_work_t *work) {
-    /* 0, so that e^-inf is the rest, where there is none. */
-    const selfcal_real_t step[2] = {work->bank->rho_step[work->hypothesis], work->bank->alpha_step[work->hypothesis]};
-    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight;
-    const selfcal_real_t rest = r_exp(R(-4.9348022) / step[0]) + R(0.375) * r_exp(R(-4.9348022) / step[1]);
-    if (!has_expectation(work)) {
-        return rest * weight > R(0.08);
+/* Nats that interpolation may be wrong by. They move a mean by at most as many sd. */
+#define WRONG_MOST R(0.05)
+/* Largest error of the quintic spline over the mean of sixth differences, their signs apart, at steps of 1.
+ * What the data put into a node's sums looks, as a function of ln rho or ln alpha, like white noise smoothed by
+ * 1/(1 + e^2x), whose spectrum falls as e^(-pi |s|/2). Both follow from that spectrum: the error over the square of the
+ * step is 5.2e-3 to 7e-3 of the largest difference at steps of 0.5 to 1. The largest is pi/2 of the mean. */
+#define PER_SIXTH R(9e-3)
+
+/* Mean of the four sixth differences about the nodes `z` and `z` + 1 of a line of node values, `stride` apart.
+ * Their signs do not count. Fewer than seven nodes have no sixth difference, and show nothing. */
+static selfcal_real_t sixth_difference(const selfcal_real_t line[], size_t stride, uint16_t nodes, int z) {
+    static const selfcal_real_t binomial[7] = {R(1.0), R(-6.0), R(15.0), R(-20.0), R(15.0), R(-6.0), R(1.0)};
+    const int last = (int)nodes - 7;
+    selfcal_real_t mean = last < 0 ? (selfcal_real_t)INFINITY : R(0.0);
+    for (int i = z - 4; i < z && last >= 0; i++) {
+        const int first = i < 0 ? 0 : (i < last ? i : last); /* at an end the last counts for those beyond */
+        selfcal_real_t sum = R(0.0);
+        for (int k = 0; k < 7; k++) {
+            sum = r_fma(binomial[k], line[(size_t)(first + k) * stride], sum);
+        }
+        mean = r_fma(R(0.25), r_fabs(sum), mean);
     }
-    const bool pair = hypothesis_of(work)->alpha != NULL;
-    return rest * (r_sqrt((pair ? r_fmin(weight, R(1e4)) : weight) + R(400.0)) + R(18.0) * work->truth.missed) >
-               (work->truth.pair ? R(0.4) : R(0.02)) ||
-           selfcal_spectrum_range(weight) > LINES_APART * (selfcal_real_t)(SELFCAL_LINES - 1);
+    return mean;
+}
+
+/* The node at or below the middle of a range, not the last. */
+static int node_below(selfcal_real_t middle, selfcal_real_t lo, selfcal_real_t step, uint16_t nodes) {
+    const selfcal_real_t z = r_fmin(r_fmax((middle - lo) / step, R(0.0)), (selfcal_real_t)(nodes - 2U));
+    return (int)z;
+}
+
+/* Whether nodes or lines are too far apart for the record. The spline carries a change that is slow from node to node;
+ * sixth differences grow with a fast one. tests/ACCURACY.md has how often this errs. */
+static bool too_coarse(const selfcal_work_t *work) {
+    const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
+    if (hypothesis->rho == NULL) {
+        return false;
+    }
+    const selfcal_t *bank = work->bank;
+    const selfcal_real_t *value = &work->field[0][work->first_node];
+    const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
+    unsigned top = 0;
+    for (unsigned i = 1; hypothesis->alpha != NULL && i < SAMPLES; i++) {
+        top = work->scratch.grid.height[i] > work->scratch.grid.height[top] ? i : top;
+    }
+    const selfcal_range_t *found = &work->scratch.grid.found[top], *alpha = &work->search.range[1];
+    const selfcal_real_t step = bank->rho_step[work->hypothesis], other = bank->alpha_step[work->hypothesis];
+    const int row = node_below(R(0.5) * (found->lo + found->hi), bank->rho_lo[work->hypothesis], step, rows);
+    const selfcal_real_t part = ((selfcal_real_t)top + R(0.5)) / (selfcal_real_t)SAMPLES;
+    const int column = columns < 2U ? 0
+                                    : node_below(r_fma(alpha->hi - alpha->lo, part, alpha->lo),
+                                                 bank->alpha_lo[work->hypothesis], other, columns);
+    selfcal_real_t along = R(0.0), across = R(0.0);
+    for (int i = 0; i < (columns < 2U ? 1 : 2); i++) {
+        along = r_fmax(along, sixth_difference(&value[column + i], columns, rows, row));
+        if (columns >= 2U) {
+            across = r_fmax(across, sixth_difference(&value[(size_t)(row + i) * columns], 1, columns, column));
+        }
+    }
+    return PER_SIXTH * r_fma(step * step, along, other * other * across) > WRONG_MOST ||
+           (has_expectation(work) &&
+            selfcal_spectrum_range((selfcal_real_t)bank->weight) > LINES_APART * (selfcal_real_t)(SELFCAL_LINES - 1));
 }
 
 void selfcal_integral_begin(selfcal_work_t *work) {

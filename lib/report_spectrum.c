@@ -29,9 +29,6 @@
 /* A float's digits of those nats, over the 0.01. */
 #define FAR_EVEN R(2e-4)
 
-/* Nats below the best node up to which a node counts for what the splines have to hold. */
-#define NEAR R(30.0)
-
 /* Half of ln 0.1. */
 #define HALF_LN_LEAST R(-1.1512925)
 /* Lines are so far apart in ln omega, as far as there are so many. */
@@ -182,17 +179,6 @@ static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t
     }
 }
 
-/* What gaps and uneven noise add to ln_s of a node, beyond 8 nats as the filters settle and as much for some gaps. */
-static void count_missed(selfcal_work_t *work, uint16_t k, selfcal_place_t place) {
-    const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
-    const selfcal_real_t rho_sq = r_exp(R(2.0) * place.ln_rho), noise = selfcal_expected_noise(work, rho_sq, beta);
-    const selfcal_real_t s_less_1 = selfcal_expected_settled(rho_sq / noise, beta);
-    const selfcal_real_t ln_s = (selfcal_real_t)work->bank->weight * (r_log1p(noise - R(1.0)) + r_log1p(s_less_1));
-    selfcal_node_view_t node;
-    selfcal_bank_ln_s(work->bank, k, &node);
-    work->truth.missed = r_fmax(work->truth.missed, r_fabs((selfcal_real_t)node.ln_s - ln_s) - R(16.0));
-}
-
 /* First the best node of all, for the process that made the data; then every node. Its row is its variance over the
  * expected one, less the best node's, by lines and edges of their prior deviations. All begins anew where the process
  * was too slow. */
@@ -223,8 +209,5 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
     } else {
         const selfcal_real_t deficit = work->field[0][work->best_node] - work->field[0][k];
         add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), deficit);
-        if (deficit < NEAR) {
-            count_missed(work, k, place);
-        }
     }
 }

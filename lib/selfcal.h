@@ -108,8 +108,9 @@ enum {
     /* The node grid does not support this estimate: treat it as rough.
      * Set if more than 1 % of the posterior lies beyond the outermost node, or if interpolation between nodes may be
      * wrong by more than 0.05 nat (evidence), 0.05 sd (mean) or 3 % (sd).
-     * The second condition is a conservative bound. It grows with the length of the record, with scattered gaps, and
-     * with changes of rate. Without a Gauss-Markov law in the model it does not see a record that no random walk makes.
+     * The nodes about the posterior show the second condition: by how far they depart from what splines can hold.
+     * Fewer than seven nodes a dimension do not show it, and are flagged. Without a Gauss-Markov law in the model the
+     * flag does not see a record that no random walk makes.
      * Also set for all laws if the report lost one between the nodes: its ln_evidence is -INFINITY, its estimates are
      * NaN, and no probability is right. Without the flag an ln_evidence of -INFINITY means that the priors exclude the
      * law.

@@ -282,8 +282,6 @@ struct selfcal_former {
 typedef struct {
     /* the samples' noise, their geometric mean, over a whole block's at the model's rate, less 1 */
     selfcal_real_t noise_less_1;
-    selfcal_real_t missed; /* nats of ln_s, the most of all nodes near the best, that come of what is uneven in noise or
-                              time */
     selfcal_real_t variance, rate; /* of a first-order drift over that noise's variance; 1 - its pole */
     selfcal_wide_t ln_v;           /* expected variance of its own filter's innovations */
     bool wide;                     /* the record is so long that the expectation takes selfcal_wide_t */
