@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations, product
 from typing import Any
 
@@ -86,7 +87,11 @@ class Sums:
 
     def coefficients(self) -> tuple[Array, Array, float]:
         """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares. The last is
-        infinite where the filter overflowed."""
+        infinite where the filter overflowed. Solved once."""
+        return self._solved
+
+    @cached_property
+    def _solved(self) -> tuple[Array, Array, float]:
         A, B = self.G[1:, 1:], self.G[1:, 0]
         if not np.isfinite(self.G).all():
             return np.zeros(B.size), np.zeros(A.shape), math.inf
@@ -105,8 +110,7 @@ class Sums:
 @dataclass(frozen=True)
 class Fit:
     """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
-    standard deviations `sd`, and `ln_likelihood` at its maximum. `spread` [k, k], of a fit: a root of the covariance of
-    `theta`."""
+    standard deviations `sd`, and `ln_likelihood` at its maximum. `information` [k, k], of a fit: that of `theta`."""
 
     terms: Terms
     theta: Array
@@ -117,7 +121,12 @@ class Fit:
     n: float
     dt: float
     duration_s: float
-    spread: Array = field(default_factory=lambda: np.empty((0, 0)))
+    information: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @cached_property
+    def spread(self) -> Array:
+        """A root of the covariance of theta [k, k]."""
+        return _spread(self.information)
 
     def value(self, name: str) -> float:
         """One parameter of the vector."""
@@ -335,7 +344,7 @@ def _climbed(series: Series, here: Fit) -> Fit:
     before: tuple[Array, Array] | None = None
     for _ in range(STEPS):
         slope, information = slopes(series, here)
-        here = replace(here, spread=_spread(information))
+        here = replace(here, information=information)
         if not (np.isfinite(slope).all() and np.isfinite(information).all()):
             return here
         weak = size & (np.diag(information) < WEAK)
@@ -355,7 +364,7 @@ def _climbed(series: Series, here: Fit) -> Fit:
             if more > 0.0:
                 break
             reach *= SHORTER
-        before, here = (move, slope), replace(there, spread=here.spread)
+        before, here = (move, slope), replace(there, information=here.information)
         # A small gain that came as promised, by a step that nothing has shortened, was the last one.
         whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
         if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
