@@ -60,7 +60,7 @@ static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_vi
 }
 
 /* The node of most weight is the first. */
-static void begin(selfcal_work_t *work) {
+static void begin_bias(selfcal_work_t *work) {
     const selfcal_real_t *weight = work->scratch.grid.spline[0];
     for (uint16_t k = 1; k < nodes_of(work); k++) {
         work->bias.from = weight[k] > weight[work->bias.from] ? k : work->bias.from;
@@ -93,7 +93,7 @@ static void now_plain(const selfcal_work_t *work, uint16_t k, selfcal_real_t sig
  * change too much from node to node. */
 void selfcal_bias_step(selfcal_work_t *work) {
     if (work->at == 0U) {
-        begin(work);
+        begin_bias(work);
     }
     const uint16_t in_turn = (uint16_t)(work->bias.from + work->at), nodes = nodes_of(work),
                    k = (uint16_t)(in_turn < nodes ? in_turn : in_turn - nodes);

@@ -209,7 +209,7 @@ static void limit(const selfcal_work_t *work, unsigned dimension, selfcal_range_
 }
 
 /* A row of the first pass is looked for where it counts in the columns of nodes beside it. */
-static void begin_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
+static void begin_line(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
     const selfcal_node_column_t *column = work->scratch.grid.column, *other = column;
     if (alpha != NULL) {
@@ -283,7 +283,7 @@ bool selfcal_search_step(selfcal_work_t *work) {
     if (work->at == 0U) {
         const selfcal_real_t ln_alpha = rows ? sample_at(range, work->row) : R(0.0);
         if (work->search.pass == 0U) {
-            begin_row(work, ln_alpha);
+            begin_line(work, ln_alpha);
         } else {
             widen_row(work);
         }
