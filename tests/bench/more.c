@@ -5,7 +5,7 @@
 #include "record.h"
 
 #if defined(BENCH_SUMS)
-#include "../c/laws.h"
+#include "../common/named_laws.h"
 #endif
 
 #define AXES SELFCAL_MODEL_AXES
