@@ -93,6 +93,17 @@ def test_the_interval_of_a_mean_does_not_matter(tmp_path: Path) -> None:
         assert_identified(identify(log, decimate=decimate).axes["gx"], N, Q)
 
 
+def test_lost_readings_leave_N_and_Q(tmp_path: Path) -> None:
+    """One in 50 is lost at random. A mean with a hole has two remainders more: with those N would be a fifth too large,
+    6 sd. 4 sd."""
+    random, rate, N, Q, n = np.random.default_rng(9), 10.0, 0.02, 0.02, 36_000
+    y = moved(random, n, rate, N, 2e-4) + differenced(random, n, rate, Q)
+    kept = random.random(n) > 0.02
+    log = tmp_path / "log.npz"
+    np.savez(log, **{"t[s]": np.arange(n)[kept] / rate, "gx[deg/s]": y[kept]})
+    assert_identified(identify(log).axes["gx"], N, Q)
+
+
 def test_intervals_of_Q_and_N_hold(tmp_path: Path) -> None:
     """Q / N from 0.4 to 3 sqrt(s), 1 h. 90 %, the lower tail of the binomial not below 1 in 1000."""
     random, n = np.random.default_rng(6), 3600

@@ -312,19 +312,19 @@ def simulated(state: State, random: np.random.Generator) -> Array:
     y += _states(m, np.sqrt(state.r), random) * fit.sigma
     y += fit.c @ state.series.columns
     if fit.quantized:
-        y = _counted(y, fit, random)
+        y = _counted(y, fit, random, means=state.redrawn)
     y = np.where(np.isfinite(state.y), y, np.nan)
     if state.lsb > 0.0:
         y = np.rint((y + state.level) / state.lsb) * state.lsb - state.level
     return y
 
 
-def _counted(y: Array, fit: Fit, random: np.random.Generator) -> Array:
-    """Readings of a counter that gains `y`. How far it gets within an increment from one reading to the next decides
-    what two remainders have in common, and no fit knows that: it is drawn. Of a counter that its noise does not stir
-    the remainders are white: something else does."""
+def _counted(y: Array, fit: Fit, random: np.random.Generator, *, means: bool) -> Array:
+    """Readings of a counter that gains `y`. `means`: the increments show in no reading, but in what two remainders have
+    in common. How far the counter gets within an increment decides that, and no fit knows it: it is drawn. Remainders
+    are white where something else than the noise stirs the counter."""
     step = fit.increment / fit.dt
-    if fit.N_of_color**2 / fit.dt < WHITE_REMAINDERS * step**2:
+    if not means or fit.N_of_color**2 / fit.dt < WHITE_REMAINDERS * step**2:
         return np.asarray(y + np.diff(step * random.random(y.size + 1)))
     start, gain = random.random(2)
     total = np.floor(np.cumsum(y / step + gain) + start)

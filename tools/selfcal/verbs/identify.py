@@ -18,7 +18,7 @@ from rich.progress import Progress
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.checks import coefficients_of, judge, with_readings
+from selfcal.checks import FEWEST, coefficients_of, judge, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import OutsidePriors, UserError
 from selfcal.export import FORMS, write_export
@@ -35,7 +35,7 @@ from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
 from selfcal.results import Identification
 from selfcal.summary import halved_after, summarize
-from selfcal.tables import make_tables
+from selfcal.tables import bank_block, make_tables
 from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 if TYPE_CHECKING:
@@ -203,14 +203,29 @@ def _with_added_laws(
         add_law(tree, shown)
         with suppress(UserError):  # too long for the law's filters
             of_file = Model.of_tree(tree, DEFAULT)
-            model = for_record(of_file, recording, (name,))
-            axis = identify_axis(recording, name, model, engine, decimate, draw=draw)
+            whole = _whole_means(recording.along(name), decimate or of_file.bank_rate_hz)
+            model = for_record(of_file, whole, (name,))
+            axis = identify_axis(whole, name, model, engine, decimate, draw=draw)
             if axis.result.best not in before:
                 own = to_document(recording, {name: axis})
                 add_sources(own, of_file, model)
                 document["axes"][name] = own["axes"][name] | {"suspicion": shown.cause, "added_law": axis.result.best}
                 again.append(name)
     return again
+
+
+def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
+    """The recording without the bank intervals that lost readings: what a counter gained there is in no other reading.
+    Raises UserError where none is left."""
+    if not recording.missing_before.any():
+        return recording
+    block = bank_block(recording.rate_hz, bank_rate_hz)
+    place = np.arange(recording.samples) + np.cumsum(recording.missing_before).astype(np.int64)
+    cell = (place - place[0]) // block
+    whole = np.bincount(cell) == block
+    if np.count_nonzero(whole) < FEWEST:
+        raise UserError("too few bank intervals have all of their readings")
+    return recording.with_rows(whole[cell])
 
 
 def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequence[str]) -> None:
