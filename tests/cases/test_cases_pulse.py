@@ -55,8 +55,8 @@ def test_times_and_amplitude_lie_in_their_intervals(law: str) -> None:
     held: dict[str, list[bool]] = {"time_s": [], "duration_s": [], "amplitude": []}
     for _ in range(case_records(6, 200)):
         shape, *truth = drawn(random, 1.0)
-        looks = pulse.looks(*recorded(noise(random, law, shape.size, 1.0) + shape, 1.0))
-        found = [look.measured() for look in looks]
+        state, record = recorded(noise(random, law, shape.size, 1.0) + shape, 1.0)
+        found = [look.measured(state) for look in pulse.looks(state, record)]
         for (key, each), value in zip(held.items(), truth, strict=True):
             each.append(bool(found) and found[0].estimate[key]["q05"] <= value <= found[0].estimate[key]["q95"])
     assert_held(held, law)
@@ -82,7 +82,7 @@ def test_a_pulse_that_no_drift_can_judge_has_the_fit_as_its_size(monkeypatch: py
     _, fit = state.with_columns((np.arange(shape.size) >= begin) * 1.0 - (np.arange(shape.size) >= end))
     none = pulse.Pulses(np.zeros(shape.size), np.zeros(shape.size), 0.0)
     monkeypatch.setattr(pulse, "_other", lambda *_, **__: none)
-    found = pulse.posterior(state, record.time_s, begin, end, fit)
+    found = pulse.posterior(record.time_s, begin, end, state)
     assert found["amplitude"]["mean"] == pytest.approx(fit.c[-1])
     assert found["duration_s"]["mean"] == pytest.approx(end - begin)
 

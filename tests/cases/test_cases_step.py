@@ -48,7 +48,7 @@ def drawn(random: np.random.Generator, rate: float, gap_s: float) -> tuple[Array
 def looked(y: Array, rate: float, cause: Any) -> Look | None:
     state = State("gx", "deg/s", y, 1.0 / rate, 0.0, np.ones(y.size)).refit()
     record = Record(rate, {"gx": state}, {}, {}, np.isfinite(y), recorded_hz=rate)
-    return next((look.measured() for look in cause(state, record)), None)
+    return next((look.measured(state) for look in cause(state, record)), None)
 
 
 def holds(estimate: dict[str, float], truth: float) -> bool:

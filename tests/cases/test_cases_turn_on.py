@@ -30,7 +30,8 @@ from conftest import case_records, shared_case
 
 
 def looked(y: Array, rate: float) -> Look | None:
-    return next((look.measured() for look in turn_on.looks(*recorded(y, rate))), None)
+    state, record = recorded(y, rate)
+    return next((look.measured(state) for look in turn_on.looks(state, record)), None)
 
 
 def drawn(random: np.random.Generator, rate: float, seconds: float) -> tuple[Array, float, float]:
@@ -101,7 +102,7 @@ def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:
     later, record = recorded(y[300:], 10.0)
     means, of_means = recorded(y.reshape(-1, 50).mean(axis=1), 0.2)
     for state, its in ((later, replace(record, start_s=30.0)), (means, replace(of_means, recorded_hz=10.0))):
-        (look,) = (one.measured() for one in turn_on.looks(state, its))
+        (look,) = (one.measured(state) for one in turn_on.looks(state, its))
         assert abs(look.estimate["amplitude"]["mean"] - 0.8) < 3.0 * look.estimate["amplitude"]["sd"]
         assert look.estimate["amplitude"]["sd"] < 0.03
 

@@ -51,7 +51,9 @@ def test_amplitude_and_dwell_times_lie_in_their_intervals() -> None:
     held: dict[str, list[bool]] = {key: [] for key in truth}
     for _ in range(case_records(2, 100)):
         y = noise(random, "walk", 3600, 1.0) + jumps(random, 3600, 1.0)
-        look = two_level.looks(*recorded(y, 1.0))[0].measured()
+        state, record = recorded(y, 1.0)
+        look = two_level.looks(state, record)[0]
+        look = look.measured(state.refit(**look.changes))
         for key, value in truth.items():
             held[key].append(look.estimate[key]["q05"] <= value <= look.estimate[key]["q95"])
     assert_held(held, "walk")

@@ -71,6 +71,29 @@ def test_a_jump_does_not_carry_over_and_both_causes_are_listed(tmp_path: Path) -
     assert nats(found["cross_axis"]) > 10.0
 
 
+def test_all_causes_together_have_a_gain_of_their_own(tmp_path: Path) -> None:
+    """A leak and a line hardly know each other: together they gain the sum of both, within the scatter of each."""
+    own = model(tmp_path)
+    for name, seed in (("a", 3), ("b", 4)):
+        simulate(own, tmp_path / f"{name}.npz", seed, [LEAK, LINE])
+    axis = diagnose(tmp_path / "a.npz", axes="gx", on=tmp_path / "b.npz")["axes"]["gx"]
+    single = [nats(finding) for finding in axis["findings"]]
+    assert len(single) == 2
+    assert min(single) > 10.0
+    assert nats(axis) == pytest.approx(sum(single), rel=0.2)
+
+
+def test_a_short_second_recording_is_named(tmp_path: Path) -> None:
+    own = model(tmp_path)
+    simulate(own, tmp_path / "a.npz", 3, [LEAK])
+    rows = "".join(f"{k},{0.1 * (k % 7)},{0.1 * (k % 5)}\n" for k in range(30))
+    (tmp_path / "b.csv").write_text("t[s],gx[deg/s],gy[deg/s]\n" + rows, "utf-8")
+    axis = diagnose(tmp_path / "a.npz", axes="gx", on=tmp_path / "b.csv")["axes"]["gx"]
+    for one in (axis, *axis["findings"]):
+        assert one["gain_on"] is None
+        assert one["gain_on_reason"] == "the second recording is too short: 30 bank samples, and 60 are needed"
+
+
 def test_a_second_recording_without_the_axis_is_named(tmp_path: Path) -> None:
     own = model(tmp_path)
     simulate(own, tmp_path / "a.npz", 3, [LEAK])

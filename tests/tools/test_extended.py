@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -152,8 +152,14 @@ def gain_of_library(at: Case, folder: Path) -> float:
 
 
 def gained(at: Case) -> float:
-    """nats: the same by the diagnosis' own fits."""
-    return at.one.state.best.ln_likelihood - at.one.first.best.ln_likelihood
+    """nats: the same by the diagnosis' own fits, with the time constant that the file states: the posterior's median,
+    where the search took the best of its grid."""
+    tau_s = {entry["name"]: entry["tau_s"] for entry in at.tree.get("regressors", []) if entry["kind"] == "turn_on"}
+    columns = tuple(
+        replace(one, values=np.exp(-at.one.record.time_s / tau_s[one.name])) if one.name in tau_s else one
+        for one in at.one.state.regressors
+    )
+    return at.one.state.refit(regressors=columns).best.ln_likelihood - at.one.first.best.ln_likelihood
 
 
 def _columns(entry: dict[str, Any]) -> range:

@@ -160,6 +160,7 @@ class Finding(Object):
     gain_reason: str | None
     gain_on: dict[str, Any] | None
     gain_on_reason: str | None
+    left_out_of_model: str | None
     inflation: dict[str, float]
     inflation_words: str
 
@@ -177,6 +178,8 @@ class DiagnosedAxis(Object):
     not_judged: list[dict[str, Any]]
     discrepancies: list[dict[str, Any]]
     posterior: dict[str, Any] | None
+    gain_on: dict[str, Any] | None
+    gain_on_reason: str | None
     unfinished: str | None
 
 

@@ -33,6 +33,8 @@ from selfcal.tables import make_tables
 
 #: Pieces of the second recording whose scatter gives the uncertainty.
 PIECES = 12
+#: Bank samples of the second recording at least: the bank reports on five and more, and each piece has as many.
+LEAST = 5 * PIECES
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,9 @@ class _Term:
 
 def gains(
     model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], second: Recording
-) -> dict[str, list[Carried]]:
-    """By axis one entry for each finding of `found`, by gain. `tree`: the extended model file's."""
+) -> dict[str, tuple[list[Carried], Carried]]:
+    """By axis one entry for each finding of `found`, by gain, and one of all together. `tree`: the extended model
+    file's."""
     return {name: _of_axis(model, tree, record, found, name, second) for name in found}
 
 
@@ -68,10 +71,11 @@ def _of_axis(
     found: Mapping[str, Diagnosed],
     name: str,
     second: Recording,
-) -> list[Carried]:
+) -> tuple[list[Carried], Carried]:
     findings = found[name].by_gain
     if name not in second.columns:
-        return [Carried(None, f"{second.path} has no axis {name}")] * len(findings)
+        none = Carried(None, f"{second.path} has no axis {name}")
+        return [none] * len(findings), none
     extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
     terms: dict[int, _Term] = {}
     results: dict[int, Carried] = {}
@@ -83,7 +87,10 @@ def _of_axis(
             terms[k] = term
     try:
         readings = look(second.along(name), name, model.group_of(name))
-        whole = _evidence(model, record, found, name, readings, [*terms.values()]) if terms else None
+        if not terms:
+            return [results[k] for k in range(len(findings))], Carried(None, "no finding is in the bank's model")
+        whole = _evidence(model, record, found, name, readings, [*terms.values()])
+        together = Carried(_compared(_evidence(model, record, found, name, readings, []), whole))
         for k, term in terms.items():
             try:
                 others = [one for one in terms.values() if one is not term]
@@ -92,8 +99,9 @@ def _of_axis(
             except UserError as error:
                 results[k] = Carried(None, str(error))
     except UserError as error:
-        return [results.get(k, Carried(None, str(error))) for k in range(len(findings))]
-    return [results[k] for k in range(len(findings))]
+        none = Carried(None, str(error))
+        return [results.get(k, none) for k in range(len(findings))], none
+    return [results[k] for k in range(len(findings))], together
 
 
 def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> _Term | str:
@@ -146,6 +154,8 @@ def _evidence(
     bank = Bank(tables)
     prior = {one.name: one.ln_probability for one in tables.hypotheses}
     rows, columns = as_float(values)[:, None], as_float(columns_of(regressors, recording))
+    if values.size < LEAST:
+        raise UserError(f"the second recording is too short: {values.size} bank samples, and {LEAST} are needed")
     cuts = np.linspace(0, values.size, PIECES + 1).astype(int)
     after = []
     for first, last in pairwise(cuts):
@@ -159,9 +169,8 @@ def _evidence(
     return evidence
 
 
-def _compared(without: Array, whole: Array | None) -> dict[str, Any]:
+def _compared(without: Array, whole: Array) -> dict[str, Any]:
     """The contract's `gain_on`. The first piece is all the priors', so the scatter is that of the others."""
-    assert whole is not None
     if (without[0] != whole[0]).any():
         raise UserError("the bank takes other samples with the finding than without")
     n = whole[0]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.statemodel import Array
 
 if TYPE_CHECKING:
@@ -97,8 +98,10 @@ def _never(a: Look, b: Look) -> bool:
     return False
 
 
-def _as_is(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
-    return dict(entry)
+def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
+    """The entry of a column, of which a look knows numbers better than the search that chose it."""
+    known = {} if look is None else medians(look)
+    return {**entry, **{key: digits(value) for key, value in known.items() if key in entry}}
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ class Cause:
     """Everything about one cause.
 
     id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
+    unsure       words instead where the estimate has `source`: which axis is the source is not shown.
     looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
     before_motion  looks that motion must not be taken for: they come before motion.
@@ -121,13 +125,13 @@ class Cause:
     trained      look, states before and after, record and split: the state after as the first `split` samples show it.
     together     nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
     least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
-    entry        the model file's entry of its column for the whole recording.
+    entry        the model file's entry of its column for the whole recording, by the look that found it.
     smoothed     its column is the mean of a channel: the model file states the trailing window that suits it.
     from_zero    the simulator's effect begins at 0, its column is about the middle.
     law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
     extend       writes what is no column into the model file.
-    of_column    keys of `--effect` for its columns: the first one and the coefficients of all.
-    of_estimate  keys of `--effect` for a finding without a column; None: the column has them.
+    of_column    keys of `--effect` for columns of the model file: the first one and the coefficients of all.
+    of_estimate  keys of `--effect` for a finding; None: the simulator cannot make it.
     keys         keys of `simulate --effect`; empty: it cannot be simulated.
     follows      the effect follows another axis: the key `other`.
     common       the effect is of the whole recording and has no axis.
@@ -138,6 +142,7 @@ class Cause:
     id: str
     words: str
     record_next: str
+    unsure: str = ""
     looks: Looks | None = None
     most: int = 0
     before_motion: Looks | None = None
@@ -153,7 +158,7 @@ class Cause:
     trained: Callable[[Look, State, State, Record, int], State] | None = None
     together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]] | None = None
     least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
-    entry: Callable[[Mapping[str, Any], Record], dict[str, Any]] = _as_is
+    entry: Callable[[Mapping[str, Any], Look | None, Record], dict[str, Any]] = sized
     smoothed: bool = False
     from_zero: bool = False
     law: Callable[[dict[str, Any], Look], None] | None = None

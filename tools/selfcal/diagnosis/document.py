@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
@@ -18,10 +18,13 @@ from selfcal.diagnosis.state import Look
 from selfcal.document import recording_entry
 from selfcal.ending import Stopped
 from selfcal.errors import UserError
+from selfcal.model import MOST_COLUMNS
 from selfcal.recording import SIDE_CHANNELS, Recording
 from selfcal.regressors import coefficient_unit
 
 SCHEMA = "selfcal.diagnose/1"
+#: Why a finding is not in the extended model file.
+NO_ROOM = f"a model file holds {MOST_COLUMNS} columns, and findings of more evidence fill them"
 G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 
@@ -31,10 +34,12 @@ def to_document(
     errors: Mapping[str, str],
     model: Mapping[str, Any],
     first: Mapping[str, Diagnosed] = MappingProxyType({}),
+    out: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
-    model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it."""
-    axes = {name: _axis(one, recording.columns[name].unit, first.get(name)) for name, one in found.items()}
+    model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it.
+    `out`: findings that the model file has no room for."""
+    axes = {name: _axis(one, recording.columns[name].unit, first.get(name), out) for name, one in found.items()}
     return {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
@@ -43,7 +48,7 @@ def to_document(
     }
 
 
-def _axis(one: Diagnosed, unit: str, first: Diagnosed | None) -> dict[str, Any]:
+def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Finding]) -> dict[str, Any]:
     record = one.record
     causes = {finding.look.cause for finding in one.findings}
     only = [] if first is None else [finding for finding in first.findings if finding.look.cause not in causes]
@@ -54,7 +59,11 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None) -> dict[str, Any]:
         "judged_at_hz": record.rate_hz,
         "verdict": "adequate" if one.adequate else "inadequate",
         **({"unfinished": one.unfinished} if one.unfinished else {}),
-        "findings": [_finding(finding, record, factor, unit) for finding in one.by_gain],
+        "findings": [
+            _finding(finding, record, factor, unit)
+            | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})
+            for finding in one.by_gain
+        ],
         **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit) for one in only]}),
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.fit import finish
+from selfcal.diagnosis.forms import form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import Regressor as Column
@@ -75,19 +78,59 @@ def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
             nodes["cortex-m0"].update({law: nodes["cortex-m0-small"][law] for law in plain})
 
 
-def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> list[dict[str, Any]]:
-    """Entries for the columns that were found, the strongest first, as many as a model may have."""
+def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[dict[str, float], list[tuple[str, Finding]]]:
+    """Regressors that the model file has room for, with their evidence, the most first; findings that it has none for,
+    with their axes. A finding fits whole or not at all."""
     stated = {column for one in model.regressors for column in one.columns}
+    offered: list[tuple[float, str, Finding | None, dict[str, int]]] = []
+    for name, one in found.items():
+        places = {
+            column.name: k
+            for k, column in enumerate(one.state.regressors, 1)
+            if column.name not in stated and column.entry
+        }
+        owned = [(finding, {column.name for column in finding.columns}) for finding in one.findings]
+        groups: list[tuple[Finding | None, list[str]]] = [
+            (finding, [column for column in places if column in own]) for finding, own in owned if own & places.keys()
+        ]
+        # A harmonic's finding is its fundamental's.
+        groups += [(None, [column]) for column in places if not any(column in own for _, own in owned)]
+        for finding, columns in groups:
+            c, sd = (getattr(one.state.best, of)[[places[column] for column in columns]] for of in ("c", "sd"))
+            gain = finding.look.gain if finding else 0.5 * float(np.sum((c / np.maximum(sd, 1e-300)) ** 2))
+            offered.append((gain, name, finding, dict(Counter(map(regressor_key, columns)))))
+    kept: dict[str, float] = {}
+    out: list[tuple[str, Finding]] = []
+    used = len(stated)
+    for gain, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
+        more = {key: count for key, count in keys.items() if key not in kept}
+        if used + sum(more.values()) <= MOST_COLUMNS:
+            kept |= dict.fromkeys(more, gain)
+            used += sum(more.values())
+        elif finding is not None:
+            out.append((name, finding))
+    return kept, out
+
+
+def left_out(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
+    """Findings whose columns the model file has no room for, each with its axis. Those of most evidence are in it."""
+    return _fitting(model, found)[1]
+
+
+def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> list[dict[str, Any]]:
+    """Entries for the columns that were found, the most evidence first, as many as a model may have."""
+    kept = _fitting(model, found)[0]
     entries: dict[str, dict[str, Any]] = {}
-    strength: dict[str, float] = {}
     smoothed: set[str] = set()
     for name, one in found.items():
         group = model.group_of(name).name
         for k, regressor in enumerate(one.state.regressors):
-            if regressor.name in stated or not regressor.entry:
-                continue
             key = regressor_key(regressor.name)
-            own = CAUSES[regressor.cause].entry(_settled(one, regressor), record)
+            if key not in kept:
+                continue
+            finding = finding_of(one, regressor)
+            look = None if finding is None else finding.look
+            own = CAUSES[regressor.cause].entry(regressor.entry, look, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
             if (
                 CAUSES[regressor.cause].smoothed
@@ -97,33 +140,14 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
-            strength[key] = max(strength.get(key, 0.0), abs(c) / max(sd, 1e-300))
-    kept: list[dict[str, Any]] = []
-    used = len(stated)
-    for key in sorted(entries, key=lambda key: -strength[key]):
-        entry = entries[key]
-        columns = _columns_of(entry)
-        if used + columns <= MOST_COLUMNS:
-            if key in smoothed:
-                _smooth(entry, key, found)
-            kept.append(entry)
-            used += columns
-    return kept
+    for key in smoothed:
+        _smooth(entries[key], key, found)
+    return [entries[key] for key in kept]
 
 
-def _settled(one: Diagnosed, column: Column) -> Mapping[str, Any]:
-    """The entry of a column with the median of the posterior for the lag or the play that the search's grid gave it."""
-    key = NUMBER.get(str(column.entry.get("form", "")), "")
-    for finding in one.findings:
-        number = finding.look.estimate.get(key)
-        before = {known.name for known in finding.before.regressors}
-        if (
-            isinstance(number, Mapping)
-            and column.name not in before
-            and any(added is column for added in finding.after.regressors)
-        ):
-            return {**column.entry, key: digits(number["median"])}
-    return column.entry
+def finding_of(one: Diagnosed, column: Column) -> Finding | None:
+    """The finding that added a column to the model; None: the model file had it."""
+    return next((each for each in one.findings if column.name in {added.name for added in each.columns}), None)
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
@@ -209,37 +233,59 @@ def regressor_key(column: str) -> str:
 
 def _effects(name: str, one: Diagnosed) -> list[str]:
     """`--effect` texts that put what an axis has into a simulated record. The simulator itself has one effect of a
-    kind on an axis: the strongest. Those that a cause adds are all there."""
-    strongest: dict[object, tuple[Cause, float, dict[str, Any]]] = {}
-    for k, (cause, strength, pairs) in enumerate([*_of_columns(one), *_of_findings(one)]):
-        place = k if cause.several else cause.id
-        if place not in strongest or strongest[place][1] < strength:
-            strongest[place] = (cause, strength, pairs)
+    kind on an axis: the strongest. Those that a cause adds are all there. The forms of one channel are one effect."""
+    joined: dict[object, _Effect] = {}
+    for k, effect in enumerate([*_of_columns(one), *_of_findings(one)]):
+        place: object = (effect.cause.id, *effect.channel) if effect.channel else k
+        known = joined.get(place, replace(effect, strength=0.0))
+        sizes = {key: value for key, value in effect.keys.items() if value}
+        keys = {**effect.keys, **known.keys, **sizes}
+        joined[place] = replace(effect, strength=known.strength + effect.strength, keys=keys)
+    strongest: dict[object, _Effect] = {}
+    for k, effect in enumerate(joined.values()):
+        kind: object = k if effect.cause.several else effect.cause.id
+        if kind not in strongest or strongest[kind].strength < effect.strength:
+            strongest[kind] = effect
     texts = []
-    for cause, _, pairs in strongest.values():
-        where = {} if cause.common else {"axis": name}
-        values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in pairs.items()}
-        texts.append(f"{cause.id}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
+    for effect in strongest.values():
+        where = {} if effect.cause.common else {"axis": name}
+        values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in effect.keys.items()}
+        texts.append(f"{effect.cause.id}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
     return texts
 
 
-def _of_findings(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]:
-    """Cause, strength in nats, and the effect's keys, of what is no column. The lattice and the range are in the
-    groups."""
+@dataclass(frozen=True)
+class _Effect:
+    """An effect of the simulator: `strength` in nats, its `keys`, and the channel and input that it follows."""
+
+    cause: Cause
+    strength: float
+    keys: dict[str, Any]
+    channel: tuple[str, ...] = ()
+
+
+def _channel_of(column: Column) -> tuple[str, ...]:
+    """Channel and input of a column."""
+    return form_of(column)[:2] if "column" in column.entry else ()
+
+
+def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
+    """Of the findings. The lattice and the range are in the groups."""
     for finding in one.findings:
         cause = CAUSES[finding.look.cause]
         keys = cause.of_estimate(finding.look) if cause.of_estimate is not None else None
         if keys is not None:
-            yield cause, finding.look.gain, keys
+            channel = _channel_of(finding.columns[0]) if finding.columns else ()
+            yield _Effect(cause, finding.look.gain, keys, channel)
 
 
-def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]:
-    """Cause, strength in nats, and the effect's keys, of the columns in an axis' model."""
+def _of_columns(one: Diagnosed) -> Iterator[_Effect]:
+    """Of the columns that the model file had."""
     fit = one.state.best
     sizes: dict[str, list[int]] = {}
     for k, column in enumerate(one.state.regressors):
-        sizes.setdefault(regressor_key(column.name), []).append(k)
-    forms: dict[tuple[str, str, str], tuple[Cause, float, dict[str, Any]]] = {}
+        if finding_of(one, column) is None:
+            sizes.setdefault(regressor_key(column.name), []).append(k)
     for places in sizes.values():
         column = one.state.regressors[places[0]]
         c = [float(fit.c[1 + k]) for k in places]
@@ -248,15 +294,7 @@ def _of_columns(one: Diagnosed) -> Iterator[tuple[Cause, float, dict[str, Any]]]
         )
         cause = CAUSES.get(column.cause)
         if cause is not None and cause.of_column is not None:
-            pairs = cause.of_column(replace(column, entry=_settled(one, column)), c)
-            if "column" not in column.entry:
-                yield cause, strength, pairs
-                continue
-            # The forms of one channel are one effect.
-            key = (cause.id, str(column.entry["column"]), str(column.entry.get("input", "value")))
-            _, before, others = forms.get(key, (cause, 0.0, {}))
-            forms[key] = (cause, before + strength, {**pairs, **others} | {k: v for k, v in pairs.items() if v})
-    yield from forms.values()
+            yield _Effect(cause, strength, cause.of_column(column, c), _channel_of(column))
 
 
 def check_not_by_hand(path: Path | str) -> None:

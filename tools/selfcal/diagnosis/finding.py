@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, State
+from selfcal.diagnosis.state import Look, Regressor, State
 from selfcal.diagnosis.statistics import Statistic
 
+#: Rounds at most: a recording that holds more is told as it is then.
+ROUNDS = 12
 #: A finding whose gain lies so many standard deviations below 0 is none.
 HARM_SD = 2.0
 
@@ -42,6 +44,12 @@ class Finding:
     shared_with: tuple[str, ...] = ()
     partner: State | None = None
     held_out: HeldOut | None = None
+
+    @property
+    def columns(self) -> tuple[Regressor, ...]:
+        """The columns that it added to the model."""
+        known = {one.name for one in self.before.regressors}
+        return tuple(one for one in self.after.regressors if one.name not in known)
 
 
 @dataclass

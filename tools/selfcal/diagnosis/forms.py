@@ -17,18 +17,25 @@ import numpy as np
 from scipy.fft import rfft
 from scipy.stats import chi2
 
-from selfcal.diagnosis.cause import Channels, Key, positive
+from selfcal.diagnosis.cause import Channels, Key, medians, positive
 from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
 from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import FORMS, NUMBER, POWER, formed, slope
+from selfcal.forms import NUMBER, POWER, formed, slope
 from selfcal.recording import SIDE_CHANNELS
 from selfcal.regressors import coefficient_unit
 from selfcal.units import power
 
+#: Forms, the simplest first. `first_order` is (coefficient + rate s) / (1 + lag_s s): static, a lag, and a filtered
+#: rate are cases of it.
+FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play")
 #: The columns of each form: a power comes with all that are simpler.
-PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube")}
+PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube"), "first_order": ("static", "lag")}
+#: Forms with a time constant of a lag.
+LATE = ("lag", "first_order")
+#: Forms that `first_order` is a sum of.
+FIRST_ORDER = ("static", "lag", "rate")
 #: Estimate key of a column's coefficient; of all others `coefficient`.
 KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
@@ -48,7 +55,7 @@ REFITTED, REFIT_ADDS = 3, 3.0
 #: A drift of less: where a form has pulled the drift up, its score is too small there.
 STIFFER = 1.5
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
-LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "cube": 2.0, "play": 3.0}
+LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "first_order": 3.0, "cube": 2.0, "play": 3.0}
 #: Numbers of a lag or a play that stand for its posterior.
 FINE = 15
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
@@ -93,7 +100,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Option:
-    """One form with its number: a time constant, s, or a width; `regressors` are its columns."""
+    """One form with its number: a time constant, s, or a width; `regressors` are its columns in the model file."""
 
     form: str
     number: float
@@ -102,7 +109,12 @@ class Option:
 
     @property
     def columns(self) -> Array:
-        return np.array([one.values for one in self.regressors])
+        """Those whose coefficients are the estimate's; they span the same."""
+        columns = np.array([one.values for one in self.regressors])
+        if self.form == "first_order":
+            value, late = columns
+            return np.array([late, (value - late) / self.number])
+        return columns
 
 
 def side_looks(state: State, record: Record, cause: str) -> list[Look]:
@@ -185,9 +197,10 @@ def options_of(channel: Channel, state: State) -> Iterator[Option]:
     middle = widths[len(widths) // 2]
     known = _known(state)
     for form in channel.forms:
-        if (channel.column, channel.input, form) in known:
+        parts = PARTS[form] if form == "first_order" else (form,)
+        if any((channel.column, channel.input, part) in known for part in parts):
             continue
-        if form == "lag":
+        if form in LATE:
             yield from (column_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
         elif form == "rate":
             windows = [max(window, dt) for window in channel.rate_windows_s if window <= n * dt / 6.0]
@@ -237,9 +250,10 @@ def _look(state: State, channel: Channel) -> list[Look]:
     if best < 1.0:
         return []
     alike = [form for form in FORMS if form in tried and tried[form].net > best - ALIKE]
-    if "lag" in alike and tried["lag"].option.number > LONGEST_LAG / 2.0 * channel.values.size * state.dt:
-        # The longest lag that is looked at sums the channel up: any slower change of it looks so.
-        alike.append(alike.pop(alike.index("lag")))
+    for form in LATE:
+        if form in alike and tried[form].option.number > LONGEST_LAG / 2.0 * channel.values.size * state.dt:
+            # The longest lag that is looked at sums the channel up: any slower change of it looks so.
+            alike.append(alike.pop(alike.index(form)))
     chosen = tried[alike[0]]
     if not channel.slow:
         constant = [form for form in alike if _constant(state, tried[form])]
@@ -258,9 +272,31 @@ def _look(state: State, channel: Channel) -> list[Look]:
             return []
     rivals = [form for form in alike if form != chosen.option.form]
     estimate = _estimate(state, channel, chosen) | ({"form_also_possible": rivals} if rivals else {})
-    changes = {"regressors": (*state.regressors, *chosen.option.regressors)}
-    measure = partial(_measured, state, channel, chosen)
-    return [Look(channel.cause, chosen.gain, chosen.net, estimate, changes, measure=measure)]
+    before, chosen = _whole(state, channel, chosen)
+    if before is not state:
+        estimate = _estimate(state, channel, chosen)
+    changes = {"regressors": (*before.regressors, *chosen.option.regressors)}
+    measure = partial(_measured, channel, chosen)
+    look = Look(channel.cause, chosen.gain, chosen.net, estimate, changes, measure=measure)
+    return [look if before is state else replace(look, before=before)]
+
+
+def _whole(state: State, channel: Channel, chosen: _Tried) -> tuple[State, _Tried]:
+    """`first_order` in the place of its parts that the state has and the one chosen, if it explains no less than they
+    together, and the state without; else both as they are."""
+    parts = {(channel.column, channel.input, part) for part in FIRST_ORDER}
+    own = {one.name for one in state.regressors if form_of(one) in parts}
+    if not own or chosen.option.form not in FIRST_ORDER or "first_order" not in channel.forms:
+        return state, chosen
+    before = state.without(own).refit()
+    tried = _tried(before, replace(channel, forms=("first_order",)))
+    if not tried:
+        return state, chosen
+    whole = tried["first_order"]
+    gain = before.best.ln_likelihood + whole.gain - state.best.ln_likelihood
+    if gain < chosen.gain:
+        return state, chosen
+    return before, replace(whole, gain=gain, net=_worth(channel, chosen.option, gain))
 
 
 def _tried(state: State, channel: Channel) -> dict[str, _Tried]:
@@ -345,15 +381,18 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
     return float(-chi2.logsf(chi, freedom)) if freedom > 0 else 0.0
 
 
-def _keys(state: State, chosen: _Tried) -> list[tuple[str, str]]:
+def _keys(state: State, option: Option) -> list[tuple[str, str]]:
     """Key and unit of each coefficient of a form."""
-    columns = chosen.option.regressors
+    if option.form == "first_order":
+        unit = coefficient_unit(state.unit, option.regressors[0].unit)
+        return [("coefficient", unit), ("rate", coefficient_unit(state.unit, f"{option.regressors[0].unit}/s"))]
+    columns = option.regressors
     return [(KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in columns]
 
 
 def _estimate(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
     """The coefficients as the fit has them."""
-    keys = _keys(state, chosen)
+    keys = _keys(state, chosen.option)
     places = range(chosen.fit.c.size - len(keys), chosen.fit.c.size)
     sizes = {
         key: interval(float(chosen.fit.c[place]), float(chosen.fit.sd[place]), unit)
@@ -363,50 +402,47 @@ def _estimate(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
     return {**sizes, "form": chosen.option.form, **window, "input": channel.input, **channel.extra}
 
 
-def _measured(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
+def _measured(channel: Channel, chosen: _Tried, state: State) -> dict[str, Any]:
     """Intervals of the coefficients and of the form's number."""
     option = chosen.option
     form = option.form
     alternatives = [option]
-    shaped = form in ("lag", "play")
+    shaped = form in (*LATE, "play")
     if shaped:
         alternatives += [
             column_of(channel, state, form, number, option.window * state.dt if option.window > 1 else 0.0)
             for number in _around(state, channel, chosen)
         ]
     weight, means, sds = state.posterior(*(one.columns for one in alternatives))
-    kept = (
-        _kept(state, chosen.fit, option.columns[0], channel, option.window)
-        if form == "static" and channel.noisy
-        else 1.0
-    )
+    kept = _kept(state, option.columns[0], channel, option.window) if form == "static" and channel.noisy else 1.0
     sizes = {
         key: mixture(weight.ravel(), means[..., j].ravel() / kept, sds[..., j].ravel() / kept, unit)
-        for j, (key, unit) in enumerate(_keys(state, chosen))
+        for j, (key, unit) in enumerate(_keys(state, option))
     }
     if shaped:
         numbers = np.array([one.number for one in alternatives])
         # The deviation within a cell of the grid: its width over the root of 12.
         apart = np.gradient(np.sort(numbers))[np.argsort(np.argsort(numbers))] / math.sqrt(12.0)
         total = weight.sum(axis=1)
-        sizes[NUMBER[form]] = mixture(total, numbers, apart, "s" if form == "lag" else channel.of)
+        late = form in LATE
+        sizes[NUMBER["lag" if late else form]] = mixture(total, numbers, apart, "s" if late else channel.of)
     return sizes
 
 
 def _around(state: State, channel: Channel, chosen: _Tried) -> list[float]:
     """Numbers about the best one, over all that the record leaves possible."""
     options = [one for one in options_of(channel, state) if one.form == chosen.option.form]
-    gains = state.scores([one.columns for one in options], chosen.fit)
+    gains = state.scores([one.columns for one in options])
     numbers = np.array([one.number for one in options])
     possible = numbers[gains > gains.max() - 2.0 * ALIKE]
     factor = float(numbers[1] / numbers[0]) if numbers.size > 1 else 2.0
     low, high = float(possible.min()) / factor, float(possible.max()) * factor
-    if chosen.option.form == "lag":
+    if chosen.option.form in LATE:
         high = min(high, LONGEST_LAG * channel.values.size * state.dt)
     return [float(x) for x in np.geomspace(low, high, FINE)]
 
 
-def _kept(state: State, fit: Fit, column: Array, channel: Channel, window: int) -> float:
+def _kept(state: State, column: Array, channel: Channel, window: int) -> float:
     """Share of a coefficient that the own noise of a channel leaves: the share of the information that is none of it.
 
     `column` is the channel smoothed over `window` samples. Neighbouring readings differ by their noise alone. It is
@@ -416,6 +452,7 @@ def _kept(state: State, fit: Fit, column: Array, channel: Channel, window: int) 
     noise = math.sqrt(0.5 * float(np.var(np.diff(channel.values)))) * random.standard_normal((NOISES, column.size))
     columns = np.vstack([column, *(smoothed(row, window) for row in noise)])
     known = 1 + len(state.regressors) + 1
+    fit = state.best
     G = run(state.series.beside(columns), fit.terms, fit.theta)[0][0].G
     cross = G[1:known, known]
     information = G[known, known] - cross @ np.linalg.pinv(G[1:known, 1:known], rcond=1e-12, hermitian=True) @ cross
@@ -450,7 +487,10 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
         if NUMBER[form] in keys:
             late = formed(values, form, float(keys[NUMBER[form]]), 0.0, interval_s)
             total += float(keys["coefficient"]) * (late - values)
-    if "rate" in keys:
+    if "rate" in keys and "lag_s" in keys and "window_s" not in keys:
+        late = formed(values, "lag", float(keys["lag_s"]), 0.0, interval_s)
+        total += float(keys["rate"]) * (values - late) / float(keys["lag_s"])
+    elif "rate" in keys:
         window_s = float(keys.get("window_s", RATE_WINDOW_S))
         total += float(keys["rate"]) * slope(values, window_s, interval_s)
     for form in POWER:
@@ -472,3 +512,9 @@ def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
 def of_other(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
     """The same of another axis."""
     return {**of_column(column, c), "other": str(column.entry["column"])}
+
+
+def of_look(look: Look) -> dict[str, Any]:
+    """Keys of `simulate --effect` for a finding. A slope needs its window, and every form a coefficient."""
+    window = {key: look.estimate[key] for key in (NUMBER["rate"], "other") if key in look.estimate}
+    return {"coefficient": 0.0, **medians(look), **window}

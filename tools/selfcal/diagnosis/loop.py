@@ -10,7 +10,7 @@ from dataclasses import replace
 from selfcal.diagnosis import integrity, score, work
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
-from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import judged
@@ -23,8 +23,6 @@ LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cau
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY: tuple[Looks, ...] = tuple(cause.before_motion for cause in CAUSES.values() if cause.before_motion)
 CERTAIN = 25.0
-#: Rounds at most: a recording that holds more is told as it is then.
-ROUNDS = 12
 #: Looks of a cause at an axis of a record, by the record's states: these stay alive with it.
 Seen = dict[tuple[Looks, tuple[int, ...]], tuple[list[Look], Record]]
 #: Why an axis is not done.
@@ -98,11 +96,17 @@ def _stated(state: State) -> bool:
 
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
-    """What is left over, and the statistics of the model that the loop began with."""
+    """Sizes in the final model, what is left over, and the statistics of the model that the loop began with."""
     advance(f"{one.state.axis}: statistics")
-    one.findings = [finding for finding in one.findings if finding.round <= ROUNDS]
+    one.findings = [_measured(finding, one.state) for finding in one.findings if finding.round <= ROUNDS]
     _unexplained(one)
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
+
+
+def _measured(finding: Finding, final: State) -> Finding:
+    """The finding with its sizes beside all others: a later column may have taken a part of an earlier one."""
+    beside = final.without({column.name for column in finding.columns})
+    return replace(finding, look=finding.look.measured(beside))
 
 
 def _provisional(
@@ -216,7 +220,8 @@ def _rounds(
                 looks, idle, waiting = _by_worth([*looks, *more]), idle | unworthy, []
             if not looks or looks[0].net < least:
                 return
-            best, before, after = looks[0], one.state, one.state.refit(**looks[0].changes)
+            best, after = looks[0], one.state.refit(**looks[0].changes)
+            before = best.before or one.state
             known = None if provisional else score.gain(best, before, after, record)
             harms = known is not None and known.harms
             if harms:
@@ -227,9 +232,18 @@ def _rounds(
             dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
         )
         one.state = after
-        measured = best if provisional else best.measured()
-        one.findings.append(Finding(measured, number, before, after, rivals, held_out=known))
+        replaced = [finding for finding in one.findings if _gone(finding, after)]
+        best = replace(best, gain=best.gain + sum(finding.look.gain for finding in replaced))
+        best = replace(best, net=best.net + sum(finding.look.net for finding in replaced))
+        one.findings = [finding for finding in one.findings if finding not in replaced]
+        one.findings.append(Finding(best, number, before, after, rivals, held_out=known))
         number += 1
+
+
+def _gone(finding: Finding, state: State) -> bool:
+    """Whether a later finding took the place of this one's columns."""
+    kept = {id(column) for column in state.regressors}
+    return bool(finding.columns) and not any(id(column) in kept for column in finding.columns)
 
 
 def _looked(

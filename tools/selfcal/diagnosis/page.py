@@ -387,20 +387,12 @@ def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
         told += "; ".join(f"{escape(axis)}: {escape(size)}" for (axis, _, _), size in zip(members, sizes, strict=True))
         told += "."
     nats = sorted(_nats(finding) for finding in findings)
-    evidence = _evidence(first) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
+    evidence = words.evidence(first, _whole) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
     text = f"<strong>{cause_name(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
     if len(members) == 1 and first.get("inflation_words"):
         text += f" {escape(str(first['inflation_words']))}"
     if first.get("record_next"):
         text += f" <strong>Do:</strong> {escape(str(first['record_next']))}"
-    return text
-
-
-def _evidence(finding: Mapping[str, Any]) -> str:
-    text = f"{_whole(_nats(finding))} nats"
-    net = finding.get("net_nats")
-    if net is not None and math.isfinite(net):
-        text += f", {_whole(net)} net of the search"
     return text
 
 
@@ -498,7 +490,7 @@ def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     when = finding.get("when")
     if when:
         yield "When", f"{number(when[0], 6)} s" + ("" if when[0] == when[1] else f" to {number(when[1], 6)} s")
-    yield "Evidence", _evidence(finding)
+    yield "Evidence when found", words.evidence(finding, _whole)
     if finding.get("shared_with"):
         yield "Also on", escape(", ".join(finding["shared_with"]))
     if finding.get("also_possible"):

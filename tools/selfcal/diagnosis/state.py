@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -107,6 +107,10 @@ class State:
         _, white, s = run(series, chosen.terms, chosen.theta, innovations=True)
         residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
         return replace(state, whitened=residual, variance=s * chosen.sigma**2)
+
+    def without(self, names: Collection[str]) -> State:
+        """The state less some columns. Its fits are still those with them, from which a fit beside it starts."""
+        return replace(self, regressors=tuple(one for one in self.regressors if one.name not in names))
 
     def stiffer(self, by: float) -> list[Fit]:
         """The best fit with a drift smaller by exp(-by), if it has one."""
@@ -252,7 +256,9 @@ def ln_looks(bend: Array, gain: float) -> float:
 @dataclass(frozen=True)
 class Look:
     """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
-    interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be."""
+    interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
+    beside a model that lacks the look's columns alone. `before`: the state less earlier columns of its channel, which
+    it takes the place of."""
 
     cause: str
     gain: float
@@ -263,18 +269,19 @@ class Look:
     when: tuple[float, float] | None = None
     shown_by: str = ""
     others: tuple[str, ...] = ()
-    measure: Callable[[], Mapping[str, Any]] | None = None
+    measure: Callable[[State], Mapping[str, Any]] | None = None
+    before: State | None = None
 
     def repeats(self, other: Look) -> bool:
         """Whether both are the same cause of the same channel."""
         channels = [(one.cause, one.estimate.get("other"), one.estimate.get("channel")) for one in (self, other)]
         return channels[0] == channels[1]
 
-    def measured(self) -> Look:
-        """The look with the intervals that `measure` has, where they take work that only a taken look is worth."""
+    def measured(self, beside: State) -> Look:
+        """The look with the sizes that `measure` has beside a model."""
         if self.measure is None:
             return self
-        return replace(self, estimate={**self.estimate, **self.measure()}, measure=None)
+        return replace(self, estimate={**self.estimate, **self.measure(beside)})
 
 
 def interval(value: float, sd: float, unit: str) -> dict[str, Any]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.finding import ROUNDS
 
 
 def verdict(axis: Mapping[str, Any]) -> str:
@@ -41,6 +42,7 @@ FORMS = {
     "lag": "late by a first-order lag",
     "rate": "by its rate",
     "square": "by its square as well",
+    "first_order": "by its value and its rate behind one first-order lag",
     "cube": "by its cube as well",
     "play": "through a play (hysteresis)",
 }
@@ -83,12 +85,21 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
             parts += [FORMS[value]] if value in FORMS else []
         elif key == "form_also_possible":
             parts.append(f"not to be told from {', '.join(value)}")
-        elif key == "input":
+        elif key in ("input", "source"):
             continue
         else:
             parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
     text = ", ".join(parts)
-    return f"{CAUSES[cause].words} {text[:1].upper()}{text[1:]}."
+    begin = CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
+    return f"{begin} {text[:1].upper()}{text[1:]}."
+
+
+def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f}".format) -> str:
+    """What a finding gained when it was found, over the model with the findings of earlier rounds."""
+    found = finding.get("found_in_round", 0)
+    text = f"{number(finding['evidence_gain_nats'])} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
+    net = finding.get("net_nats")
+    return text if net is None or not math.isfinite(net) else f"{text}, {number(net)} net of the search"
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:

@@ -13,10 +13,10 @@ from typing import Any, Unpack
 from rich.console import Console
 
 from selfcal.diagnosis import words, work
-from selfcal.diagnosis.document import SCHEMA, to_document
-from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended
-from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.loop import INTERRUPTED, ROUNDS, diagnose_record
+from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
+from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
+from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
+from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, carried, of_recording, why_left_out
 from selfcal.diagnosis.verdict import joined, of_checks
 from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
@@ -136,7 +136,8 @@ def diagnose(
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
             tree = extended(loaded, record, found)
-            document = to_document(recording, found, errors, tree, first)
+            out = left_out(loaded, found)
+            document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
@@ -145,6 +146,9 @@ def diagnose(
             _add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path))
+                if out:
+                    told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
+                    note(f"{write_model} leaves out {told}: {NO_ROOM}")
             if report is not None:
                 from selfcal.diagnosis.page import write_page
 
@@ -166,15 +170,17 @@ def _add_carried(
     found: Mapping[str, Diagnosed],
     second: Recording,
 ) -> None:
-    """The gain of each finding on a second recording."""
+    """The gain of each finding on a second recording, and of all on an axis together."""
     from selfcal.diagnosis.carried import gains
 
     document["on"] = recording_entry(second)
-    for name, each in gains(model, tree, record, found, second).items():
-        for finding, one in zip(document["axes"][name]["findings"], each, strict=True):
-            finding["gain_on"] = one.gain
+    for name, (each, together) in gains(model, tree, record, found, second).items():
+        axis = document["axes"][name]
+        pairs = zip(axis["findings"], each, strict=True)
+        for entry, one in [*pairs, *([(axis, together)] if each else [])]:
+            entry["gain_on"] = one.gain
             if one.gain is None:
-                finding["gain_on_reason"] = one.reason
+                entry["gain_on_reason"] = one.reason
 
 
 def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> dict[str, Diagnosed]:
@@ -298,13 +304,16 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         for finding in axis["findings"]:
             for line in _lines(finding):
                 console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
+        if len(axis["findings"]) > 1:
+            for line in words.carried(axis):
+                console.print(f"  all causes together: {line}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:
     """One finding in a few lines."""
     gain = finding["gain"]
     lines = [f"{finding['cause']}: {finding['words']}"]
-    evidence = f"  evidence {finding['evidence_gain_nats']:.1f} nats, {finding['net_nats']:.1f} net of the search"
+    evidence = f"  evidence {words.evidence(finding)}"
     if finding["when"]:
         evidence += f"; at {finding['when'][0]:.6g} s"
         evidence += "" if finding["when"][0] == finding["when"][1] else f" to {finding['when'][1]:.6g} s"

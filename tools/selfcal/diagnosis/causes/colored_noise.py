@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
 from selfcal.diagnosis.causes import quantization_noise
-from selfcal.diagnosis.fit import best, fit, moved
+from selfcal.diagnosis.fit import Fit, best, fit, moved
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State, interval, net
@@ -40,16 +40,20 @@ def looks(state: State, record: Record) -> list[Look]:
             fits.append(fit(state.series, terms, start))
         chosen = best(fits)
         gain = chosen.ln_likelihood - state.best.ln_likelihood
-        m = math.tanh(chosen.value("color"))
         if chosen.quantized:
             found.append(quantization_noise.look_of(chosen, gain, state, extras))
             continue
-        lag1 = m / (1.0 + m * m) if color == "ma" else m
-        sd = (1.0 - lag1 * lag1) / math.sqrt(n)
-        found.append(Look("colored_noise", gain, net(gain), {"lag1": interval(lag1, sd, "1")}, {"extras": extras}))
+        sizes, changes = _sizes(chosen), {"extras": extras}
+        found.append(Look("colored_noise", gain, net(gain), sizes, changes, measure=lambda final: _sizes(final.best)))
     average, process = found
     counter = average.cause == "quantization_noise"
     return [average if average.gain > process.gain - ALIKE * counter else process]
+
+
+def _sizes(chosen: Fit) -> dict[str, Any]:
+    m = math.tanh(chosen.value("color"))
+    lag1 = m / (1.0 + m * m) if chosen.terms.color == "ma" else m
+    return {"lag1": interval(lag1, (1.0 - lag1 * lag1) / math.sqrt(chosen.n), "1")}
 
 
 def _extend(at: Extension) -> None:

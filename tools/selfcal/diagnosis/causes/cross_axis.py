@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from selfcal.diagnosis import forms
-from selfcal.diagnosis.cause import Cause, Key, shown
-from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.forms import Channel
+from selfcal.diagnosis.cause import Cause, Key, shown, sized
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import ALIKE, Look, State
+from selfcal.forms import formed
 from selfcal.regressors import coefficient_unit
 
 #: Windows of a rate, s: another axis moves faster than a temperature.
@@ -34,7 +36,7 @@ def looks(state: State, record: Record) -> list[Look]:
                 record.axes[name].unit,
                 values,
                 rate_windows_s=RATE_WINDOWS_S,
-                forms=("static", "lag", "rate", "square"),
+                forms=("static", "lag", "rate", "square", "first_order"),
                 slow=False,
                 ln_looks=math.log(len(others)),
                 extra={"other": name},
@@ -69,7 +71,37 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             one.findings.remove(finding)
             one.state = without(one.state, other)
             changed.append(name)
+    for name, one in found.items():
+        for k, finding in enumerate(one.findings):
+            if finding.look.cause == "cross_axis" and not _source_shown(record, found, name, finding):
+                estimate = {**finding.look.estimate, "source": "not shown"}
+                one.findings[k] = replace(finding, look=replace(finding.look, estimate=estimate))
     return changed
+
+
+def _source_shown(record: Record, found: Mapping[str, Diagnosed], name: str, finding: Finding) -> bool:
+    """Whether the record shows that the other axis is the source: not this one, and no third one of both.
+
+    The joint likelihood of both axes must be clearly larger with this one following than with the other following. A
+    lag has a direction in time as well: where the other axis' future explains as much as its past, or adds to it, both
+    follow a third.
+    """
+    other = str(finding.look.estimate["other"])
+    final = found[name].state
+    free = without(final, other)
+    ahead = final.best.ln_likelihood - free.best.ln_likelihood
+    source = without(found[other].state if other in found else record.axes[other], name)
+    back = source.with_columns(record.other_axes(other)[name])[0]
+    if ahead - back <= ALIKE:
+        return False
+    if "lag_s" not in finding.look.estimate:
+        return True
+    lag_s = float(finding.look.estimate["lag_s"]["median"])
+    early = formed(record.other_axes(name)[other][::-1], "lag", lag_s, 0.0, final.dt)[::-1]
+    beside = final.without({one.name for one in finding.columns if form_of(one)[2] == "lag"})
+    instead = beside.fitted_with(final.best.terms, early).ln_likelihood
+    both = final.fitted_with(final.best.terms, early).ln_likelihood
+    return final.best.ln_likelihood - instead > ALIKE and both - final.best.ln_likelihood < ALIKE
 
 
 def without(state: State, other: str) -> State:
@@ -88,23 +120,27 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
     return {"coefficient": (sizes[worst], coefficient_unit(state.unit, record.axes[worst].unit))}
 
 
-def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """A module knows the reading and not its level."""
+    own = sized(entry, look, record)
     if entry.get("form") == "rate":
-        return dict(entry)
-    return {**entry, "reference": digits(record.axes[str(entry["column"])].level)}
+        return own
+    return {**own, "reference": digits(record.axes[str(entry["column"])].level)}
 
 
 CAUSE = Cause(
     "cross_axis",
-    "Another axis leaks into this one.",
-    "Turn the sensor so that the other axis reads something else.",
+    words="Another axis leaks into this one.",
+    unsure="This axis and another one move together. The record does not show which of them is the source: it may be a "
+    "third one that was not recorded, such as the temperature.",
+    record_next="Turn the sensor so that the other axis reads something else. Record temperature and supply beside it.",
     looks=looks,
     settle=_settle,
     pictures=shown("means", "evidence"),
     least=_least,
     entry=_entry,
     of_column=forms.of_other,
+    of_estimate=forms.of_look,
     keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
     add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
     follows=True,

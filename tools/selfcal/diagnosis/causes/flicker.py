@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
 from selfcal.diagnosis.fit import Fit, best, fit, ln_likelihood, moved, run
@@ -30,17 +31,13 @@ def looks(state: State, record: Record) -> list[Look]:
     worth = net(gain, 1, LN_LOOKS)
     if worth < 1.0:
         return []
+    sizes = _sizes(state, chosen)
+    return [Look("flicker", gain, worth, sizes, {"extras": extras}, measure=lambda final: _sizes(final, final.best))]
+
+
+def _sizes(state: State, chosen: Fit) -> dict[str, Any]:
     B = chosen.sigma * math.exp(chosen.value("ln_flicker"))
-    sd_ln = _curvature(state, chosen, "ln_flicker")
-    return [
-        Look(
-            "flicker",
-            gain,
-            worth,
-            {"B": _log_interval(B, sd_ln, state.unit)},
-            {"extras": extras},
-        )
-    ]
+    return {"B": _log_interval(B, _curvature(state, chosen, "ln_flicker"), state.unit)}
 
 
 def _log_interval(value: float, sd_ln: float, unit: str) -> dict[str, object]:

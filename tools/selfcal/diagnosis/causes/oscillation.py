@@ -61,12 +61,17 @@ def looks(state: State, record: Record) -> list[Look]:
     period = math.exp(chosen.value("ln_period"))
     if worth < 1.0 or period * TURNS_LEAST > state.y.size * state.dt:
         return []
-    estimate = {
+    changes, unit = {"extras": extras, "fits": tuple(fits)}, state.unit
+    sizes = _sizes(chosen, unit)
+    return [Look("oscillation", gain, worth, sizes, changes, measure=lambda final: _sizes(final.best, unit))]
+
+
+def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
+    return {
         "period_s": _interval(chosen, "ln_period", 1.0, "s"),
         "damping": _interval(chosen, "ln_damping", 1.0, "1"),
-        "sd": _interval(chosen, "ln_swing", chosen.sigma, state.unit),
+        "sd": _interval(chosen, "ln_swing", chosen.sigma, unit),
     }
-    return [Look("oscillation", gain, worth, estimate, {"extras": extras, "fits": tuple(fits)})]
 
 
 def _search(state: State) -> dict[str, float] | None:
@@ -153,19 +158,19 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
 
 def _extend(at: Extension) -> None:
     """A law of a walk beside the oscillation, whose size is free. One that states the same period already serves."""
-    estimate, one = at.finding.look.estimate, at.finding.after.best
+    estimate, final = at.finding.look.estimate, at.found[at.axis].state
     period = estimate["period_s"]
     if any(period["q05"] <= other <= period["q95"] for other in _periods(at.tree)):
         return
     w = 2.0 * math.pi / period["median"]
-    walk = next(fit for fit in at.finding.after.fits if fit.terms.walk)
+    walk = next(fit for fit in final.fits if fit.terms.walk)
     K = max(walk.K, 2.0 * float(at.group["priors"]["K"]["min"]))
     ratio = estimate["sd"]["median"] * math.sqrt(w) / K
     low, high = (min(max(by * ratio, RATIO_LIMITS[0]), RATIO_LIMITS[1]) for by in RATIOS)
     term = {
         "kind": "oscillation",
         "period_s": digits(period["median"]),
-        "damping": digits(min(max(math.exp(one.value("ln_damping")), DAMPING_LIMITS[0]), DAMPING_LIMITS[1])),
+        "damping": digits(min(max(estimate["damping"]["median"], DAMPING_LIMITS[0]), DAMPING_LIMITS[1])),
         "deviation": "ratio",
     }
     add_law(

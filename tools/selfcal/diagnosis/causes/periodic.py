@@ -81,8 +81,12 @@ def _band(state: State, record: Record) -> list[Look]:
     if worth < 1.0 or half_width * NARROW > centre:
         return []
     extras = replace(state.extras, bands=(*state.extras.bands, (centre, half_width, chosen.value("ln_band"))))
-    rms = chosen.sigma * math.exp(chosen.value("ln_band"))
+    share = math.exp(chosen.value("ln_band"))
     turns = max(1.0, half_width * n * state.dt)
+
+    def amplitude(sigma: float) -> dict[str, Any]:
+        return interval(math.sqrt(2.0) * sigma * share, sigma * share / math.sqrt(turns), state.unit)
+
     return [
         Look(
             "periodic",
@@ -90,11 +94,12 @@ def _band(state: State, record: Record) -> list[Look]:
             worth,
             {
                 "frequency_hz": interval(centre, half_width / math.sqrt(turns), "Hz"),
-                "amplitude": interval(rms * math.sqrt(2.0), rms / math.sqrt(turns), state.unit),
+                "amplitude": amplitude(chosen.sigma),
                 "width_hz": interval(half_width, half_width / math.sqrt(turns), "Hz"),
             },
             {"extras": extras},
             shown_by="band",
+            measure=lambda final: {"amplitude": amplitude(final.best.sigma)},
         )
     ]
 
@@ -165,7 +170,7 @@ def _line(state: State, record: Record) -> list[Look]:
             pair = columns(f)
     amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
 
-    def measure() -> dict[str, Any]:
+    def measure(state: State) -> dict[str, Any]:
         weight, means, sds = (of[0] for of in state.posterior(pair))
         return {"amplitude": mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)}
 
@@ -277,10 +282,6 @@ def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
     return {"frequency_hz": float(column.entry["frequency_hz"]), "amplitude": math.hypot(*c)}
 
 
-def _of_estimate(look: Look) -> dict[str, Any] | None:
-    return medians(look, "frequency_hz", "amplitude") if "width_hz" in look.estimate else None
-
-
 CAUSE = Cause(
     "periodic",
     "A periodic disturbance of one frequency is in the readings.",
@@ -294,7 +295,7 @@ CAUSE = Cause(
     trained=_trained,
     least=_least,
     of_column=_of_column,
-    of_estimate=_of_estimate,
+    of_estimate=lambda look: medians(look, "frequency_hz", "amplitude"),
     keys={
         "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
         "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),

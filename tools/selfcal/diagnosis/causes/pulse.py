@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, raised, scan
 from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
 from selfcal.diagnosis.forms import LN_SLOW
@@ -66,7 +66,7 @@ def looks(state: State, record: Record) -> list[Look]:
     tried = [one for one in moved if one[1] >= EDGE and one[2] <= n - EDGE and one[2] - one[1] >= SHORTEST]
     if not tried:
         return []
-    gain, begin, end, fit = max(tried, key=lambda one: one[0])
+    gain, begin, end, _ = max(tried, key=lambda one: one[0])
     found = raised(n, begin, end)
     worth = _worth(steps, gain)
     if worth < 1.0:
@@ -80,9 +80,9 @@ def looks(state: State, record: Record) -> list[Look]:
     times = [float(record.time_s[place]) for place in (begin, end)]
     entry = {"kind": "pulse", "start_s": times[0], "end_s": times[1]}
     column = Regressor(_name(*times), "pulse", found, "1", entry)
-    estimate = posterior(state, record.time_s, begin, end, fit, brief=True)
+    estimate = posterior(record.time_s, begin, end, state, brief=True)
     changes = {"regressors": (*state.regressors, column)}
-    measure = partial(posterior, state, record.time_s, begin, end, fit)
+    measure = partial(posterior, record.time_s, begin, end)
     return [Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]), measure=measure)]
 
 
@@ -208,12 +208,13 @@ def _other(state: State, fit: Fit, place: int, after: bool) -> Pulses:
     return Pulses(score / fit.sigma**2 * (1.0 if after else -1.0), A / fit.sigma**2, none)
 
 
-def posterior(state: State, time_s: Array, begin: int, end: int, fit: Fit, brief: bool = False) -> dict[str, Any]:
+def posterior(time_s: Array, begin: int, end: int, state: State, brief: bool = False) -> dict[str, Any]:
     """Time, duration and amplitude over every near drift and its parameters' spread; of a `brief` one at the best.
 
     The two times hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
     ln_weight, amplitude, sd, starts, ends = [], [], [], [], []
     found = raised(state.y.size, begin, end)
+    fit = state.with_columns(found)[1]
     drifts = [(fit, fit.theta, 0.0)] if brief else state.possible(found, rich=False)
     for one, theta, ln_share in drifts:
         at = replace(one, theta=theta, sigma=fit.sigma)
@@ -269,9 +270,13 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     return {"amplitude": (state.least(shape) * math.sqrt(gain_for(lambda gain: _worth(steps, gain))), state.unit)}
 
 
-def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """Its times are those of the whole recording."""
-    start_s, end_s = (digits(float(entry[key]) + record.start_s) for key in ("start_s", "end_s"))
+    times = [float(entry[key]) for key in ("start_s", "end_s")]
+    if look is not None:
+        known = medians(look)
+        times = [known["time_s"], known["time_s"] + known["duration_s"]]
+    start_s, end_s = (digits(time + record.start_s) for time in times)
     return {**entry, "name": _name(start_s, end_s), "start_s": start_s, "end_s": end_s}
 
 
@@ -298,6 +303,7 @@ CAUSE = Cause(
     least=_least,
     entry=_entry,
     of_column=_of_column,
+    of_estimate=medians,
     add=_add,
     keys={
         "time_s": Key(lambda s: 0.45 * s.duration_s),

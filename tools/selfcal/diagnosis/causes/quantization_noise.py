@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,15 +33,25 @@ def look_of(fit: Fit, gain: float, state: State, extras: Terms) -> Look:
 
     The record knows the size s of the innovations and the coefficient m independently: N = s (1 + m) sqrt(dt) and
     Q = s sqrt(-m) dt."""
+    changes = {"extras": extras}
+    measure = partial(_measured, state.unit)
+    return Look("quantization_noise", gain, net(gain), _sizes(state.unit, fit), changes, measure=measure)
+
+
+def _measured(unit: str, final: State) -> dict[str, Any]:
+    """As the final fit has them; a coefficient that has changed its sign there has none."""
+    return _sizes(unit, final.best) if final.best.quantized else {}
+
+
+def _sizes(unit: str, fit: Fit) -> dict[str, Any]:
     m, n = math.tanh(fit.value("color")), max(fit.n, 1.0)
     size = fit.sigma / math.sqrt(1.0 + m * m)
     N, of_N = size * (1.0 + m) * math.sqrt(fit.dt), math.sqrt((0.5 + (1.0 - m) / (1.0 + m)) / n)
     Q, of_Q = size * math.sqrt(-m) * fit.dt, math.sqrt((0.5 + (1.0 - m * m) / max(4.0 * m * m, 1e-12)) / n)
-    estimate = {
-        "Q": interval(Q, Q * of_Q, units.times_second(state.unit)),
-        "N": interval(N, N * of_N, f"{state.unit}/sqrt(Hz)"),
+    return {
+        "Q": interval(Q, Q * of_Q, units.times_second(unit)),
+        "N": interval(N, N * of_N, f"{unit}/sqrt(Hz)"),
     }
-    return Look("quantization_noise", gain, net(gain), estimate, {"extras": extras})
 
 
 def _law(tree: dict[str, Any], look: Look) -> None:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Key, shown
+from selfcal.diagnosis.cause import Cause, Key, medians, shown, sized
 from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
+from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
 from selfcal.diagnosis.statemodel import Array, Mask
@@ -107,11 +108,11 @@ def looks(state: State, record: Record) -> list[Look]:
         "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
     }
     changes = {"regressors": (*state.regressors, column)}
-    measure = partial(posterior, state, record.time_s, place)
+    measure = partial(posterior, record.time_s, place)
     return [Look("step", exact, value, estimate, changes, when=(time, time), measure=measure)]
 
 
-def posterior(state: State, time_s: Array, place: int) -> dict[str, Any]:
+def posterior(time_s: Array, place: int, state: State) -> dict[str, Any]:
     """Time and amplitude of a step over the places about `place`, every near drift and the spread of its parameters.
 
     At each node of the drift's parameters the scan gives likelihood, amplitude and its sd of a step at each place.
@@ -183,9 +184,9 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     return {"amplitude": (state.least(raised(n, n // 2)) * math.sqrt(gain_for(worth)), state.unit)}
 
 
-def _entry(entry: Mapping[str, Any], record: Record) -> dict[str, Any]:
+def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """Its time is one of the whole recording's."""
-    time_s = float(entry["time_s"]) + record.start_s
+    time_s = digits(float(sized(entry, look, record)["time_s"]) + record.start_s)
     return {**entry, "name": f"step_{time_s:.6g}s", "time_s": time_s}
 
 
@@ -206,6 +207,7 @@ CAUSE = Cause(
     least=_least,
     entry=_entry,
     of_column=_of_column,
+    of_estimate=medians,
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0, "step_time_s"),
         "amplitude": Key(lambda s: 2.0 * s.n, "step_amplitude"),

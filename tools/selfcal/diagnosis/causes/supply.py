@@ -15,6 +15,7 @@ CAUSE = Cause(
     least=lambda state, record: forms.least(state, record, "supply"),
     smoothed=True,
     of_column=forms.of_column,
+    of_estimate=forms.of_look,
     keys={"coefficient": Key(lambda s: 50.0 * s.n, "supply_coefficient"), **forms.EFFECT_KEYS},
     add=lambda keys, channels: forms.added(keys, channels, channels.supply),
 )

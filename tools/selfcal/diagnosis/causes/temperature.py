@@ -16,6 +16,7 @@ CAUSE = Cause(
     smoothed=True,
     from_zero=True,
     of_column=forms.of_column,
+    of_estimate=forms.of_look,
     keys={"coefficient": Key(lambda s: 0.3 * s.n, "temperature_coefficient"), **forms.EFFECT_KEYS},
     add=lambda keys, channels: forms.added(keys, channels, channels.temperature),
 )

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
@@ -109,9 +109,9 @@ def looks(state: State, record: Record) -> list[Look]:
         Regressor(f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))})
         for one, row in zip(times, found, strict=True)
     )
-    estimate = posterior(state, t, times, record, brief=True)
+    estimate = posterior(t, times, record, state, brief=True)
     changes = {"regressors": (*state.regressors, *added)}
-    return [Look("turn_on", gain, worth, estimate, changes, measure=partial(posterior, state, t, times, record))]
+    return [Look("turn_on", gain, worth, estimate, changes, measure=partial(posterior, t, times, record))]
 
 
 def _search(state: State, t: Array, record: Record, least: float) -> tuple[float, Array]:
@@ -197,7 +197,7 @@ def _refined(state: State, t: Array, tau: Array, record: Record) -> tuple[float,
     return gain, np.sort(best_tau)
 
 
-def posterior(state: State, t: Array, tau: Array, record: Record, brief: bool = False) -> dict[str, Any]:
+def posterior(t: Array, tau: Array, record: Record, state: State, brief: bool = False) -> dict[str, Any]:
     """Amplitudes at power-on and time constants, over the drifts, the spread of their parameters, and
     the time constants. Of a `brief` one the drift is the best alone. A time constant's prior is flat in its logarithm,
     an amplitude's is flat."""
@@ -278,6 +278,13 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     return {"amplitude": (size, state.unit), "tau_s": (tau, "s")}
 
 
+def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
+    """Of the two time constants of a look the nearer one."""
+    known = {} if look is None else medians(look)
+    times = [known[key] for key in ("tau_s", "tau_2_s") if key in known] or [float(entry["tau_s"])]
+    return {**entry, "tau_s": digits(min(times, key=lambda one: abs(math.log(one / float(entry["tau_s"])))))}
+
+
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     t = channels.time_s
     first, second = (keys[f"amplitude{end}"] * np.exp(-t / keys[f"tau{end}_s"]) for end in ("", "_2"))
@@ -296,7 +303,9 @@ CAUSE = Cause(
     trained=_trained,
     anew=True,
     least=_least,
+    entry=_entry,
     of_column=lambda column, c: {"amplitude": c[0], "tau_s": float(column.entry["tau_s"])},
+    of_estimate=medians,
     add=_add,
     keys={
         "amplitude": Key(lambda s: 5.0 * s.n),

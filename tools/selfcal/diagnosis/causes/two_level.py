@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -129,7 +129,7 @@ def looks(state: State, record: Record) -> list[Look]:
     if _shaken(state, record, levels):
         return []
     dt = state.dt * block
-    measure = partial(_amplitude, state, levels)
+    measure = partial(_amplitude, levels, math.exp(theta[0]))
     estimate = {
         "amplitude": mixture(np.ones(1), np.exp(theta[:1]), 0.05 * math.exp(theta[0]), state.unit),
         "dwell_s": _dwell(sum(time for time, _ in stays), sum(count for _, count in stays), dt),
@@ -195,8 +195,9 @@ def _best(y: Array, theta: Array) -> tuple[Array, float]:
     return middle, value
 
 
-def _amplitude(state: State, levels: Array) -> dict[str, Any]:
-    """The coefficient of the decoded `levels` [n], -0.5 and 0.5, over every near drift."""
+def _amplitude(levels: Array, removed: float, state: State) -> dict[str, Any]:
+    """The coefficient of the decoded `levels` [n], -0.5 and 0.5, over every near drift; `removed` of them is gone."""
+    state = replace(state, y=state.y + removed * levels)
     weight, means, sds = (of[0] for of in state.posterior(levels))
     return {"amplitude": mixture(weight, means[:, 0], sds[:, 0], state.unit)}
 

@@ -65,6 +65,7 @@ CAUSE = Cause(
     pictures=shown("means", "evidence"),
     smoothed=True,
     of_column=forms.of_other,
+    of_estimate=forms.of_look,
     keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
     follows=True,
     add=_add,
