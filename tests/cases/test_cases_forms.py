@@ -16,8 +16,9 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.diagnosis.cause import Channels
 from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.forms import inconstancy
+from selfcal.diagnosis.forms import added, inconstancy
 from selfcal.diagnosis.loop import LOOKS, diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, State
@@ -312,6 +313,16 @@ def test_the_slope_of_the_diagnosis_is_not_late(window_s: float, dt: float) -> N
     curve = 30.0 + 0.01 * t + 3e-4 * t**2
     assert slope(curve, window_s, dt)[inner] == pytest.approx((0.01 + 6e-4 * t)[inner], abs=6e-4 * dt * 0.51 + 2e-5)
     assert np.all(np.isfinite(slope(curve[:3], window_s, dt)))
+
+
+def test_a_filtered_rate_is_simulated() -> None:
+    """As this file's lag has it. Between two samples the channel moves on a straight line, here it stands: half a
+    sample of 150 s."""
+    d = Drawn(7600)
+    channels = Channels(d.t, d.temperature, d.supply, {}, d.random)
+    made = added({"coefficient": 0.0, "rate": 8.0, "lag_s": 150.0}, channels, d.temperature)
+    truth = 8.0 * (d.temperature - late(d.temperature, 150.0, d.dt)) / 150.0
+    assert np.abs(made - truth).max() < 0.01 * np.abs(truth).max()
 
 
 def test_a_form_begins_at_rest() -> None:

@@ -146,7 +146,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
 
 
 def finding_of(one: Diagnosed, column: Column) -> Finding | None:
-    """The finding that added a column to the model; None: the model file had it."""
+    """The finding that added a column to the model; None: the model file had it, or its line is a harmonic."""
     return next((each for each in one.findings if column.name in {added.name for added in each.columns}), None)
 
 
@@ -266,7 +266,7 @@ class _Effect:
 
 def _channel_of(column: Column) -> tuple[str, ...]:
     """Channel and input of a column."""
-    return form_of(column)[:2] if "column" in column.entry else ()
+    return form_of(column)[:2] if column.entry.get("column") else ()
 
 
 def _of_findings(one: Diagnosed) -> Iterator[_Effect]:

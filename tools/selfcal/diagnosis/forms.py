@@ -282,10 +282,11 @@ def _look(state: State, channel: Channel) -> list[Look]:
 
 
 def _whole(state: State, channel: Channel, chosen: _Tried) -> tuple[State, _Tried]:
-    """`first_order` in the place of its parts that the state has and the one chosen, if it explains no less than they
-    together, and the state without; else both as they are."""
+    """`first_order` in the place of its parts that were found and the one chosen, if it explains no less than they
+    together, and the state without; else both as they are. A column of the model file, whose entry here has no unit,
+    stays."""
     parts = {(channel.column, channel.input, part) for part in FIRST_ORDER}
-    own = {one.name for one in state.regressors if form_of(one) in parts}
+    own = {one.name for one in state.regressors if form_of(one) in parts and "unit" in one.entry}
     if not own or chosen.option.form not in FIRST_ORDER or "first_order" not in channel.forms:
         return state, chosen
     before = state.without(own).refit()

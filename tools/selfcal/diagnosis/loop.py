@@ -235,7 +235,7 @@ def _rounds(
         replaced = [finding for finding in one.findings if _gone(finding, after)]
         best = replace(best, gain=best.gain + sum(finding.look.gain for finding in replaced))
         best = replace(best, net=best.net + sum(finding.look.net for finding in replaced))
-        one.findings = [finding for finding in one.findings if finding not in replaced]
+        one.findings = [finding for finding in one.findings if not _gone(finding, after)]
         one.findings.append(Finding(best, number, before, after, rivals, held_out=known))
         number += 1
 

@@ -97,7 +97,8 @@ def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
 def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f}".format) -> str:
     """What a finding gained when it was found, over the model with the findings of earlier rounds."""
     found = finding.get("found_in_round", 0)
-    text = f"{number(finding['evidence_gain_nats'])} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
+    gain = finding["evidence_gain_nats"]
+    text = f"{number(math.inf if gain is None else gain)} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
     net = finding.get("net_nats")
     return text if net is None or not math.isfinite(net) else f"{text}, {number(net)} net of the search"
 
