@@ -78,6 +78,30 @@ def test_a_grid_keeps_its_rate_with_jitter_and_losses(jitter: float, lost: float
         assert abs(missing - truth) <= (0 if jitter < 0.05 else 0.01 * truth + 0.002 * ROWS)
 
 
+@pytest.mark.parametrize(
+    "delay",
+    [
+        lambda r: 0.2 * r.standard_normal(ROWS),
+        lambda r: 0.28 * r.standard_normal(ROWS),
+        lambda r: r.exponential(0.5, ROWS),
+    ],
+    ids=["0.2", "0.28", "late by 0.5"],
+)
+@pytest.mark.parametrize("lost", [0.03, 0.27, 0.63])
+def test_a_grid_shows_behind_jitter_that_hides_it_from_single_steps(
+    delay: Callable[[Random], Floats], lost: float
+) -> None:
+    """A third of the steps is far from whole intervals. The rate is that of the grid: the mean one is 3 to 63 % low."""
+    for seed in range(case_records(2, 50)):
+        random = np.random.default_rng(seed)
+        time = np.arange(ROWS) + delay(random)
+        kept = random.random(ROWS) >= lost
+        rate, missing = found(np.sort(time[kept]) / RATE_HZ)
+        truth = int(np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0]) + 1 - int(kept.sum())
+        assert rate == pytest.approx(RATE_HZ, rel=2e-3)
+        assert abs(missing - truth) <= 0.01 * truth + 0.002 * ROWS
+
+
 @pytest.mark.parametrize("lost", [0.3, 0.45, 0.55])
 def test_an_exact_grid_may_lose_half_of_its_samples(lost: float) -> None:
     for seed in range(case_records(3, 50)):

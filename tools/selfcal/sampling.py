@@ -60,6 +60,9 @@ _PIECE_OF_GRID = 100
 #: A stated rate is checked against other grids where so many steps hold missing samples: places in one interval,
 #: places looked at, rows at least, intervals from 1/_OTHER to _OTHER times the stated one, and how far from it (ln).
 _SUSPECT, _FINE, _OTHER_PLACES, _OTHER_ROWS, _OTHER, _OTHER_APART = 0.1, 16, 1 << 21, 100, 4.0, 0.1
+#: A grid behind jitter: the slowest line, turns in the mean step; the least power of one, that of jitter of 0.3 dt; and
+#: the largest of random times over the power of their noise, e^-10 among a few thousand.
+_LINE_FIRST, _LINE_LEAST, _LINE_CHANCE = 0.9, 0.012, 25.0
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
@@ -110,7 +113,8 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
     dt, missing = _fine(time, steps, first)
     if rate is None and (typical > _MEAN * first or missing.any()):
         if not _even(time, dt):
-            return _mean_grid(steps)
+            dt = _line(time, typical, lattice)
+            return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
         if _blurred(steps, dt):
             return _on_grid(time, dt)
     return dt, missing
@@ -147,18 +151,44 @@ def on_other_grid(time: NDArray[np.float64], dt: float, missing: NDArray[np.int6
     """Whether stamps lie on a grid whose interval is not the stated one, `dt`: they miss many samples of that one.
 
     A grid is a line in the spectrum of the stamps, however many samples are lost. Its multiples are lines too."""
-    head = time[:_STRETCH]
-    head = head[head < _OTHER_PLACES / _FINE * dt]
-    if head.size < _OTHER_ROWS or np.count_nonzero(missing) < _SUSPECT * missing.size or _even(time, dt):
+    if np.count_nonzero(missing) < _SUSPECT * missing.size or _even(time, dt):
+        return False
+    turns, power = _spectrum(time, dt)
+    if not turns.size:
         return False
     lattice = _lattice(np.diff(time), 1e-9 * dt)
     if lattice > _COARSE * dt:
         return abs(math.log(lattice / dt)) > _OTHER_APART and _lossy(np.rint(np.diff(time) / lattice))
-    stamped = np.bincount(np.rint(head * (_FINE / dt)).astype(np.int64))
-    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2
-    turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
-    lines = turns[(power > _COHERENT * head.size**2) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
+    lines = turns[(power > _COHERENT) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
     return lines.size > 0 and abs(math.log(lines[0])) > _OTHER_APART
+
+
+def _spectrum(time: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frequencies [m], turns in `dt`, and the power there of the first stamps, that of an exact grid being 1. Empty for
+    few stamps."""
+    head = time[:_STRETCH]
+    head = head[head < _OTHER_PLACES / _FINE * dt]
+    if head.size < _OTHER_ROWS:
+        return np.empty(0), np.empty(0)
+    stamped = np.bincount(np.rint(head * (_FINE / dt)).astype(np.int64))
+    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
+    return np.arange(power.size) * (_FINE / (2.0 * stamped.size)), power
+
+
+def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
+    """Interval, s, of a grid that jitter and losses hide from single steps; 0 if the stamps have none.
+
+    A grid is a line in the spectrum of the stamps, jitter of the sd s dt leaves exp(-(2 pi s)^2) of its power. The
+    stamps' own `lattice` is one as well. Of `typical`, the mean step, the grid may keep so many samples."""
+    turns, power = _spectrum(time, typical)
+    shown = (turns > _LINE_FIRST) & (turns < min(_OTHER, 0.5 * typical / max(lattice, 1e-300)))
+    if not shown.any():
+        return 0.0
+    dt = typical / float(turns[int(np.argmax(np.where(shown, power, 0.0)))])
+    head = time[:_STRETCH]
+    # The spectrum is of rounded stamps, and so has images of a quicker line.
+    exact = float(np.abs(np.exp(2j * math.pi * (head - head[0]) / dt).mean()) ** 2)
+    return dt if exact > max(_LINE_LEAST, _LINE_CHANCE / head.size) else 0.0
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
+from selfcal.diagnosis.statemodel import Array
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.
@@ -71,6 +74,10 @@ def mixed(state: State, record: Record) -> list[Look]:
     y[picked] = np.nan
     if not np.nanmax(y) > np.nanmin(y):
         return []  # the others are all equal: a dead band
+    later = _aftermath(state, y)
+    gain, worth = gain + later, worth + later
+    if worth < 1.0:
+        return []
     largest = int(picked[np.argmax(np.abs(w[picked]))])
     fraction = picked.size / n
     return [
@@ -86,6 +93,19 @@ def mixed(state: State, record: Record) -> list[Look]:
             when=(float(record.time_s[picked[0]]), float(record.time_s[picked[-1]])),
         )
     ]
+
+
+def _aftermath(state: State, kept: Array) -> float:
+    """ln likelihood that the other readings gain where the wild ones are left out of `kept` [n].
+
+    A reading that is off by itself spoils the predictions that follow. A jump of the drift foretells them: without it
+    they are worse, and it is no outlier."""
+    fit = state.best
+    _, white, s = run(replace(state.series, y=kept), fit.terms, fit.theta, innovations=True)
+    residual = (white[:, 0] - white[:, 1:] @ fit.c) / fit.sigma
+    there = np.isfinite(kept)
+    before, after = state.whitened[there] ** 2 + np.log(state.variance[there] / fit.sigma**2), residual[there] ** 2
+    return 0.5 * float((before - after - np.log(s[there])).sum())
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
