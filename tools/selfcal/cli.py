@@ -178,8 +178,11 @@ Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine"),
 ]
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor", min=1)
+]
 Results = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Folder that keeps finished records, so that a later run goes on")
+    Path | None, typer.Option(metavar="DIR", help="Folder that keeps finished records: a later run continues from them")
 ]
 
 
@@ -456,9 +459,7 @@ def fleet(
     write_model: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="Write the model with the batch as a new unit's priors")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Processes on this machine; default: one for each processor")
-    ] = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     results: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of finished recordings; default: FILE.parts")
@@ -654,6 +655,7 @@ def rivals(
     only: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Method to run (repeat for more); default: all")
     ] = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     results: Results = None,
     json: Json = None,
@@ -673,6 +675,7 @@ def rivals(
             only=only or (),
             seed=seed,
             json=json,
+            workers=workers,
             scheduler=scheduler,
             results=results,
         )
@@ -867,6 +870,7 @@ def montecarlo(
     duration: Annotated[float, typer.Option(metavar="S", help="Length of each, s")] = 3600.0,
     axis: Annotated[str, typer.Option(metavar="NAME", help="Axis whose priors are drawn from")] = "gx",
     seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same records", min=0)] = 1,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     results: Results = None,
     json: Json = None,
@@ -881,6 +885,7 @@ def montecarlo(
         axis=axis,
         seed=seed,
         json=json,
+        workers=workers,
         scheduler=scheduler,
         results=results,
     )

@@ -85,6 +85,8 @@ def spread(
     the remaining time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
     Raises UserError for a package that is absent and a scheduler that does not answer.
     """
+    if count is not None and count < 1:
+        raise UserError("--workers must be at least 1")
     store: Keeper | None = Store(Path(results), settings) if isinstance(results, Path | str) else results
     pieces = [list(jobs[at : at + piece]) for at in range(0, len(jobs), piece)]
     each = [1.0] * len(jobs) if weights is None else list(weights)

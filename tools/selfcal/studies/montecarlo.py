@@ -53,6 +53,7 @@ def montecarlo(
     axis: str = "gx",
     seed: int = 1,
     json: Path | str | None = None,
+    workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
 ) -> dict[str, Any]:
@@ -61,8 +62,9 @@ def montecarlo(
 
     Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law.
 
-    `scheduler`: address of a Dask scheduler, else the work is done here; the numbers are the same. `results`: a folder
-    that keeps finished records, so that a run that was stopped goes on, and one of more records adds to it.
+    `workers`: processes here, one for each processor by default; `scheduler`: address of a Dask scheduler instead. The
+    numbers are the same. `results`: a folder that keeps finished records: a run that was stopped continues from them,
+    and one of more records adds to them.
     Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
     records the calculated and actual probability of false identification, with the sd of their difference.
     """
@@ -83,6 +85,7 @@ def montecarlo(
         settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
         scheduler=scheduler,
         results=results,
+        count=workers,
     )
     document = _summary(found, records, duration_s, axis)
     if json is not None:

@@ -111,13 +111,14 @@ def ensemble(
     only: Sequence[str] = (),
     seed: int = 1,
     json: Path | str | None = None,
+    workers: int | None = None,
     scheduler: str | None = None,
     results: Path | str | None = None,
 ) -> dict[str, Any]:
     """Give every method the same simulated records, `records` of each law and number of `samples`.
 
     `truth`: 'middle' has every record made with the middle of the priors' logarithms, 'prior' draws it for each. The
-    model is `models/ensemble.yaml` unless one is given. `scheduler`, `results`: as for `montecarlo`.
+    model is `models/ensemble.yaml` unless one is given. `workers`, `scheduler`, `results`: as for `montecarlo`.
     Returns the document `selfcal.rivals_ensemble/1`.
     """
     check_writable(json)
@@ -150,6 +151,7 @@ def ensemble(
         },
         scheduler=scheduler,
         results=results,
+        count=workers,
     )
     entries = summary(rows, loaded.group_of(axis))
     document = {

@@ -75,8 +75,6 @@ def fleet(
     check(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
-    if workers is not None and workers < 1:
-        raise UserError("--workers must be at least 1")
     loaded = Model.load(model)
     for name in axes:
         loaded.group_of(name)
