@@ -590,3 +590,21 @@ def test_axe_finds_no_fault(browser: Any, address: str, scheme: str) -> None:
     assert len(result.response["passes"]) > 10
     assert [(fault["id"], fault["nodes"][0]["html"]) for fault in result.response["violations"]] == []
     view.close()
+
+
+@pytest.mark.parametrize("log_x", [True, False])
+def test_a_limit_far_from_the_data_is_drawn_at_its_value(log_x: bool) -> None:
+    """A histogram over a factor of 45 or a range, its limit three times beyond. Truth: places between the ticks."""
+    x = np.geomspace(0.02, 0.9, 9) if log_x else np.linspace(-1.0, 1.0, 9)
+    limit = 2.7 if log_x else 5.3
+    panel = Panel("K", "deg/s", "units", [Curve("units", x, np.arange(9.0))], log_x=log_x, marks=[limit], stairs=True)
+    drawn = chart.draw(Figure("K", "nine units", [panel]))
+    (mark,) = (float(at) for at in re.findall(rf"class=mark d='M([\d.]+) {chart.TOP}V", drawn))
+    ticks = [
+        (float(at), float(text.replace("−", "-").replace(",", "")))
+        for at, text in re.findall(r"class=tick x=([\d.]+) y=\d+ text-anchor=(?:middle|end)>([^<]*)<", drawn)
+        if re.fullmatch(r"[−\d.e]+", text)
+    ]
+    places, values = np.array(ticks).T
+    slope, start = np.polyfit(np.log(values) if log_x else values, places, 1)
+    assert abs(slope * (np.log(limit) if log_x else limit) + start - mark) < 0.5  # printed to a tenth
