@@ -6,7 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "../c/noise.h"
+#include "../common/noise.h"
 #include "erring.h"
 #include "selfcal_model.h"
 /* not for what follows */

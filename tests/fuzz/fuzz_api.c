@@ -14,7 +14,7 @@
 
 #include "selfcal.h"
 
-#include "../c/laws.h"
+#include "../common/named_laws.h"
 
 enum { NODES_A_GRID = 6, NODES_MAX = SELFCAL_HYPOTHESES_MAX * NODES_A_GRID * NODES_A_GRID };
 enum { STEPS_MAX = 100000, CALLS_MAX = 200, LOOK_EVERY = 32 };

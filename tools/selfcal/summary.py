@@ -105,8 +105,10 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
 
     By the Fisher information at the medians, beside the priors. An open interval is wider than this information says,
-    and falls faster with the rest: the geometric mean of both variances is taken for that of now. The interval is then
-    0.2 to 0.7 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times the record does."""
+    and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
+    records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
+    the record does.
+    """
     law = max(result.probability, key=lambda one: result.probability[one])
     estimates = result.parameters[law]
     open_ = [name for name, estimate in estimates.items() if not estimate.identified]
