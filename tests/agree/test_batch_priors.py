@@ -24,6 +24,7 @@ from selfcal.result import HALF_90
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.tables import make_tables
 from selfcal.verbs.fleet import fleet
+from selfcal.verbs.identify import identify
 
 from conftest import COMMAND, ROOT, case_records, worst_difference
 
@@ -170,6 +171,23 @@ def test_the_printed_example(tmp_path: Path) -> None:
     found = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=1800)
     print(found.stdout)
     assert [line.strip() for line in printed.split("\n\n")[0].splitlines()] == found.stdout.splitlines()
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.35, 4.0])
+def test_a_part_unlike_the_batch_is_not_adequate(tmp_path: Path, factor: float) -> None:
+    """K of the batch, and times 0.35 and 4: 5 and 7 sd of its spread. Beside wide priors another law takes the drift.
+    A part of the batch is beyond the limit once in 1000; of those far off one in four may hide behind its interval."""
+    tree, place = yaml.safe_load(DEFAULT.read_text()), tmp_path / "batch.yaml"
+    priors = {name: {"law": "log_normal", "median": median, "sd": sd} for name, (median, sd) in PARTS.items()}
+    tree["groups"]["gyro"]["own_priors"] = {"gx": priors}
+    place.write_text(yaml.safe_dump(tree))
+    few = case_records(4, 100)
+    random, passed = np.random.default_rng(91), 0
+    for k in range(few):
+        y, _, _ = a_unit(random, 3600, factor)
+        save(tmp_path / f"{k}.npz", {"gx": ("deg/s", y)}, 1.0)
+        passed += identify(tmp_path / f"{k}.npz", model=place)["axes"]["gx"]["checks"]["batch"]["passed"]
+    assert passed >= 0.97 * few if factor == 1.0 else passed <= 0.25 * few
 
 
 def own(place: Path) -> dict[str, dict[str, Any]]:

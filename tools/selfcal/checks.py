@@ -15,13 +15,19 @@ from selfcal import units
 from selfcal.allan import Curve, curve_of, ratio_at, terms_of
 from selfcal.blocks import MOST_DENSE, Blocks
 from selfcal.lattice import BELOW_LATTICE
-from selfcal.model import Group
+from selfcal.model import Group, Prior
 from selfcal.readings import CLOCK_LEAST, Readings
-from selfcal.result import AxisResult
+from selfcal.result import HALF_90, AxisResult, Estimate
 from selfcal.tables import Tables
 
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
+#: A part that is not from the batch, sd of `batch_check`: by chance one law's two parameters in 1000 parts.
+BATCH_LIMIT = 3.5
+#: A law of the batch has this prior probability at least.
+BATCH_LAW = 0.1
+#: Of the prior's variance, what a record that shows nothing leaves to compare by.
+LEFT_LEAST = 0.1
 #: Bank samples without which there are no checks.
 FEWEST = 20
 #: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
@@ -64,7 +70,8 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
     if not all(one["passed"] for one in hidden.values()):
         return Judged(hidden, curve)  # the other checks would show the same
     checks = innovation_checks(blocks, tables, group, result, list(used))
-    return Judged({**hidden, **checks, **(allan_checks(curve) if curve else {})}, curve)
+    unlike = batch_check(tables, group, result)
+    return Judged({**hidden, **unlike, **checks, **(allan_checks(curve) if curve else {})}, curve)
 
 
 def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
@@ -76,6 +83,33 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     terms = terms_of(group.laws[result.best], at, tables.dt_s, tables.block)
     share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
+
+
+def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
+    """Is the part like the batch that log-normal priors describe? Else another law with wide priors takes its drift.
+
+    The `value` is the distance of a parameter from its prior's median: (m1 - m0)/sqrt(s0^2 - s1^2) of the posterior's
+    m1, s1 in the logarithm is normal (0, 1) if the part is from the batch. Of a law its largest distance counts, of the
+    laws of the batch the least. Nothing where no law that is likely a priori has a log-normal prior of its drift.
+    """
+    distances = []
+    for one in tables.hypotheses:
+        priors = {name: group.priors[name] for name in one.law.parameters if group.priors[name].law == "log_normal"}
+        if priors.keys() - {"N"} and one.ln_probability >= math.log(BATCH_LAW):
+            distances.append(max(_distance(result.parameters[one.name][name], prior) for name, prior in priors.items()))
+    if not distances:
+        return {}
+    value = min(distances)
+    return {"batch": {"value": value, "limit": BATCH_LIMIT, "passed": value <= BATCH_LIMIT}}
+
+
+def _distance(estimate: Estimate, prior: Prior) -> float:
+    """Standard deviations between the record and the prior. A posterior of nearly the prior's width states none."""
+    if not (estimate.q05 > 0.0 and math.isfinite(estimate.q95)):
+        return math.inf
+    sd = math.log(estimate.q95 / estimate.q05) / (2.0 * HALF_90)
+    left = max(prior.ln_sd**2 - sd**2, LEFT_LEAST * prior.ln_sd**2)
+    return abs(math.log(estimate.median / prior.median)) / math.sqrt(left)
 
 
 def with_readings(

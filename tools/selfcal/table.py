@@ -199,6 +199,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 failed.append(
                     f"not adequate: {name}: drift_in_average: {share}: average less, with a higher --decimate"
                 )
+            elif not outcome["passed"] and check == "batch":
+                distance = f"{outcome['value']:.1f} sd from the batch of the model's priors"
+                failed.append(f"not adequate: {name}: {distance}: identify it with the model without that batch")
             elif not outcome["passed"] and check == "outliers":
                 share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
                 failed.append(f"not adequate: {name}: outliers: {share}, too many for noise: lost words of the bus?")
