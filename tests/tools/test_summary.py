@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,24 @@ def test_a_law_counts_by_its_probability() -> None:
         assert found["bias_instability"].estimate.identified is sure
         assert found["rrw"].estimate.q95 == pytest.approx(1e-3, rel=1e-4)
         assert found["rrw"].estimate.mean == pytest.approx((1.0 - share) * 1e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize(("n", "k"), [(0.04, 1e-4), (0.2, 3e-4)])
+def test_a_drift_of_unknown_size_makes_no_minimum(n: float, k: float) -> None:
+    """A law that always has a walk has a minimum too: that of the prior's least K, where the record leaves K open."""
+    for open_ in (False, True):
+        parameters = {"random_walk": {"N": sharp(n), "K": replace(sharp(k), identified=not open_)}}
+        found = summarize(AxisResult(20_000, {}, {"random_walk": 1.0}, parameters, 0.0, 1.0), GROUP, 1.0, 20_000, 10)
+        assert [found[name].estimate.identified for name in ("rrw", "bias_instability")] == [not open_] * 2
+        assert found["bias_instability"].estimate.q95 == pytest.approx(
+            math.sqrt(2.0 * n * k / math.sqrt(3.0)) / FLOOR, rel=1e-3
+        )
+
+
+def test_the_limit_of_no_walk_is_above_zero() -> None:
+    """Without a walk in any likely law: less than the least K of the prior."""
+    found = known("constant", {"N": 0.03})["rrw"]
+    assert not found.estimate.identified and found.estimate.q95 == GROUP.priors["K"].min
 
 
 TRUTHS = {

@@ -90,14 +90,18 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
         found["quantization_noise"] = _number(q, w)
     prior = group.priors["K"]
     widest = HALF_90 * prior.ln_sd  # of ln(q95 / q05): half the prior's sd
+    left_open = open_drifts > 0.5 * drifts
     if has_walk < _SURE:
-        found["rrw"] = _without(found["rrw"], NO_WALK)
-    elif open_drifts > 0.5 * drifts or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
+        none = found["rrw"].estimate
+        found["rrw"] = _without(Number(replace(none, q95=max(none.q95, prior.min))), NO_WALK)  # a limit is above 0
+    elif left_open or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
         found["rrw"] = _without(found["rrw"], WIDE)
     if has_floor < _SURE:
         found["bias_instability"] = _without(
             found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
         )
+    elif left_open:  # then the prior of the drift makes the minimum
+        found["bias_instability"] = _without(found["bias_instability"], WIDE)
     return found
 
 

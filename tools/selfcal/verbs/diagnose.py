@@ -36,7 +36,7 @@ from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
-OF_COUNTER = "its readings are increments of a counter, coarse against their noise: give --decimate 1"
+OF_COUNTER = "its readings are increments of a counter, coarse against their noise: give a lower --decimate HZ"
 #: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
 FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
 #: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
