@@ -19,7 +19,7 @@ import pytest
 
 from selfcal.batch.files import Source
 from selfcal.batch.page import page
-from selfcal.batch.summary import document_of, summed_up
+from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import COLUMNS, Unit
 from selfcal.errors import UserError
 from selfcal.model import Model
@@ -167,6 +167,44 @@ def test_whose_recording_it_is(logs: Path) -> None:
         (logs / "units.csv").write_text(text)
         with pytest.raises(UserError, match=words):
             fleet(["logs/a/*.npz"], "t.csv", units_table="units.csv")
+
+
+def test_what_a_pattern_or_a_table_has_beside_recordings_is_a_line(
+    logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A shell's pattern names folders and links to nothing; a table rows and columns of another use."""
+    (logs / "logs/gone.npz").symlink_to(logs / "nowhere.npz")
+    (logs / "units.csv").write_text("file,device,Shift\nsn03.npz,X,2\nsn77.npz,Y,1\n")
+    given = ["logs/gone.npz", "logs/a", "logs/b/sn03.npz", "logs/b/sn04.npz"]
+    assert fleet(given, "t.csv", units_table="units.csv")["recordings"] == 2
+    said = capsys.readouterr().err
+    assert "logs/gone.npz: is a link to nothing: skipped" in said and "logs/a: is a folder" in said
+    assert "no recording of the batch is 'sn77.npz' (line 3)\n" in said and "does not read Shift (known: " in said
+    assert fleet(["logs/**/*.npz"], "t.csv")["recordings"] == 5
+    said = capsys.readouterr().err
+    assert "logs/gone.npz: is a link" in said and "folder" not in said
+    for none in (["logs/gone.npz"], ["logs/a"], ["logs/b/sn03.npz", "logs/b/sn33.npz"]):
+        with pytest.raises(UserError, match=f"no recording matches '{none[-1]}'"):
+            fleet(none, "t.csv")
+
+
+def test_dates_are_iso_8601(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Others are refused in a table of units, and left out with a line in metadata. Zones count in the order."""
+    for date in ("03/11/2025", "yesterday", "2025-02-30", "2025-3-1", "2025-03-01Tnoon", "20250301"):
+        (logs / "units.csv").write_text(f"file,device,date\nsn00.npz,A,2025-01-31\nsn01.npz,A,{date}\n")
+        with pytest.raises(UserError, match=f"units.csv: line 3: date '{date}': write it as 2026-03-01 or "):
+            fleet(["logs/a/*.npz"], "t.csv", units_table="units.csv")
+    dates = ("2025-11-03T01:30:00+02:00", "2025-11-03", "2025-11-02 23:45:00Z")  # the first is at 23:30 of the 2nd
+    lines = [f"sn0{k}.npz,A,{date}" for k, date in enumerate(dates)]
+    (logs / "units.csv").write_text("\n".join(["file,device,date", *lines]))
+    fleet(["logs/a/*.npz"], "t.csv", units_table="units.csv")
+    order = list(dict.fromkeys(row["recorded_at"] for row in table(logs / "t.csv")))
+    assert order == [dates[0], dates[2], dates[1]]
+    values = 0.1 * np.random.default_rng(6).standard_normal(2000)
+    save("logs/b/meta.npz", {"gx": ("deg/s", values)}, 5.0, {"date": "5. May 2025"})
+    fleet(["logs/b/meta.npz"], "t.csv")
+    assert "logs/b/meta.npz: leaves out the date '5. May 2025': write it as 2026-03-01" in capsys.readouterr().err
+    assert {row["recorded_at"] for row in table(logs / "t.csv")} == {""}
 
 
 def test_finished_recordings_are_kept(logs: Path) -> None:
@@ -333,6 +371,18 @@ def synthetic(units: int, seed: int = 1) -> list[Unit]:
         record = {"error": "broken <b>"} if k % 200 == 3 else {"recording": {"duration_s": 3600.0}, "axes": axes}
         found.append(Unit(source, record))
     return found
+
+
+def test_an_axis_of_another_kind_is_left_out_with_a_line() -> None:
+    """No factor turns an acceleration into an angular rate: the population has the other units."""
+    batch = synthetic(12, 5)
+    axis = batch[8].record["axes"]["gy"]
+    axis["bias_now"] = {**axis["bias_now"], "unit": "m/s^2"}
+    summary = summed_up(batch, Model.load())
+    (line,) = [line for line in lines_of(summary) if line.startswith("left out")]
+    assert line == "left out of the population: gy of d00008: reads in m/s^2, the model in deg/s"
+    units = {name: one["units"] for name, one in document_of(summary)["population"].items()}
+    assert units["gx.N"] - units["gy.N"] == 1 == units["gx.bias"] - units["gy.bias"]
 
 
 def test_the_page_stays_small(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from pathlib import Path
@@ -18,6 +19,7 @@ from selfcal.recording import save
 from selfcal.result import HALF_90
 from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.tables import make_tables
+from selfcal.units import factor
 from selfcal.verbs.fleet import fleet
 
 from conftest import case_records, run
@@ -150,6 +152,42 @@ def batch_of_files(folder: Path, units: int, seed: int, odd: dict[int, str], sam
         if kind == "stuck":
             y[500:2000] = y[500]
         save(folder / f"u{k:04}.npz", {"gx": ("deg/s", y)}, 1.0)
+
+
+def test_units_of_one_kind_are_one_population(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A batch in three units has the population of the same batch in one; a device's recordings join across units.
+
+    The lattice is compared as well: of the units, only the one with twice the step is unlike. The table keeps each
+    recording's own unit."""
+    monkeypatch.chdir(tmp_path)
+    random, samples = np.random.default_rng(21), 900
+    rows = ["file,device"]
+    for k in range(12):
+        lattice = 0.008 if k == 7 else 0.004
+        y = 0.2 * random.standard_normal() + np.cumsum(3e-3 * random.standard_normal(samples))
+        y = np.rint((y + 0.04 * random.standard_normal(samples)) / lattice) * lattice
+        unit = ("deg/s", "mrad/s", "deg/h")[0 if k == 7 else k % 3]
+        for folder, own in (("same", "deg/s"), ("mixed", unit)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            save(tmp_path / folder / f"r{k:02}.npz", {"gz": (own, y * factor("deg/s", own))}, 1.0)
+        rows.append(f"r{k:02}.npz,d{k // 2}")  # two recordings a device, in two units
+    Path("units.csv").write_text("\n".join(rows))
+    for table in (None, "units.csv"):
+        same, mixed = (fleet([f"{name}/*"], f"{name}.csv", units_table=table) for name in ("same", "mixed"))
+        assert set(same["population"]) >= {"gz.N", "gz.bias"}
+        for name, one in same["population"].items():
+            other = mixed["population"][name]
+            assert (other["units"], other["unit"], other["left_out"]) == (one["units"], one["unit"], one["left_out"])
+            for key in ("median", "q05", "q95"):  # identify works in float: 1e-7 of a reading, 1e-4 of an estimate
+                scale = one["spread"]["median"] * (1.0 if one["of"] == "value" else one["middle"]["median"])
+                assert other["middle"][key] == pytest.approx(one["middle"][key], abs=0.01 * scale)
+        stepped = {name: [text for text in words if "steps of" in text] for name, words in mixed["unlike"].items()}
+        assert {name: len(words) for name, words in stepped.items() if words} == {"r07" if table is None else "d3": 1}
+    with Path("mixed.csv").open(newline="") as stream:
+        read = {
+            row["recording"][-7:-4]: row["parameter_unit"] for row in csv.DictReader(stream) if row["parameter"] == "N"
+        }
+    assert read["r01"] == "mrad/s/sqrt(Hz)" and read["r02"] == "deg/h/sqrt(Hz)"
 
 
 KINDS = ("walk", "step", "clipped", "stuck", "range", "noise")

@@ -6,13 +6,14 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from glob import glob
 from pathlib import Path
 from typing import Any
 
-from selfcal.errors import UserError, short
+from selfcal.errors import UserError, note, short
 from selfcal.limits import read_text
 from selfcal.recording import meta_place
 
@@ -22,6 +23,11 @@ MOST_TABLE_BYTES = 1 << 26
 TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
 #: Where a serial number comes from.
 FROM_NAME, FROM_FIELD = "name", "field"
+#: A date of ISO 8601 in its extended form, with or without a time of day.
+_DATE = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d.*)?", re.ASCII)
+DATE_FORM = "2026-03-01 or 2026-03-01T14:30:00Z (ISO 8601)"
+#: Rows of a table of units that are named at most.
+MOST_ROWS_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -44,22 +50,39 @@ class Source:
     copy_of: str = ""
 
 
-def matching(patterns: Iterable[str], own: Sequence[Path]) -> list[str]:
+def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
     """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
 
     `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
+    A line names each link to nothing. It names a folder only where `patterns` names it, as a shell's pattern does.
     Raises UserError for a pattern that matches none.
     """
     found: dict[str, None] = {}
+    skipped: dict[str, str] = {}
     for pattern in patterns:
-        names = [pattern] if Path(pattern).exists() else glob(pattern, recursive=True)  # noqa: PTH207
-        kept = [name for name in names if _is_recording(Path(name)) and not _within_any(Path(name), own)]
-        if not kept:
-            raise UserError(
-                f"no recording matches '{short(pattern)}': give files, or a pattern in quotes as 'logs/**/*.csv'"
-            )
+        place = Path(pattern)
+        named = place.exists() or place.is_symlink()
+        names = [pattern] if named else glob(pattern, recursive=True)  # noqa: PTH207
+        others = [name for name in names if not _within_any(Path(name), own)]
+        kept = [name for name in others if _is_recording(Path(name))]
+        if not kept and not named:
+            raise _unmatched(pattern)
+        skipped |= {name: "a link to nothing" for name in others if not Path(name).exists()}
+        if named and place.is_dir() and others and not kept:
+            skipped[pattern] = "a folder that is no recording of ROS 2"
         found.update(dict.fromkeys(kept))
+    if not found:
+        raise _unmatched(*patterns)
+    for name, kind in skipped.items():
+        note(f"{name}: is {kind}: skipped")
     return sorted(found)
+
+
+def _unmatched(*patterns: str) -> UserError:
+    more = f" and {len(patterns) - 1} more" if len(patterns) > 1 else ""
+    return UserError(
+        f"no recording matches '{short(patterns[0])}'{more}: give files, or a pattern in quotes as 'logs/**/*.csv'"
+    )
 
 
 def _within_any(path: Path, own: Sequence[Path]) -> bool:
@@ -131,6 +154,17 @@ def sources_of(
     return Named(sources, copies)
 
 
+def moment(text: str) -> datetime | None:
+    """The time of a date of ISO 8601, in UTC where it has no zone; None for any other text."""
+    if not _DATE.fullmatch(text):
+        return None
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
 def stem(path: str) -> str:
     """A file's name without its suffixes of a recording: `a.12.csv.gz` is `a.12`."""
     name = Path(path).name.removesuffix(".gz")
@@ -183,12 +217,16 @@ def _table(place: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
         raise UserError(
             f"{place}: its first line must name each of {', '.join(TABLE_COLUMNS)} once; the last three may be left out"
         )
+    unknown = [cell.strip() for cell, name in zip(rows[0], header, strict=True) if name not in TABLE_COLUMNS]
+    if unknown:
+        note(f"{place}: does not read {_few(unknown, 'columns')} (known: {', '.join(TABLE_COLUMNS)})")
     by_place: dict[Path, list[str]] = {}
     by_name: dict[str, list[str]] = {}
     for path in paths:
         by_place.setdefault(Path(path).resolve(), []).append(path)
         by_name.setdefault(Path(path).name, []).append(path)
     found: dict[str, dict[str, str]] = {}
+    without: list[str] = []
     for number, cells in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in cells):
             continue
@@ -206,11 +244,24 @@ def _table(place: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
                     f"{place}: line {number}: '{short(file.name)}' is {short(meant[0])} and {short(meant[1])}: "
                     "give its folder"
                 )
+        date = row.get("date", "")
+        if date and moment(date) is None:
+            raise UserError(f"{place}: line {number}: date '{short(date)}': write it as {DATE_FORM}")
+        without += [] if meant else [f"'{row['file']}' (line {number})"]
         entry = {"device": row["device"], "station": row.get("station", ""), "lot": row.get("lot", "")}
-        entry["recorded_at"] = row.get("date", "")
+        entry["recorded_at"] = date
         for path in dict.fromkeys(meant):
             if found.setdefault(path, entry) != entry:
                 raise UserError(
                     f"{place}: line {number}: '{short(row['file'])}' is there twice, with different entries"
                 )
+    if without:
+        note(f"{place}: no recording of the batch is {_few(without, 'rows')}")
     return found
+
+
+def _few(names: Sequence[str], what: str) -> str:
+    """The first of the names, and how many more `what` there are."""
+    more = len(names) - MOST_ROWS_NAMED
+    shown = ", ".join(short(name) for name in names[:MOST_ROWS_NAMED])
+    return shown if more <= 0 else f"{shown} and {more} more {what}"

@@ -18,7 +18,6 @@ from selfcal import units
 from selfcal.batch.population import Population
 from selfcal.batch.summary import Batch, axes_of, group_of, sound_of
 from selfcal.errors import UserError
-from selfcal.laws import RATIOS
 from selfcal.model import LOG_NORMAL_SD, Model, Prior, read_yaml
 from selfcal.output import write_text
 from selfcal.priors import prior_tree
@@ -39,7 +38,7 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
     for one in batch.populations:
         axis, _, parameter = one.measured.name.rpartition(".")
         if one.measured.logarithm:
-            found.setdefault(axis, {})[parameter] = _prior(one, axis, parameter, batch, model)
+            found.setdefault(axis, {})[parameter] = _prior(one, batch)
     if not found:
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
@@ -75,18 +74,14 @@ def _rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def _prior(population: Population, axis: str, parameter: str, batch: Batch, model: Model) -> Prior:
+def _prior(population: Population, batch: Batch) -> Prior:
     """The log-normal prior of a new unit's parameter, in the unit of the axis's group."""
-    measured, fit = population.measured, population.fit
+    fit = population.fit
     mean = float(fit.weight @ fit.mean)
     variance = float(fit.weight @ (fit.t**2 + fit.variance + (fit.mean - mean) ** 2))
     shift = _of_lots(population, batch)
-    unit = units.parameter_unit(parameter, model.group_of(axis).unit)
-    factor = 1.0 if parameter in RATIOS else units.factor(measured.unit, unit)
     sd = math.sqrt(variance + float(np.var(shift)))
-    return Prior.log_normal(
-        factor * math.exp(mean + float(np.mean(shift))), min(max(sd, LOG_NORMAL_SD[0]), LOG_NORMAL_SD[1])
-    )
+    return Prior.log_normal(math.exp(mean + float(np.mean(shift))), min(max(sd, LOG_NORMAL_SD[0]), LOG_NORMAL_SD[1]))
 
 
 def _of_lots(population: Population, batch: Batch) -> np.ndarray:

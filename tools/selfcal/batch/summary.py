@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from selfcal.batch.population import (
     sd_of,
 )
 from selfcal.batch.table import Unit, bias_of
+from selfcal.errors import UserError
 from selfcal.laws import RATIOS
 from selfcal.model import Model, Prior
 from selfcal.result import HALF_90
@@ -41,6 +42,8 @@ LATTICE = 0.05
 LEAST_WEIGHT = 0.1
 #: What groups units, by the attribute of a source.
 KINDS = ("station", "day", "lot")
+#: Devices of a line at most.
+MOST_NAMED = 20
 
 
 @dataclass(frozen=True)
@@ -63,14 +66,22 @@ class Batch:
     populations: Sequence[Population]
     unlike: Mapping[str, Sequence[str]]
     shared: Sequence[Shared]
+    left_out: Mapping[tuple[str, str], Sequence[str]]
 
 
 def summed_up(units: Sequence[Unit], model: Model) -> Batch:
-    """The batch of recordings `units`."""
+    """The batch of recordings `units`. Its axes are in the units of the model's groups.
+
+    `left_out`: the devices whose axis reads in a unit of another kind, by axis and reason."""
     devices: dict[str, list[Unit]] = {}
+    left_out: dict[tuple[str, str], dict[str, None]] = {}
     for unit in units:
         if unit.error is None:
-            devices.setdefault(unit.device, []).append(unit)
+            own = _in_group_units(unit, model)
+            devices.setdefault(unit.device, []).append(own)
+            for axis, reason in own.errors.items():
+                if axis not in unit.errors:
+                    left_out.setdefault((axis, reason), {})[unit.device] = None
     names = list(devices)
     groupings = [(kind, [group_of(kind, devices[name][-1]) for name in names]) for kind in KINDS]
     laws = _laws(devices)
@@ -82,7 +93,41 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
             unlike.setdefault(names[one.at], []).append(_off(population, one.off, one.log_p))
     for name, words in _marked(devices, laws, shared):
         unlike.setdefault(name, []).append(words)
-    return Batch(devices, found, dict(sorted(unlike.items())), shared)
+    others = {key: list(one) for key, one in left_out.items()}
+    return Batch(devices, found, dict(sorted(unlike.items())), shared, others)
+
+
+def _in_group_units(unit: Unit, model: Model) -> Unit:
+    """The recording with each axis in the unit of its group. An axis of another kind has an `error` instead."""
+    axes = {name: _converted(axis, model.group_of(name).unit) for name, axis in unit.axes.items()}
+    return Unit(unit.source, {**unit.record, "axes": axes})
+
+
+def _converted(axis: Mapping[str, Any], to: str) -> Mapping[str, Any]:
+    if "error" in axis or axis["bias_now"]["unit"] == to:
+        return axis
+    bias = axis["bias_now"]
+    try:
+        factor = unit_module.factor(bias["unit"], to)
+    except UserError:
+        return {**axis, "error": f"reads in {bias['unit']}, the model in {to}"}
+    mean = unit_module.convert(bias["mean"], bias["unit"], to)
+    parameters = {
+        law: {name: _estimate_in(estimate, name, to) for name, estimate in of.items()}
+        for law, of in axis["parameters"].items()
+    }
+    found = {**axis, "bias_now": {"mean": mean, "sd": bias["sd"] * factor, "unit": to}, "parameters": parameters}
+    return found | ({"lattice": axis["lattice"] * factor} if "lattice" in axis else {})
+
+
+def _estimate_in(estimate: Mapping[str, Any], name: str, to: str) -> Mapping[str, Any]:
+    """An estimate of the parameter `name` of an axis that is to read in `to`."""
+    if name in RATIOS:
+        return estimate
+    unit = unit_module.parameter_unit(name, to)
+    factor = unit_module.factor(estimate["unit"], unit)
+    numbers = {key: estimate[key] for key in ("mean", "median", "sd", "q05", "q95") if estimate.get(key) is not None}
+    return {**estimate, **{key: factor * value for key, value in numbers.items()}, "unit": unit}
 
 
 def group_of(kind: str, unit: Unit) -> str:
@@ -129,41 +174,23 @@ def _measured(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], mo
     """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
     place = {name: k for k, name in enumerate(devices)}
     for axis, law in laws.items():
-        sound = sound_of(devices, axis)
-        unit = _unit(sound)
-        sound = {name: axes for name, axes in sound.items() if axes[-1]["bias_now"]["unit"] == unit}
+        sound, group = sound_of(devices, axis), model.group_of(axis)
         at = np.array([place[name] for name in sound], np.intp)
         parameters = list(next(iter(sound.values()))[0]["parameters"][law])
         for name in parameters:
-            of = next(iter(sound.values()))[0]["parameters"][law][name]["unit"]
-            prior = _prior(model, axis, name, of)
-            known = [_joined([one["parameters"][law][name] for one in axes], prior) for axes in sound.values()]
+            estimates = [[one["parameters"][law][name] for one in axes] for axes in sound.values()]
+            known = [_joined(of, group.priors.get(name)) for of in estimates]
             kept = np.array([one is not None and one[2] for one in known])
             if kept.sum() < max(FEWEST, 0.5 * kept.size):
                 continue  # the batch does not identify it
             there = [k for k, one in enumerate(known) if one is not None]
             y, s = np.array([known[k][:2] for k in there], np.float64).T  # type: ignore[index]
-            yield Measured(f"{axis}.{name}", "1" if name in RATIOS else of, law, y, s, at[there])
+            unit = unit_module.parameter_unit(name, group.unit)
+            yield Measured(f"{axis}.{name}", unit, law, y, s, at[there])
         bias = [bias_of(axes[-1]) for axes in sound.values()]
         y = np.array([one["median"] for one in bias])
         s = np.array([(one["q95"] - one["q05"]) / (2.0 * HALF_90) for one in bias])
-        yield Measured(f"{axis}.bias", unit, law, y, s, at, logarithm=False)
-
-
-def _unit(sound: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """The unit that most devices read in."""
-    counted = Counter(str(axes[-1]["bias_now"]["unit"]) for axes in sound.values())
-    return counted.most_common(1)[0][0]
-
-
-def _prior(model: Model, axis: str, name: str, unit: str) -> Prior | None:
-    """The prior that an axis's parameter was identified under, in `unit`; None if the model has none."""
-    group = model.group_of(axis)
-    prior = group.priors.get(name)
-    if prior is None or name in RATIOS:
-        return prior
-    factor = unit_module.factor(unit_module.parameter_unit(name, group.unit), unit)
-    return replace(prior, min=factor * prior.min, max=factor * prior.max)
+        yield Measured(f"{axis}.bias", group.unit, law, y, s, at, logarithm=False)
 
 
 def _joined(estimates: Sequence[Mapping[str, Any]], prior: Prior | None) -> tuple[float, float, bool] | None:
@@ -312,7 +339,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
 
 
 def lines_of(batch: Batch) -> Iterator[str]:
-    """A line for each population, each group that is apart and each shared cause."""
+    """A line for each population, each axis left out, each group that is apart and each shared cause."""
     for one in batch.populations:
         measured = one.measured
         middle, spread = plain(measured, one.fit.middle), one.fit.spread
@@ -321,6 +348,9 @@ def lines_of(batch: Batch) -> Iterator[str]:
             f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "
             f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}]"
         )
+    for (axis, reason), names in batch.left_out.items():
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        yield f"left out of the population: {axis} of {', '.join(names[:MOST_NAMED])}{more}: {reason}"
     for one in batch.populations:
         for apart in one.apart:
             yield f"{apart.kind} {apart.name}: {apart_words(one.measured, apart)}"

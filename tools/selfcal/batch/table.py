@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from selfcal.batch.files import Source, stem
+from selfcal.batch.files import Source, moment, stem
 from selfcal.errors import UserError, install
 from selfcal.output import whole
 from selfcal.result import HALF_90
@@ -28,14 +29,18 @@ class Unit:
         known = record.get("recording", {})
         self.source, self.record = source, record
         self.device: str = source.device or known.get("serial", "") or stem(source.path)
-        self.recorded_at: str = source.recorded_at or known.get("recorded_at", "")
+        dated: str = source.recorded_at or known.get("recorded_at", "")
+        self.moment = moment(dated)
+        #: A date of its metadata that is none.
+        self.undated = dated if self.moment is None else ""
+        self.recorded_at = dated if self.moment is not None else ""
         self.error: str | None = record.get("error")
         self.axes: Mapping[str, Any] = record.get("axes", {})
 
     @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> tuple[str, float, str]:
         """Its place in the table."""
-        return self.device, self.recorded_at, self.source.path
+        return self.device, -math.inf if self.moment is None else self.moment.timestamp(), self.source.path
 
     @property
     def errors(self) -> dict[str, str]:

@@ -9,14 +9,14 @@ from typing import Any, Unpack
 
 from rich.console import Console
 
-from selfcal.batch.files import sources_of
+from selfcal.batch.files import DATE_FORM, sources_of
 from selfcal.batch.prior_file import lines_of as lines_of_priors
 from selfcal.batch.prior_file import write_model as write_priors
 from selfcal.batch.record import ByContent, Options, examined, killed, settings_of
 from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import Unit, check_table, rows_of, write_table
 from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError, note, printable
+from selfcal.errors import UserError, note, printable, short
 from selfcal.fail_on import check, outcome
 from selfcal.loaders import Reading
 from selfcal.model import Model
@@ -116,6 +116,9 @@ def fleet(
         Unit(one, record_of.get(one.path, {"error": f"is the same recording as {one.copy_of}"}))
         for one in named.sources
     ]
+    for unit in batch:
+        if unit.undated:
+            note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
     batch.sort(key=lambda unit: unit.place)
     write_table(output, (row for unit in batch for row in rows_of(unit, version)))
     judged = [] if bounds is None else _judged(batch, bounds)
