@@ -25,6 +25,7 @@ from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.recording import save
 from selfcal.spread import DEATHS, Row, spread
+from selfcal.units import factor
 from selfcal.verbs.fleet import _document, _judged, fleet
 from selfcal.verdicts import Limits
 
@@ -205,6 +206,24 @@ def test_dates_are_iso_8601(logs: Path, capsys: pytest.CaptureFixture[str]) -> N
     fleet(["logs/b/meta.npz"], "t.csv")
     assert "logs/b/meta.npz: leaves out the date '5. May 2025': write it as 2026-03-01" in capsys.readouterr().err
     assert {row["recorded_at"] for row in table(logs / "t.csv")} == {""}
+
+
+def test_limits_read_as_data_sheets_print(tmp_path: Path) -> None:
+    """With or without a blank, with the signs of print; a minimum above its maximum is refused across units."""
+    place = tmp_path / "limits.yaml"
+    for text in ("0.9 °/s/√Hz", "0.9°/s/√Hz", "54deg/sqrt(h)", "5.4e1 °/√h"):  # 1 deg/sqrt(h) is 1/60 deg/s/sqrt(Hz)
+        place.write_text(f"gz.N: {{max: '{text}'}}\n")
+        (limit,) = Limits.load(place, Model.load()).stated
+        assert limit.value * factor(limit.unit, "deg/s/sqrt(Hz)") == pytest.approx(0.9, rel=1e-12)
+    for text in (
+        "gz.bias: {min: 0.3 deg/s, max: 900 deg/h}",
+        "gyro.N: {min: 3 deg/s/sqrt(Hz)}\ngz.N: {max: 2 deg/s/sqrt(Hz)}",
+    ):
+        place.write_text(text)
+        with pytest.raises(UserError, match=r"limits.yaml: gz\.(bias|N): min .* is above max "):
+            Limits.load(place, Model.load())
+    place.write_text("gz.bias: {min: 0.3 deg/s, max: 1500 deg/h}")
+    assert len(Limits.load(place, Model.load()).stated) == 2
 
 
 def test_finished_recordings_are_kept(logs: Path) -> None:

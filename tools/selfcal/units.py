@@ -108,10 +108,23 @@ _SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u
 #: A power without its sign, `s-1`, `s2`, and factors with blanks or stars between them.
 _POWER, _FACTORS = re.compile(r"(?<=[a-zA-Z])(-?\d)(?![\w.])", re.ASCII), re.compile(r"\s*[\s*]\s*")
 
+#: A root as print has it, and a number with its unit, with or without a blank between them.
+_ROOT = re.compile(r"√\(?([a-zA-Z]+)\)?")
+_QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*(\S.*)?", re.ASCII)
+
+
+def quantity(text: str) -> tuple[float, str]:
+    """Number and unit, "" for none, of a text as `0.014 deg/s/sqrt(Hz)` or `1.2°/√h`. Raises ValueError."""
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError("neither a number nor one with its unit")
+    return float(match[1]), plain(match[2] or "")
+
 
 def plain(name: str) -> str:
-    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`; other texts stay."""
-    spelled = name.strip().translate(_SIGNS)
+    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`;
+    `√Hz` -> `sqrt(Hz)`; other texts stay."""
+    spelled = _ROOT.sub(r"sqrt(\1)", name.strip().translate(_SIGNS))
     if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
         return spelled
     product = _FACTORS.sub("*", _POWER.sub(r"^\1", spelled.replace("^", "")))

@@ -129,16 +129,23 @@ class Limits:
                     (of_group if name in groups else stated).append(Limit(axis, parameter, side, value, of))
         if not stated and not of_group:
             raise UserError(f"{place}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
-        return Limits(tuple(stated), tuple(of_group))
+        found = Limits(tuple(stated), tuple(of_group))
+        by_side = {(one.axis, one.parameter, one.side): one for one in found.of(model.axes)}
+        for (axis, parameter, side), low in by_side.items():
+            high = by_side.get((axis, parameter, "max"))
+            if side == "min" and high is not None and low.value * units.factor(low.unit, high.unit) > high.value:
+                raise UserError(
+                    f"{place}: {axis}.{parameter}: min {low.value:g} {low.unit} is above max {high.value:g} {high.unit}"
+                )
+        return found
 
 
 def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
     """Value and unit of a text such as `0.014 deg/s/sqrt(Hz)`, of the kind of `like`."""
     wanted = f"takes a number and a unit as {like}, not {shown(text)}"
-    number, _, unit = str(text).strip().partition(" ")
-    unit = "1" if not unit and like == "1" else units.plain(unit)
     try:
-        value = float(number)
+        value, unit = units.quantity(str(text))
+        unit = unit or ("1" if like == "1" else "")
         alike = units.known(unit) and unit != units.LSB and units.same_kind(unit, like)
     except ValueError as error:
         raise UserError(f"{where}: {wanted}") from error

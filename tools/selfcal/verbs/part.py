@@ -107,9 +107,7 @@ def part(
 
 def parse(text: str) -> Stated:
     """`gx.N=0.012deg/sqrt(h)`: an axis or a group and a dot, if it is of one alone; the key; the number; its unit."""
-    match = re.fullmatch(
-        r"\s*(?:(?P<of>[\w-]+)\.)?(?P<key>\w+)\s*=\s*(?P<value>[-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\S.*)?", text
-    )
+    match = re.fullmatch(r"\s*(?:(?P<of>[\w-]+)\.)?(?P<key>\w+)\s*=(?P<quantity>.*)", text)
     wanted = "write KEY=NUMBER and its unit, as N=0.012deg/sqrt(h), accel.N=70ug/sqrt(Hz) or rate=200Hz"
     if match is None:
         raise UserError(f"--datasheet {short(text)}: {wanted}")
@@ -118,10 +116,9 @@ def parse(text: str) -> Stated:
         known = ", ".join((*STATED, *OF_PART))
         raise UserError(f"--datasheet {short(text)}: there is no key '{short(key)}' (there are {known})")
     try:
-        value = float(match["value"])
+        value, unit = unit_module.quantity(match["quantity"])
     except ValueError:
         raise UserError(f"--datasheet {short(text)}: {wanted}") from None
-    unit = unit_module.plain(match["unit"] or "")
     if key == "density":
         key, value = "N", value * unit_module.ONE_SIDED_TO_TWO_SIDED
     if not math.isfinite(value) or not value > 0.0 or not unit_module.known(unit):
