@@ -93,8 +93,10 @@ def checks(quick: bool) -> Count:
     """Every target of `make check`. With them, so that no core idles, what the later suites run is made; they tell
     what of that failed."""
     makefile = (ROOT / "tests" / "checks.mk").read_text(encoding="utf-8")
-    match = re.search(r"^CHECKS := (.*)$", makefile, re.MULTILINE)
-    names = [name for name in (match[1].split() if match else []) if not (quick and name in SLOW_CHECKS)]
+    match = re.search(r"^CHECKS := ((?:.*\\\n)*.*)$", makefile, re.MULTILINE)
+    names = [
+        name for name in (match[1].replace("\\\n", " ").split() if match else []) if not (quick and name in SLOW_CHECKS)
+    ]
     built = [program(VARIANTS[0], source) for source in C_TESTS] if quick else BUILT
     code, output = run([*MAKE, *names, *map(str, built)], TIMEOUT["check"])
     made = r"\*\*\* \[[^\]]*: (check-\S+)\]|Target '(check-\S+)' not remade"

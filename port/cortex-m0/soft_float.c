@@ -112,7 +112,7 @@ uint32_t soft_float_add(uint32_t a, uint32_t b) {
     uint32_t mx, my;
     int32_t e = unpack(x, &mx);
     const int32_t lower = e - unpack(y, &my);
-    const uint32_t shift = lower < 31 ? (uint32_t)lower : 31U;
+    const uint32_t shift = (uint32_t)lower < 31U ? (uint32_t)lower : 31U;
     mx <<= 6; /* a bit for the carry */
     my <<= 6;
     my = (my >> shift) | ((my & ((1U << shift) - 1U)) != 0U ? 1U : 0U);
