@@ -72,12 +72,15 @@ static void begin_bias(selfcal_work_t *work) {
 static void now_plain(const selfcal_work_t *work, uint16_t k, selfcal_real_t sigma_sq, selfcal_node_view_t *v,
                       selfcal_now_t *now) {
     selfcal_bank_now(work->bank, (uint16_t)(work->first_node + k), v);
-    const selfcal_real_t per_sd = (selfcal_real_t)work->per_bias_sd, prior_precision = sigma_sq * per_sd * per_sd,
-                         offset = (selfcal_real_t)selfcal_bank_from_prior(work->bank, work->axis);
-    const selfcal_real_t variance = R(1.0) / ((selfcal_real_t)v->a + prior_precision),
-                         x0 = ((selfcal_real_t)v->b - offset * prior_precision) * variance,
+    /* Wide: a bias that nearly no reading shows has a precision beyond a float. */
+    const selfcal_wide_t per_sd = (selfcal_wide_t)work->per_bias_sd,
+                         prior_precision = (selfcal_wide_t)sigma_sq * per_sd * per_sd,
+                         offset = (selfcal_wide_t)selfcal_bank_from_prior(work->bank, work->axis);
+    const selfcal_wide_t per_precision = 1.0 / ((selfcal_wide_t)v->a + prior_precision),
+                         level = ((selfcal_wide_t)v->b - offset * prior_precision) * per_precision;
+    const selfcal_real_t variance = (selfcal_real_t)per_precision, x0 = (selfcal_real_t)level,
                          left = (selfcal_real_t)v->bias_left, lost = R(1.0) - left;
-    now->mean = v->drift + (selfcal_wide_t)(x0 * left);
+    now->mean = v->drift + level * (selfcal_wide_t)left;
     now->drift[0] = (selfcal_real_t)v->drift - x0 * lost;
     now->own[0] = left * left * variance;
     now->own[1] = left * lost * variance;
@@ -109,6 +112,9 @@ void selfcal_bias_step(selfcal_work_t *work) {
     }
     if (work->at++ == 0U) {
         work->bias.about = now.mean;
+    }
+    if (weight == R(0.0)) {
+        return; /* far from all that counts, its mean may lie beyond a float */
     }
     const selfcal_real_t off = (selfcal_real_t)(now.mean - work->bias.about), weighed = weight * off;
     work->bias.weight += weight;
