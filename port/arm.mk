@@ -14,7 +14,7 @@ ARM_COMPILE := -std=c99 -ffp-contract=off -fno-math-errno -ffunction-sections -f
 ARM_SMALL := -fno-move-loop-invariants -fno-tree-loop-im -fno-tree-tail-merge -fno-reorder-blocks -fno-schedule-insns2 \
              -fno-tree-fre
 ARM_FAST := %/intake.c %/intake_fixed.c %/intake_float.c %/bank_kernel_fixed.c %/bank_kernel_float.c \
-            %/report_expected.c %/report_spectrum.c %/report_spline.c %/report_cells.c
+            %/report_expected.c %/report_spline.c %/report_cells.c
 # arm_objects FLAGS,SOURCES,DIR: objects of the sources in DIR. Paths are as given: the path of a checkout, which may
 # hold spaces, does not enter.
 arm_each = for source in $(2); do $(1) -c $$source -o $(3)/$$(basename $$source .c).o || exit 1; done

@@ -246,7 +246,7 @@ def test_half_of_the_evidence_carries_over(law: str) -> None:
         tree = extended(model, record, found)
         names = [finding.look.cause for finding in found["gx"].by_gain]
         log = Recording(Path("second"), 1.0, {"gx": Column("gx", "deg/s", second)}, np.zeros(second.size, np.int64), {})
-        gains = dict(zip(names, carried.gains(model, tree, record, found, log)["gx"], strict=True))
+        gains = dict(zip(names, carried.gains(model, tree, record, found, log)["gx"][0], strict=True))
         gain = gains["oscillation"].gain if "oscillation" in gains else None
         score = {} if gain is None else gain["log_score_per_sample"]
         won = 0.0 if gain is None else (score["after"] - score["before"]) * score["samples"]

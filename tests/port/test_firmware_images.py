@@ -257,10 +257,10 @@ def said_of(source: str, model: Path, core: str = "cortex-m4f", *flags: str, sen
         # by 1638.4 / n Hz, n = 1 .. 128, of the data sheet, to 0.1 %
         ("app/readings.c", "819.2", "546.1", ""),
         ("app/readings.c", "819.2", "12.8", ""),
-        ("app/readings.c", "819.2", "12.7", "the_sensor_makes_the_rate"),
-        ("app/readings.c", "819.2", "821.0", "the_sensor_makes_the_rate"),
-        ("app/readings.c", "819.2", "100.0", "the_sensor_makes_the_rate"),
-        ("app/readings.c", "819.2", "1638.4", "the_sensor_makes_the_rate"),  # two bursts do not fit
+        ("app/readings.c", "819.2", "12.7", "set sensor.rate_hz in the model file"),
+        ("app/readings.c", "819.2", "821.0", "set sensor.rate_hz in the model file"),
+        ("app/readings.c", "819.2", "100.0", "set sensor.rate_hz in the model file"),
+        ("app/readings.c", "819.2", "1638.4", "set sensor.rate_hz in the model file"),  # two bursts do not fit
     ],
 )
 def test_models_that_the_board_cannot_keep_do_not_compile(

@@ -219,7 +219,7 @@ def test_bad_recordings(tmp_path: Path, verb: str, text: str, expected: str) -> 
 def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> None:
     """Truth: the table in tools/README.md. A monitor's `start` is its `--from`."""
     named = {"start": "start_s", "end": "end_s", "since_power_on": "since_power_on_s", "axis": "axes"}
-    named |= {"column": "columns", "unit": "units", "from": "start", "no_suspicion": "suspicion"}
+    named |= {"column": "columns", "unit": "units", "source": "sources", "from": "start", "no_suspicion": "suspicion"}
     function = getattr(import_module(f"selfcal.{selfcal.VERBS[verb]}.{verb}"), verb)
     keywords = set(inspect.signature(function).parameters)
     if "reading" in keywords:
@@ -231,7 +231,7 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
         for one in command.commands[verb].params
         if one.param_type_name == "option"
     }
-    ensemble = {"records", "results", "samples", "scheduler", "seed", "truth"} if verb == "rivals" else set()
+    ensemble = {"records", "results", "samples", "scheduler", "seed", "truth", "workers"} if verb == "rivals" else set()
     known = {named.get(option, option) for option in options - ensemble - {"help"}}
     assert known <= keywords, known - keywords
 

@@ -277,6 +277,6 @@ def test_the_noise_level_is_that_of_the_recording(lag1: float, tmp_path: Path) -
 def test_a_column_without_an_entry_is_no_regressor() -> None:
     """A cause may have a column that no model file states: the file has its effect alone."""
     column = Regressor("toy", "ramp", np.arange(8.0), "1", {})
-    found: Any = {"gx": SimpleNamespace(state=SimpleNamespace(regressors=(column,)))}
+    found: Any = {"gx": SimpleNamespace(state=SimpleNamespace(regressors=(column,)), findings=[])}
     record: Any = None
     assert _regressors(Model.load(), record, found) == []

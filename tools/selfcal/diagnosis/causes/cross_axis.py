@@ -36,7 +36,7 @@ def looks(state: State, record: Record) -> list[Look]:
                 record.axes[name].unit,
                 values,
                 rate_windows_s=RATE_WINDOWS_S,
-                forms=("static", "lag", "rate", "square", "first_order"),
+                forms=("static", "lag", "rate", "square"),  # first_order would follow noise that both share
                 slow=False,
                 ln_looks=math.log(len(others)),
                 extra={"other": name},
