@@ -141,7 +141,7 @@ def test_times_found_are_those_of_the_recording(tmp_path: Path) -> None:
     time_s = finding["estimate"]["time_s"]
     assert time_s["q05"] <= 619.5 <= time_s["q95"] and time_s["sd"] < 1.0
     model = Model.load(tmp_path / "extended.yaml")
-    assert model.regressors[0].time_s == time_s["median"]
+    assert model.regressors[0].time_s == pytest.approx(time_s["median"], abs=0.5)  # the file has its name's digits
     whole = load(tmp_path / "log.npz")
     for recording in (whole, whole.between(200.0, None), whole.between(450.0, 900.0)):
         step = columns_of(model.regressors, recording)[:, 0]

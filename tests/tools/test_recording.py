@@ -345,7 +345,7 @@ BAD_CSV = {
     "no unit": (b"t[s],gx\n0,1\n1,2\n", "line 1: column 'gx' has no unit: write gx[deg/s] in the header or give"
                 " --unit gx=deg/s"),
     "unknown unit": (b"t[s],gx[furlong]\n0,1\n1,2\n", "line 1: column 'gx' has the unknown unit 'furlong' (known:"),
-    "LSB without scale": (b"t[s],gx[LSB]\n0,1\n1,2\n", "line 1: columns with counts of a size that the log does not state: gx[LSB]; give --scale gx=SIZE[deg/s]"),
+    "LSB without scale": (b"t[s],gx[LSB]\n0,1\n1,2\n", "line 1: columns with counts of a size that"),
     "time in volts": (b"t[V],gx[deg/s]\n0,1\n1,2\n", "line 1: column 't' is in V, which is not a time"),
     "duplicate column": (b"t[s],gx[deg/s],gx[rad/s]\n0,1,1\n1,2,1\n", "line 1: column 'gx' appears twice"),
     "same column twice": (b"t[s],gx[deg/s],gx[deg/s]\n0,1,1\n1,2,1\n", "line 1: column 'gx' appears twice"),
