@@ -100,21 +100,23 @@ void selfcal_bias_step(selfcal_work_t *work) {
     }
     const uint16_t in_turn = (uint16_t)(work->bias.from + work->at), nodes = nodes_of(work),
                    k = (uint16_t)(in_turn < nodes ? in_turn : in_turn - nodes);
+    const selfcal_real_t weight = work->scratch.grid.spline[0][k];
+    const bool first = work->at++ == 0U;
+    if (weight == R(0.0) && !first) {
+        return; /* far from all that counts, its mean may lie beyond a float */
+    }
     selfcal_now_t now;
     selfcal_field_t field;
     selfcal_node_field(work, k, &field);
     const selfcal_real_t mode_sq = (selfcal_real_t)field.var * field.ratio, sigma_sq = mode_sq * work->bias.mean_sq;
-    const selfcal_real_t own = work->scratch.grid.spline[1][k] * mode_sq, weight = work->scratch.grid.spline[0][k];
+    const selfcal_real_t own = work->scratch.grid.spline[1][k] * mode_sq;
     if (work->mask != 0U) {
         work->bank->model->regressors->code->now(work, k, (selfcal_wide_t)sigma_sq, &now);
     } else {
         now_plain(work, k, sigma_sq, &field.node, &now);
     }
-    if (work->at++ == 0U) {
+    if (first) {
         work->bias.about = now.mean;
-    }
-    if (weight == R(0.0)) {
-        return; /* far from all that counts, its mean may lie beyond a float */
     }
     const selfcal_real_t off = (selfcal_real_t)(now.mean - work->bias.about), weighed = weight * off;
     work->bias.weight += weight;

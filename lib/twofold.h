@@ -13,20 +13,18 @@ static inline selfcal_sum_t two_sum(selfcal_real_t a, selfcal_real_t b) {
 
 /* Adds hi + lo, |lo| far below |hi| (Knuth's two-sum, then renormalised). */
 static inline void sum_add(selfcal_sum_t *sum, selfcal_real_t hi, selfcal_real_t lo) {
-    const selfcal_real_t total = sum->hi + hi;
-    const selfcal_real_t part = total - sum->hi;
-    const selfcal_real_t error = ((sum->hi - (total - part)) + (hi - part)) + (sum->lo + lo);
-    sum->hi = total + error;
-    sum->lo = error - (sum->hi - total);
+    const selfcal_sum_t total = two_sum(sum->hi, hi);
+    const selfcal_real_t error = total.lo + (sum->lo + lo);
+    sum->hi = total.hi + error;
+    sum->lo = error - (sum->hi - total.hi);
 }
 
 /* Adds a single number: no lo to add. */
 static inline void sum_add_value(selfcal_sum_t *sum, selfcal_real_t value) {
-    const selfcal_real_t total = sum->hi + value;
-    const selfcal_real_t part = total - sum->hi;
-    const selfcal_real_t error = ((sum->hi - (total - part)) + (value - part)) + sum->lo;
-    sum->hi = total + error;
-    sum->lo = error - (sum->hi - total);
+    const selfcal_sum_t total = two_sum(sum->hi, value);
+    const selfcal_real_t error = total.lo + sum->lo;
+    sum->hi = total.hi + error;
+    sum->lo = error - (sum->hi - total.hi);
 }
 
 /* Adds scale * value, the product in full. */

@@ -417,7 +417,6 @@ def common(random: np.random.Generator) -> dict[str, Array]:
     }
 
 
-@pytest.mark.xfail(reason="step 12: of axes that a third source moves 3 findings of 5 name no source", strict=False)
 def test_the_source_is_named_where_the_record_shows_it(tmp_path: Path) -> None:
     """Of axes that a third source moves, none is called the source; of a leak behind a lag, the axis that leaks is.
     Each on nine of ten findings."""

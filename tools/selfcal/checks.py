@@ -17,7 +17,7 @@ from selfcal.blocks import MOST_DENSE, Blocks
 from selfcal.lattice import BELOW_LATTICE
 from selfcal.model import Group, Prior
 from selfcal.readings import CLOCK_LEAST, Readings
-from selfcal.result import HALF_90, AxisResult, Estimate
+from selfcal.result import AxisResult, Estimate
 from selfcal.tables import Tables
 
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
@@ -107,8 +107,7 @@ def _distance(estimate: Estimate, prior: Prior) -> float:
     """Standard deviations between the record and the prior. A posterior of nearly the prior's width states none."""
     if not (estimate.q05 > 0.0 and math.isfinite(estimate.q95)):
         return math.inf
-    sd = math.log(estimate.q95 / estimate.q05) / (2.0 * HALF_90)
-    left = max(prior.ln_sd**2 - sd**2, LEFT_LEAST * prior.ln_sd**2)
+    left = max(prior.ln_sd**2 - estimate.ln_sd**2, LEFT_LEAST * prior.ln_sd**2)
     return abs(math.log(estimate.median / prior.median)) / math.sqrt(left)
 
 

@@ -49,6 +49,11 @@ class Estimate:
     identified: bool
     off_grid: bool = False
 
+    @property
+    def ln_sd(self) -> float:
+        """sd of the logarithm, by the 90 % interval; of a positive parameter."""
+        return math.log(self.q95 / self.q05) / (2.0 * HALF_90)
+
     def scaled(self, factor: float) -> Estimate:
         """The same estimate with its unit changed by `factor`."""
         return Estimate(

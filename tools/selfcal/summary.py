@@ -113,7 +113,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
     the record does.
     """
-    law = max(result.probability, key=lambda one: result.probability[one])
+    law = result.best
     estimates = result.parameters[law]
     open_ = [name for name, estimate in estimates.items() if not estimate.identified]
     medians = {name: estimate.median for name, estimate in estimates.items()}
@@ -127,8 +127,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     now = variance(1.0)
     found: dict[str, float | None] = {}
     for name in open_:
-        seen = (math.log(estimates[name].q95 / estimates[name].q05) / (2.0 * HALF_90)) ** 2
-        wanted = 0.25 * math.sqrt(now[name] * seen)
+        wanted = 0.25 * math.sqrt(now[name]) * estimates[name].ln_sd
         low, high = 0.0, math.log(MOST_REST)
         if not variance(MOST_REST)[name] <= wanted:
             found[name] = None

@@ -157,13 +157,11 @@ def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, floa
 def _x_limits(figure: Figure) -> tuple[float, float]:
     first = figure.panels[0]
     xs = [one.x for panel in figure.panels for one in panel.drawn]
-    low, high = _limits(xs, first.log_x, 0.0)
     if first.stairs:  # to the outer edges of the bins, and to the marks beyond them
-        part = 0.5 / max(1, xs[0].size - 1)
-        half = (high / low) ** part if first.log_x else part * (high - low)
-        low, high = (low / half, high * half) if first.log_x else (low - half, high + half)
+        low, high = _limits(xs, first.log_x, 0.5 / max(1, xs[0].size - 1))
         marks = [mark for panel in figure.panels for mark in panel.marks]
         return min([low, *marks]), max([high, *marks])
+    low, high = _limits(xs, first.log_x, 0.0)
     # Pieces' middles begin half a piece after 0.
     return (0.0 if not first.log_x and 0.0 < low < 0.05 * high else low), high
 

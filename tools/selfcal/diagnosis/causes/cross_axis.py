@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.state import ALIKE, Look, State
+from selfcal.diagnosis.statemodel import Array
 from selfcal.forms import formed
 from selfcal.regressors import coefficient_unit
 
@@ -72,32 +73,42 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             one.state = without(one.state, other)
             changed.append(name)
     for name, one in found.items():
+        of_other: dict[str, list[int]] = {}
         for k, finding in enumerate(one.findings):
-            if finding.look.cause == "cross_axis" and not _source_shown(record, found, name, finding):
-                estimate = {**finding.look.estimate, "source": "not shown"}
-                one.findings[k] = replace(finding, look=replace(finding.look, estimate=estimate))
+            if finding.look.cause == "cross_axis":
+                of_other.setdefault(str(finding.look.estimate["other"]), []).append(k)
+        for other, places in of_other.items():
+            if not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
+                for k in places:
+                    look = one.findings[k].look
+                    look = replace(look, estimate={**look.estimate, "source": "not shown"})
+                    one.findings[k] = replace(one.findings[k], look=look)
     return changed
 
 
-def _source_shown(record: Record, found: Mapping[str, Diagnosed], name: str, finding: Finding) -> bool:
-    """Whether the record shows that the other axis is the source: not this one, and no third one of both.
+def _source_shown(
+    record: Record, found: Mapping[str, Diagnosed], name: str, other: str, findings: Sequence[Finding]
+) -> bool:
+    """Whether the record shows that the other axis is the source: not this one, and no third one of both. `findings`:
+    all of the pair, of which one source is asked.
 
     The joint likelihood of both axes must be clearly larger with this one following than with the other following. A
     lag has a direction in time as well: where the other axis' future explains as much as its past, or adds to it, both
     follow a third.
     """
-    other = str(finding.look.estimate["other"])
     final = found[name].state
     free = without(final, other)
     ahead = final.best.ln_likelihood - free.best.ln_likelihood
     source = without(found[other].state if other in found else record.axes[other], name)
     back = source.with_columns(record.other_axes(other)[name])[0]
-    if ahead - back <= ALIKE:
-        return False
-    if "lag_s" not in finding.look.estimate:
-        return True
+    lagged = [finding for finding in findings if "lag_s" in finding.look.estimate]
+    return ahead - back > ALIKE and all(_is_late(final, one, record.other_axes(name)[other]) for one in lagged)
+
+
+def _is_late(final: State, finding: Finding, values: Array) -> bool:
+    """Whether the past of the other axis `values` [n] explains a lag, and its future neither instead nor beside it."""
     lag_s = float(finding.look.estimate["lag_s"]["median"])
-    early = formed(record.other_axes(name)[other][::-1], "lag", lag_s, 0.0, final.dt)[::-1]
+    early = formed(values[::-1], "lag", lag_s, 0.0, final.dt)[::-1]
     beside = final.without({one.name for one in finding.columns if form_of(one)[2] == "lag"})
     instead = beside.fitted_with(final.best.terms, early).ln_likelihood
     both = final.fitted_with(final.best.terms, early).ln_likelihood
