@@ -101,8 +101,9 @@ void selfcal_bias_step(selfcal_work_t *work) {
     const uint16_t in_turn = (uint16_t)(work->bias.from + work->at), nodes = nodes_of(work),
                    k = (uint16_t)(in_turn < nodes ? in_turn : in_turn - nodes);
     const selfcal_real_t weight = work->scratch.grid.spline[0][k];
-    const bool first = work->at++ == 0U;
+    const bool first = work->at == 0U;
     if (weight == R(0.0) && !first) {
+        work->at++;
         return; /* far from all that counts, its mean may lie beyond a float */
     }
     selfcal_now_t now;
@@ -126,6 +127,7 @@ void selfcal_bias_step(selfcal_work_t *work) {
     if (has_decay(hypothesis_of(work)->law)) {
         gather_decay(work, k, &field.node, &now, own, off);
     }
+    work->at++; /* last: what the columns sum begins with the first node as well */
 }
 
 void selfcal_bias_finish(const selfcal_work_t *work, selfcal_posterior_t *posterior) {
