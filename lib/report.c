@@ -173,7 +173,7 @@ static selfcal_status_t step_fit(selfcal_work_t *work, selfcal_report_t *report)
     (void)report;
     selfcal_spectrum_step(work);
     if (work->at > work->bank->model->nodes || !work->truth.pair) {
-        selfcal_spectrum_solve(work);
+        selfcal_spectrum_solve(&work->scratch.fit, &work->truth);
         go_to(work, SIGMA);
         work->hypothesis = 0;
     }

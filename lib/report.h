@@ -146,7 +146,7 @@ selfcal_real_t selfcal_spectrum_range(selfcal_real_t weight);
 
 /* One node's row of the least squares, and their solution after the last. */
 void selfcal_spectrum_step(selfcal_work_t *work);
-void selfcal_spectrum_solve(selfcal_work_t *work);
+void selfcal_spectrum_solve(const selfcal_fit_t *fit, selfcal_truth_t *truth);
 
 /* --- spline --- */
 
@@ -192,12 +192,12 @@ uint16_t selfcal_cells_in(const selfcal_work_t *work, unsigned dimension);
 selfcal_real_t selfcal_points_gain(const selfcal_work_t *work, selfcal_real_t ln_alpha);
 
 /* The widest ranges of ln rho and ln alpha that the priors permit. */
-void selfcal_cells_limits(selfcal_work_t *work);
+void selfcal_cells_limits(const selfcal_work_t *work, selfcal_search_t *search);
 
 /* The row of cells at an alpha, and what goes for a column of nodes as well; the cell at a rho; its white noise, of
  * which the profile has none as yet; ln of the parameters at its conditional mode. */
-void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha);
-void selfcal_cells_column(selfcal_work_t *work, selfcal_real_t ln_alpha);
+void selfcal_cells_row(const selfcal_work_t *work, selfcal_real_t ln_alpha, selfcal_cell_row_t *row);
+void selfcal_cells_column(const selfcal_work_t *work, selfcal_real_t ln_alpha, selfcal_cell_row_t *row);
 selfcal_real_t selfcal_cells_white(const selfcal_work_t *work, selfcal_real_t rho_sq, cell_t *cell);
 void selfcal_cells_make(const selfcal_work_t *work, selfcal_real_t ln_rho, cell_t *cell);
 void selfcal_cells_parameters(const selfcal_work_t *work, const cell_t *cell,

@@ -21,12 +21,12 @@ static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_real_t x0,
 /* As a term decays by 1 - psi, the mean goes to now - psi drift and the node's own variance to
  * (1 - psi)^2 drift_var + (bias_left + psi lost)^2 variance + (1 - (1 - psi)^2) stationary, times sigma_v^2. `off`: the
  * node's mean less bias_about. */
-static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_view_t *v, const selfcal_now_t *now,
-                         selfcal_real_t own, selfcal_real_t off) {
+static void gather_decay(const selfcal_work_t *work, uint16_t k, const selfcal_node_view_t *v, const selfcal_now_t *now,
+                         selfcal_real_t own, selfcal_real_t off, selfcal_bias_t *bias) {
     const selfcal_law_t *law = hypothesis_of(work)->law;
     const size_t terms = terms_of(law);
     const selfcal_real_t square = r_exp(R(2.0) * (selfcal_real_t)v->ln_rho), weight = work->scratch.grid.spline[0][k];
-    selfcal_real_t *decay = work->bias.decay[k % grid_nodes(hypothesis_of(work)->alpha)];
+    selfcal_real_t *decay = bias->decay[k % grid_nodes(hypothesis_of(work)->alpha)];
     selfcal_wide_t spread[SELFCAL_TERM_PAIRS] = {v->drift_var};
     const bool sum = is_sum(law);
     const selfcal_wide_t second = sum ? exp(v->ln_alpha) : 0.0, dt_s = (selfcal_wide_t)work->bank->model->dt_s;
@@ -60,12 +60,12 @@ static void gather_decay(selfcal_work_t *work, uint16_t k, const selfcal_node_vi
 }
 
 /* The node of most weight is the first. */
-static void begin_bias(selfcal_work_t *work) {
+static void begin_bias(const selfcal_work_t *work, selfcal_bias_t *bias) {
     const selfcal_real_t *weight = work->scratch.grid.spline[0];
     for (uint16_t k = 1; k < nodes_of(work); k++) {
-        work->bias.from = weight[k] > weight[work->bias.from] ? k : work->bias.from;
+        bias->from = weight[k] > weight[bias->from] ? k : bias->from;
     }
-    work->bias.mean_sq = (selfcal_real_t)(work->sum.mass_sq / work->sum.mass);
+    bias->mean_sq = (selfcal_real_t)(work->sum.mass_sq / work->sum.mass);
 }
 
 /* Without regressors in use. */
@@ -96,7 +96,7 @@ static void now_plain(const selfcal_work_t *work, uint16_t k, selfcal_real_t sig
  * change too much from node to node. */
 void selfcal_bias_step(selfcal_work_t *work) {
     if (work->at == 0U) {
-        begin_bias(work);
+        begin_bias(work, &work->bias);
     }
     const uint16_t in_turn = (uint16_t)(work->bias.from + work->at), nodes = nodes_of(work),
                    k = (uint16_t)(in_turn < nodes ? in_turn : in_turn - nodes);
@@ -125,7 +125,7 @@ void selfcal_bias_step(selfcal_work_t *work) {
     work->bias.second += weighed * off;
     work->bias.own += own * ((selfcal_real_t)field.node.drift_var + now.own[0]);
     if (has_decay(hypothesis_of(work)->law)) {
-        gather_decay(work, k, &field.node, &now, own, off);
+        gather_decay(work, k, &field.node, &now, own, off, &work->bias);
     }
     work->at++; /* last: what the columns sum begins with the first node as well */
 }

@@ -66,32 +66,30 @@ static selfcal_real_t drift_shift(const selfcal_work_t *work, selfcal_real_t ln_
                                               : R(-0.5) * r_log(selfcal_points_gain(work, ln_alpha));
 }
 
-void selfcal_cells_limits(selfcal_work_t *work) {
+void selfcal_cells_limits(const selfcal_work_t *work, selfcal_search_t *search) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const selfcal_prior_t *prior = prior_of(work);
     for (int d = 0; d < 2; d++) {
-        work->search.limit_lo[d] = R(0.0);
-        work->search.limit_hi[d] = R(1.0); /* a dimension the law has not: one cell of unit width */
+        search->limit_lo[d] = R(0.0);
+        search->limit_hi[d] = R(1.0); /* a dimension the law has not: one cell of unit width */
     }
     if (hypothesis->alpha != NULL) {
-        work->search.limit_lo[1] = (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min;
-        work->search.limit_hi[1] = (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max;
+        search->limit_lo[1] = (selfcal_real_t)prior[SELFCAL_ALPHA].ln_min;
+        search->limit_hi[1] = (selfcal_real_t)prior[SELFCAL_ALPHA].ln_max;
     }
     if (hypothesis->rho != NULL) {
         const selfcal_prior_t *drift = &prior[drift_parameter(hypothesis->law)];
-        const selfcal_real_t lo = half_ln_dt(work) - drift_shift(work, work->search.limit_lo[1]),
-                             hi = half_ln_dt(work) - drift_shift(work, work->search.limit_hi[1]);
-        work->search.limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + lo;
-        work->search.limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + hi;
+        const selfcal_real_t lo = half_ln_dt(work) - drift_shift(work, search->limit_lo[1]),
+                             hi = half_ln_dt(work) - drift_shift(work, search->limit_hi[1]);
+        search->limit_lo[0] = (selfcal_real_t)drift->ln_min - (selfcal_real_t)prior[SELFCAL_N].ln_max + lo;
+        search->limit_hi[0] = (selfcal_real_t)drift->ln_max - (selfcal_real_t)prior[SELFCAL_N].ln_min + hi;
         /* this far over N/sqrt(dt), farther over sigma_v */
-        const selfcal_real_t of_noise =
-            r_exp(R(2.0) * work->search.limit_hi[0]) * left_out_of(work, work->search.limit_hi[1]);
-        work->search.limit_hi[0] -= R(0.5) * r_log1p(-r_fmin(of_noise, LEFT_OUT_LIMIT));
+        const selfcal_real_t of_noise = r_exp(R(2.0) * search->limit_hi[0]) * left_out_of(work, search->limit_hi[1]);
+        search->limit_hi[0] -= R(0.5) * r_log1p(-r_fmin(of_noise, LEFT_OUT_LIMIT));
     }
 }
 
-void selfcal_cells_column(selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    selfcal_cell_row_t *row = &work->scratch.grid.row;
+void selfcal_cells_column(const selfcal_work_t *work, selfcal_real_t ln_alpha, selfcal_cell_row_t *row) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     row->ln_alpha = ln_alpha;
     row->beta = selfcal_expected_beta(work, ln_alpha);
@@ -106,11 +104,10 @@ void selfcal_cells_column(selfcal_work_t *work, selfcal_real_t ln_alpha) {
     }
 }
 
-void selfcal_cells_row(selfcal_work_t *work, selfcal_real_t ln_alpha) {
-    selfcal_cell_row_t *row = &work->scratch.grid.row;
+void selfcal_cells_row(const selfcal_work_t *work, selfcal_real_t ln_alpha, selfcal_cell_row_t *row) {
     const selfcal_hypothesis_t *hypothesis = hypothesis_of(work);
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
-    selfcal_cells_column(work, ln_alpha);
+    selfcal_cells_column(work, ln_alpha, row);
     uint16_t taps = 1;
     row->basis_first = 0;
     row->basis[0] = R(1.0);

@@ -131,7 +131,7 @@ typedef struct {
 
 /* Where nothing cuts sigma_v: its moments are those of all such cells, and their histograms receive it at the end
  * (add_modes() below). */
-static sums_t sum_whole(selfcal_work_t *work, const side_t side[2], unsigned sides, selfcal_real_t height) {
+static sums_t sum_whole(const selfcal_work_t *work, const side_t side[2], unsigned sides, selfcal_real_t height) {
     const selfcal_real_t e = work->sigma.first, e_sq = work->sigma.second;
     sums_t sum = {height * work->sigma.mass, R(0.0), {R(0.0), R(0.0)}, {R(0.0), R(0.0)}};
     sum.mass_sq = sum.mass * (R(1.0) + e + e + e_sq);
@@ -243,10 +243,10 @@ static selfcal_real_t cell_weight(unsigned count, unsigned i) {
 }
 
 /* The next row of the sums, which counts where those of the search beside it do, and a little beyond. */
-static void begin_row(selfcal_work_t *work) {
+static void begin_row(const selfcal_work_t *work, selfcal_search_t *search, selfcal_cell_row_t *row) {
     const selfcal_range_t *range = &work->search.range[1];
     if (hypothesis_of(work)->alpha == NULL) {
-        selfcal_cells_row(work, R(0.0));
+        selfcal_cells_row(work, R(0.0), row);
         return;
     }
     const selfcal_real_t at = ((selfcal_real_t)work->row + R(0.5)) / (selfcal_real_t)work->sum.rows;
@@ -255,12 +255,12 @@ static void begin_row(selfcal_work_t *work) {
     const selfcal_range_t *one = &work->scratch.grid.found[i], *other = &work->scratch.grid.found[i + 1U];
     const selfcal_real_t part = r_fmin(z - (selfcal_real_t)i, R(1.0));
     const uint8_t *least = &work->scratch.grid.least[i];
-    work->search.least[0] = least[0] > least[1] ? least[0] : least[1];
+    search->least[0] = least[0] > least[1] ? least[0] : least[1];
     const selfcal_real_t lo = r_fma(part, other->lo - one->lo, one->lo), hi = r_fma(part, other->hi - one->hi, one->hi);
     const selfcal_real_t more = BEYOND * (hi - lo);
-    work->search.range[0].lo = r_fmax(lo - more, work->search.limit_lo[0]);
-    work->search.range[0].hi = r_fmin(hi + more, work->search.limit_hi[0]);
-    selfcal_cells_row(work, r_fma(range->hi - range->lo, at, range->lo));
+    search->range[0].lo = r_fmax(lo - more, work->search.limit_lo[0]);
+    search->range[0].hi = r_fmin(hi + more, work->search.limit_hi[0]);
+    selfcal_cells_row(work, r_fma(range->hi - range->lo, at, range->lo), row);
 }
 
 /* Some cells of a row: their sums, and weights of the basis functions of rho. */
@@ -325,7 +325,7 @@ void selfcal_integral_step(selfcal_work_t *work) {
     const uint16_t rows = grid_nodes(hypothesis->rho), columns = grid_nodes(hypothesis->alpha);
     const selfcal_cell_row_t *row = &work->scratch.grid.row;
     if (work->at == 0U) {
-        begin_row(work);
+        begin_row(work, &work->search, &work->scratch.grid.row);
     }
     part_t part;
     sum_part(work, selfcal_cells_in(work, 0), &part);

@@ -145,7 +145,7 @@ void selfcal_node_step_values(selfcal_work_t *work) {
         selfcal_real_t *profile = &work->field[0][work->first_node + k],
                        *ln_sigma = &work->field[1][work->first_node + k];
         if (i == 0U) {
-            selfcal_cells_column(work, place.ln_alpha);
+            selfcal_cells_column(work, place.ln_alpha, &work->scratch.grid.row);
         }
         expectation_t e;
         selfcal_expected(work, place.ln_rho, place.ln_alpha, row->beta, row->passed, &e);

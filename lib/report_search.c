@@ -147,12 +147,12 @@ static bool find_row(selfcal_work_t *work) {
 }
 
 /* A row near the one in hand is looked for where that one is, and half as far beyond. */
-static void widen_row(selfcal_work_t *work) {
-    selfcal_range_t *range = &work->search.range[0];
+static void widen_row(selfcal_search_t *search) {
+    selfcal_range_t *range = &search->range[0];
     const selfcal_real_t more = R(0.5) * (range->hi - range->lo);
-    work->search.open = true;
-    range->lo = r_fmax(range->lo - more, work->search.limit_lo[0]);
-    range->hi = r_fmin(range->hi + more, work->search.limit_hi[0]);
+    search->open = true;
+    range->lo = r_fmax(range->lo - more, search->limit_lo[0]);
+    range->hi = r_fmin(range->hi + more, search->limit_hi[0]);
 }
 
 static selfcal_real_t depth_of(const selfcal_work_t *work) {
@@ -209,7 +209,7 @@ static void limit(const selfcal_work_t *work, unsigned dimension, selfcal_range_
 }
 
 /* A row of the first pass is looked for where it counts in the columns of nodes beside it. */
-static void begin_line(selfcal_work_t *work, selfcal_real_t ln_alpha) {
+static void begin_line(const selfcal_work_t *work, selfcal_real_t ln_alpha, selfcal_search_t *search) {
     const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
     const selfcal_node_column_t *column = work->scratch.grid.column, *other = column;
     if (alpha != NULL) {
@@ -219,17 +219,16 @@ static void begin_line(selfcal_work_t *work, selfcal_real_t ln_alpha) {
         column += z > R(0.0) ? (z < (selfcal_real_t)last ? (unsigned)z : last) : 0U;
         other = column + 1;
     }
-    selfcal_range_t *range = &work->search.range[0];
+    selfcal_range_t *range = &search->range[0];
     range->lo = r_fmin(column->range.lo, other->range.lo);
     range->hi = r_fmax(column->range.hi, other->range.hi);
     limit(work, 0, range);
-    work->search.open = true;
+    search->open = true;
 }
 
 /* Likewise the rows. */
-static void begin_rows(selfcal_work_t *work) {
+static void begin_rows(const selfcal_work_t *work, selfcal_range_t *range) {
     const selfcal_grid_t *alpha = hypothesis_of(work)->alpha;
-    selfcal_range_t *range = &work->search.range[1];
     range->lo = -INFINITY;
     range->hi = INFINITY;
     if (alpha != NULL) {
@@ -244,34 +243,35 @@ static void begin_rows(selfcal_work_t *work) {
     limit(work, 1, range);
 }
 
-static void begin_pass(selfcal_work_t *work) {
-    work->row = 0;
+/* No row has shown a parameter's range yet. */
+static void forget_ranges(selfcal_integral_t *sum) {
     for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-        work->sum.range_lo[p] = INFINITY;
-        work->sum.range_hi[p] = -INFINITY;
+        sum->range_lo[p] = INFINITY;
+        sum->range_hi[p] = -INFINITY;
     }
 }
 
 void selfcal_search_begin(selfcal_work_t *work) {
-    selfcal_cells_limits(work);
-    begin_rows(work);
+    selfcal_cells_limits(work, &work->search);
+    begin_rows(work, &work->search.range[1]);
     work->search.depth = depth_of(work);
     work->search.best = -INFINITY;
     work->search.least[0] = 1;
     work->search.pass = 0;
-    begin_pass(work);
+    work->row = 0;
+    forget_ranges(&work->sum);
 }
 
 /* Ranges of N and the drift parameter in a row: both are monotonic in rho. */
-static void note_ranges(selfcal_work_t *work) {
+static void note_ranges(const selfcal_work_t *work, selfcal_integral_t *sum) {
     for (int end = 0; end < 2; end++) {
         cell_t cell;
         selfcal_real_t ln_value[SELFCAL_PARAMETERS];
         selfcal_cells_make(work, end == 0 ? work->search.range[0].lo : work->search.range[0].hi, &cell);
         selfcal_cells_parameters(work, &cell, ln_value);
         for (unsigned p = 0; p < SELFCAL_PARAMETERS; p++) {
-            work->sum.range_lo[p] = r_fmin(work->sum.range_lo[p], ln_value[p] + work->sigma.lo);
-            work->sum.range_hi[p] = r_fmax(work->sum.range_hi[p], ln_value[p] + work->sigma.hi);
+            sum->range_lo[p] = r_fmin(sum->range_lo[p], ln_value[p] + work->sigma.lo);
+            sum->range_hi[p] = r_fmax(sum->range_hi[p], ln_value[p] + work->sigma.hi);
         }
     }
 }
@@ -283,11 +283,11 @@ bool selfcal_search_step(selfcal_work_t *work) {
     if (work->at == 0U) {
         const selfcal_real_t ln_alpha = rows ? sample_at(range, work->row) : R(0.0);
         if (work->search.pass == 0U) {
-            begin_line(work, ln_alpha);
+            begin_line(work, ln_alpha, &work->search);
         } else {
-            widen_row(work);
+            widen_row(&work->search);
         }
-        selfcal_cells_row(work, ln_alpha);
+        selfcal_cells_row(work, ln_alpha, &work->scratch.grid.row);
     }
     work->at++;
     if (!find_row(work)) {
@@ -298,7 +298,7 @@ bool selfcal_search_step(selfcal_work_t *work) {
     work->scratch.grid.found[work->row] = work->search.range[0];
     work->scratch.grid.least[work->row] = work->search.least[0];
     if (work->search.row_best > work->search.best - work->search.depth) {
-        note_ranges(work);
+        note_ranges(work, &work->sum);
     }
     work->row++;
     if (rows && work->row < SAMPLES) {
@@ -318,7 +318,8 @@ bool selfcal_search_step(selfcal_work_t *work) {
         const selfcal_real_t at = (range->lo - before.lo) / (before.hi - before.lo) * (selfcal_real_t)SAMPLES;
         work->search.range[0] =
             work->scratch.grid.found[at > R(0.0) ? (unsigned)r_fmin(at, (selfcal_real_t)(SAMPLES - 1U)) : 0U];
-        begin_pass(work);
+        work->row = 0;
+        forget_ranges(&work->sum);
         return false;
     }
     work->search.least[1] =

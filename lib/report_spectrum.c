@@ -43,11 +43,9 @@ static unsigned unknowns(const selfcal_truth_t *truth) {
     return truth->lines + (truth->lines + 2U) / 3U * 2U;
 }
 
-static void set_lines(selfcal_work_t *work) {
-    selfcal_fit_t *fit = &work->scratch.fit;
-    selfcal_truth_t *truth = &work->truth;
+static void set_lines(selfcal_real_t weight, selfcal_truth_t *truth, selfcal_fit_t *fit) {
     memset(fit->triangle, 0, sizeof fit->triangle);
-    const selfcal_real_t weight = (selfcal_real_t)work->bank->weight, range = selfcal_spectrum_range(weight);
+    const selfcal_real_t range = selfcal_spectrum_range(weight);
     truth->lines = 8;
     while (truth->lines < SELFCAL_LINES && range > LINE_STEP * (selfcal_real_t)(truth->lines - 1U)) {
         truth->lines = (uint8_t)(truth->lines + 2U);
@@ -112,7 +110,7 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
 /* Takes the best node for the process that made the data. A drift slower than the record looks like a random walk
  * within it, and the bias takes up its level. So the pole is moved to 3/n at equal steps (for a random walk: the
  * mean square about the mean). */
-static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
+static void set_truth(const selfcal_work_t *work, selfcal_place_t place, selfcal_truth_t *truth) {
     const selfcal_real_t cut = R(3.0) / (selfcal_real_t)work->bank->weight;
     const bool pole = has_pole(work);
     const selfcal_real_t beta = selfcal_expected_beta(work, place.ln_alpha);
@@ -120,12 +118,12 @@ static void set_truth(selfcal_work_t *work, selfcal_place_t place) {
     const selfcal_real_t variance = rho_sq / selfcal_expected_noise(work, rho_sq, beta);
     const selfcal_real_t rate = pole ? r_exp(place.ln_alpha) * (selfcal_real_t)work->bank->model->dt_s : R(0.0);
     const selfcal_real_t slow = r_sqrt(rate * rate + cut * cut);
-    selfcal_truth_t *truth = &work->truth;
     truth->variance = pole ? variance * rate / slow : variance / (R(2.0) * slow);
     truth->rate = -r_expm1(-slow);
 }
 
-static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t off, selfcal_real_t deficit) {
+static void add_row(const selfcal_work_t *work, const expectation_t *e, selfcal_real_t off, selfcal_real_t deficit,
+                    selfcal_fit_t *fit) {
     const selfcal_truth_t *truth = &work->truth;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     const bool even = work->bank->counters.blocks_lost == 0U && work->mask == 0U && truth->noise_less_1 == R(0.0);
@@ -145,13 +143,12 @@ static void add_row(selfcal_work_t *work, const expectation_t *e, selfcal_real_t
         end += m % 3U == 2U ? 2U : 0U;
     }
     row[unknowns(truth)] = weight * r_fmin(r_expm1(R(2.0) * off), FIT_MOST);
-    rotate_in(&work->scratch.fit, unknowns(truth), row);
+    rotate_in(fit, unknowns(truth), row);
 }
 
-void selfcal_spectrum_solve(selfcal_work_t *work) {
-    selfcal_truth_t *truth = &work->truth;
+void selfcal_spectrum_solve(const selfcal_fit_t *fit, selfcal_truth_t *truth) {
     const unsigned count = unknowns(truth);
-    const selfcal_real_t *mine = work->scratch.fit.triangle + count * (count + 3U) / 2U;
+    const selfcal_real_t *mine = fit->triangle + count * (count + 3U) / 2U;
     selfcal_real_t found[SELFCAL_FITTED];
     for (unsigned m = count; m-- > 0U; mine--) {
         found[m] = *--mine;
@@ -171,10 +168,11 @@ static bool too_slow(const selfcal_work_t *work, const expectation_t *e, selfcal
            work->truth.rate < R(0.5);
 }
 
-static void speed_up(selfcal_work_t *work, selfcal_place_t place, selfcal_real_t scatter, expectation_t *e) {
+static void speed_up(const selfcal_work_t *work, selfcal_place_t place, selfcal_real_t scatter, selfcal_truth_t *truth,
+                     expectation_t *e) {
     while (too_slow(work, e, scatter)) {
-        work->truth.rate += work->truth.rate;
-        work->truth.variance *= R(0.5);
+        truth->rate += truth->rate;
+        truth->variance *= R(0.5);
         selfcal_expected(work, place.ln_rho, place.ln_alpha, selfcal_expected_beta(work, place.ln_alpha), NULL, e);
     }
 }
@@ -191,7 +189,7 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
         return;
     }
     if (!(truth->rate > R(0.0))) {
-        set_truth(work, place);
+        set_truth(work, place, truth);
     }
     const selfcal_real_t scatter = work->scratch.fit.scatter[k];
     expectation_t e;
@@ -202,12 +200,12 @@ void selfcal_spectrum_step(selfcal_work_t *work) {
         work->ln_sigma_off = off;
         truth->ln_v = e.ln_v; /* any that is near will do */
         truth->wide = (selfcal_real_t)work->bank->weight * (selfcal_real_t)e.ln_v > WIDE_BEYOND;
-        set_lines(work);
+        set_lines((selfcal_real_t)work->bank->weight, truth, &work->scratch.fit);
     } else if (too_slow(work, &e, scatter)) {
-        speed_up(work, place, scatter, &e);
+        speed_up(work, place, scatter, truth, &e);
         work->at = 0;
     } else {
         const selfcal_real_t deficit = work->field[0][work->best_node] - work->field[0][k];
-        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), deficit);
+        add_row(work, &e, (selfcal_real_t)(off - work->ln_sigma_off), deficit, &work->scratch.fit);
     }
 }
