@@ -16,7 +16,7 @@
  *     u/s < 2^(11 - b_bits), 1/s <= 2^10     s >= r + P, r >= 2^-10; P >= q, and 1 + p_inf <= 2 + q (b_bits())
  *     a span                                 has 16 samples at most
  *   None of it depends on the length of the record: sums that fill up make room for themselves (SUMS).
- *   tests/lib/fixed/test_fixed.c drives each there under UBSan.
+ *   tests/lib/fixed/test_bank_kernel_fixed.c drives each there under UBSan.
  * GUARD BITS  Rounding to a step moves x by 0.3/sqrt(g) steps. Errors e of nu that are independent between nodes move
  *   each ln-likelihood by sqrt(n) e/sigma nats: 3e-4 at n = 10^5 for e = 1 step, 1e-3 at 10^6; where the step has
  *   grown, that much more.

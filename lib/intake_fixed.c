@@ -6,7 +6,7 @@
  *   sample of ROOM steps or more makes the step so much coarser that it is half of ROOM to ROOM.
  * HEAD-ROOM  |first| <= 2^26 steps, any sample less than ROOM = 2^29, their differences < 9/8 ROOM, a block less than
  *   2^32 samples: |sum| < 9/8 2^61. Squares are of differences rounded to 2^shift steps, of which they are 2^15 at
- *   most: sum_sq <= 2^62. Nothing saturates. (tests/lib/fixed/test_block.c drives each there.)
+ *   most: sum_sq <= 2^62. Nothing saturates. (tests/lib/fixed/test_intake_fixed.c drives each there.)
  * GUARD BITS  The mean is off by a step at most, 2^-28 of the block's largest sample, whose own last place is 2^-24 of
  *   it. A square's root is off by 2^-15 of the largest difference at most: the mean square by 2^-14 of the largest
  *   times the rms difference.

@@ -12,7 +12,7 @@ TEST_NAMES := $(basename $(notdir $(wildcard tests/lib/test_*.c tests/port/test_
 TESTS_PLAIN := $(TEST_NAMES:%=$(BUILD)/c/plain/%)
 TESTS_SANITIZED := $(TEST_NAMES:%=$(BUILD)/c/sanitized/%)
 # The integer builds: the formats by a test of their own, the rest as in float.
-TESTS_FIXED := $(foreach test,fixed block bank snapshot check intake,$(BUILD)/c/fixed/test_$(test))
+TESTS_FIXED := $(foreach test,bank_kernel_fixed intake_fixed bank snapshot check intake,$(BUILD)/c/fixed/test_$(test))
 
 test: setup-dev setup-all
 	@$(BIN)/python tests/run.py

@@ -13,7 +13,7 @@ static inline uint32_t draw(void) {
     return state;
 }
 
-static float noise(void) {
+static inline float noise(void) {
     float sum = 0.0F; /* of 12 uniforms: variance 1 */
     for (int i = 0; i < 12; i++) {
         sum += (float)draw() / 4294967296.0F;
