@@ -1,4 +1,7 @@
-"""The batch as priors: log-normal in library and reference, the model file that `fleet` writes, and its worth."""
+"""The batch as priors: log-normal in library and reference, the model file that `fleet` writes, and its worth.
+
+Truth: scipy's truncated normal, the textbook bank, and the parameters that the units were drawn with.
+"""
 
 from __future__ import annotations
 

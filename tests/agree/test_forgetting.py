@@ -1,4 +1,7 @@
-"""Forgetting: sums in which a sample counts for 2^-(age / half-life), a batch at a time."""
+"""Forgetting: sums in which a sample counts for 2^-(age / half-life), a batch at a time.
+
+Truth: the weighted recursions in double, the double build, and records whose parameter changes at a known time.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The ensemble of the paper: parameters drawn from the prior, so the stated uncertainty must be the actual one."""
+"""The ensemble of the paper: parameters drawn from the prior, so the stated uncertainty must be the actual one.
+
+Truth: the drawn parameters. Tolerances: three standard deviations of the counts.
+"""
 
 from __future__ import annotations
 

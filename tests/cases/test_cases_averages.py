@@ -1,5 +1,7 @@
 """Are the intervals honest where the intake averages? Records are drawn sample by sample and averaged, as a sensor and
 the intake do; neither has the block means' closed forms in it. `make cases` takes 400 records a cell.
+
+Truth: the parameters of each record. Tolerances: three standard deviations of a binomial count.
 """
 
 from __future__ import annotations

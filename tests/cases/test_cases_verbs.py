@@ -1,4 +1,7 @@
-"""Parts of a recording, exit codes for a production line, and ways out of long work."""
+"""Parts of a recording, exit codes for a production line, and ways out of long work.
+
+Truth: the rows of the files that a test writes, the library behind the gate, and the parameters of drawn records.
+"""
 
 from __future__ import annotations
 

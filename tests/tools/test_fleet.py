@@ -1,4 +1,7 @@
-"""`selfcal fleet`: a table of many recordings, from which nothing is lost and in which nothing is twice."""
+"""`selfcal fleet`: a table of many recordings, from which nothing is lost and in which nothing is twice.
+
+Truth: the files that a test writes, their parameters, and the bytes of an undisturbed run.
+"""
 
 from __future__ import annotations
 

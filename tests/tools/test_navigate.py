@@ -1,4 +1,7 @@
-"""The GPS/INS filter: no error without noise, consistent with the true noise, the flight by its own physics."""
+"""The GPS/INS filter: no error without noise, consistent with the true noise, the flight by its own physics.
+
+Truth: the flight in closed form, the simulated noise, and chi-squared.
+"""
 
 from __future__ import annotations
 

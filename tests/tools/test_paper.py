@@ -1,4 +1,7 @@
-"""The page of the paper's figures: whole without the real recordings, self-contained, and its numbers are runs."""
+"""The page of the paper's figures: whole without the real recordings, self-contained, and its numbers are runs.
+
+Truth: the library over the same records in one piece, and the stretches that README names.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`selfcal plan`: at the planned length the wish is met, in simulations that the plan has not seen."""
+"""`selfcal plan`: at the planned length the wish is met, in simulations that the plan has not seen.
+
+Truth: the simulated parts, and the information of white noise in closed form. Tolerances: those of the counts.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The population of a batch: honest intervals of its mean and spread, and the units and groups that are unlike it."""
+"""The population of a batch: honest intervals of its mean and spread, and the units and groups that are unlike it.
+
+Truth: the mean, the spread and the faults that the units were drawn with. Tolerances: those of binomial counts.
+"""
 
 from __future__ import annotations
 

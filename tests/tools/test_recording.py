@@ -1,4 +1,7 @@
-"""Recordings: what is read is what was written, and every bad input is one line that names file, line and column."""
+"""Recordings: what is read is what was written, and every bad input is one line that names file, line and column.
+
+Truth: the values, stamps and gaps that a test writes.
+"""
 
 import gzip
 import json

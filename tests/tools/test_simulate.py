@@ -15,10 +15,13 @@ import pytest
 from scipy import stats
 
 from selfcal import _reference, recording
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.errors import UserError
 from selfcal.laws import NAMED
 from selfcal.model import DEFAULT, Model
 from selfcal.verbs.simulate import show, simulate
+
+from conftest import run
 
 DATA = Path(__file__).parents[1] / "data"
 SIGMAS = 4.5
@@ -363,6 +366,17 @@ def test_every_effect_changes_the_recording_with_its_defaults(effect: str, tmp_p
     assert meta["effects"][0]["id"] == effect
     for name in meta["truth"]:
         assert not np.array_equal(changed[name], plain[name]), name
+
+
+def test_the_list_of_effects_has_every_key(tmp_path: Path) -> None:
+    """Truth: the keys that the complaint about an unknown one names."""
+    rows = dict(line.split(maxsplit=1) for line in run("simulate", "--list-effects").stdout.splitlines()[1:])
+    assert list(rows) == [cause.id for cause in CAUSES.values() if cause.keys]
+    for effect, keys in rows.items():
+        with pytest.raises(UserError, match=r"unknown key 'nonsense' \(known: (.*)\)") as caught:
+            simulate(DATA / "simulated_adis16405.yaml", tmp_path / "log.npz", effects=[f"{effect}:nonsense=1"])
+        known = str(caught.value).partition("known: ")[2].rstrip(")")
+        assert re.sub(r" \([^)]*\)", "", keys) == known
 
 
 @pytest.mark.parametrize(

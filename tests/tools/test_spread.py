@@ -1,4 +1,7 @@
-"""Work over many processors: the same rows whoever computes them, and nothing finished is lost."""
+"""Work over many processors: the same rows whoever computes them, and nothing finished is lost.
+
+Truth: squares, and the same work in this process, bit by bit.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Limits of a data sheet: pass, fail, or how much longer a unit must rest; JUnit and exit codes of a line."""
+"""Limits of a data sheet: pass, fail, or how much longer a unit must rest; JUnit and exit codes of a line.
+
+Truth: bounds that a test states, and parameters of simulated parts, some hours of which were not looked at.
+"""
 
 from __future__ import annotations
 

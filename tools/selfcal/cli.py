@@ -694,6 +694,14 @@ def rivals(
     verb.show(result, to_stderr=str(json) == "-")
 
 
+def _effects(wanted: bool) -> None:
+    if wanted:
+        from selfcal.verbs import simulate as verb
+
+        verb.show_effects()
+        raise typer.Exit
+
+
 @app.command()
 def simulate(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file, or a part's name", show_default=False)],
@@ -705,6 +713,10 @@ def simulate(
         list[str] | None,
         typer.Option(metavar="ID[:key=value,...]", help="Effect to put in, axis=NAME for one axis (repeat for more)"),
     ] = None,
+    list_effects: Annotated[
+        bool,
+        typer.Option("--list-effects", help="List effects and their keys, and exit", is_eager=True, callback=_effects),
+    ] = False,
 ) -> None:
     """Write a simulated recording, read out as the sensor would, with its truth in its metadata."""
     from selfcal.verbs import simulate as verb

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from selfcal import _reference, recording, units
-from selfcal.diagnosis.cause import Channels, Key, Setting, is_count
+from selfcal.diagnosis.cause import Cause, Channels, Key, Setting, is_count
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.errors import UserError, printable
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
@@ -141,6 +141,20 @@ def _slower(
     return slower, {name: (unit, taken(row)) for name, (unit, row) in columns.items()}
 
 
+def show_effects() -> None:
+    """Print every effect of `--effect` with its keys, and the limits of a key where it has any."""
+    print("--effect ID:key=value,... with these keys. Those that are not given have defaults, or are left out:")
+    for cause in CAUSES.values():
+        keys = [key if of.limits == Key(None).limits else f"{key} ({of.limits})" for key, of in cause.keys.items()]
+        if keys:
+            print(f"  {cause.id:20}{', '.join([*keys, *_other_keys(cause)])}")
+
+
+def _other_keys(cause: Cause) -> list[str]:
+    """Keys whose values are names of axes."""
+    return [*(["other"] if cause.follows else []), *([] if cause.common else ["axis"])]
+
+
 def show(meta: Mapping[str, Any], output: Path | str) -> None:
     """Print what `simulate` has written, the truth's file too, and the truth."""
     output = Path(output)
@@ -232,7 +246,7 @@ def _apply(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_ref
         raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(known)})")
     cause = CAUSES[name]
     keys = cause.keys
-    names = [*keys, *(["other"] if cause.follows else []), *([] if cause.common else ["axis"])]
+    names = [*keys, *_other_keys(cause)]
     given: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
