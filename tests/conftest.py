@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import shlex
 import shutil
 import signal
@@ -10,12 +11,19 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
+import traceback
+import warnings
 from collections.abc import Generator
+from importlib import import_module
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 
+import selfcal
+from selfcal import cli
 from selfcal.loaders import Format, child
 from selfcal.loaders.table import Hints
 from selfcal.recording import Recording, load
@@ -41,8 +49,39 @@ COMMAND = [str(Path(sys.executable).with_name("selfcal"))]
 CALLED = "selfcal" if shutil.which("selfcal") == COMMAND[0] else shlex.quote(COMMAND[0])
 
 
+#: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials.
+CAMPAIGN = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
+#: Tests that `make test` leaves to these two, a line each.
+LONG_TESTS = ROOT / "tests" / "long_tests.txt"
+#: Names of all tests that were found, the long ones too.
+COLLECTED = pytest.StashKey[set[str]]()
+
 #: Where the CPU seconds of each test go, a line each: set by tests/run.py.
 SECONDS = os.environ.get("SELFCAL_SECONDS")
+
+
+def long_tests() -> tuple[set[str], set[str]]:
+    """Of LONG_TESTS: names that are left out, and of these the ones with parameters that are kept."""
+    left: set[str] = set()
+    kept: set[str] = set()
+    last = ""
+    for line in LONG_TESTS.read_text(encoding="utf-8").splitlines():
+        if line.startswith("    keeps "):
+            kept.add(last + line.removeprefix("    keeps "))
+        elif line and not line.startswith("#"):
+            left.add(last := line)
+    return left, kept
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests of LONG_TESTS, but in a long run, and where one is asked for by its name."""
+    config.stash[COLLECTED] = {item.nodeid for item in items}
+    if CAMPAIGN > 1 or CASE_RECORDS or any("::" in argument for argument in config.args):
+        return
+    left, kept = long_tests()
+    gone = [i for i in items if i.nodeid not in kept and left & {i.nodeid, i.nodeid.partition("[")[0]}]
+    config.hook.pytest_deselected(items=gone)
+    items[:] = [item for item in items if item not in set(gone)]
 
 
 @pytest.hookimpl(wrapper=True)
@@ -56,10 +95,60 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     return result
 
 
+#: s that a command of run() may take.
+TIMEOUT_S = 120
+
+
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """The command as a user starts it."""
-    command = [*COMMAND, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=cwd)
+    """The command as a user starts it, in a fork of this process: a new Python, which takes longer than most commands,
+    is not started for each. test_cli.py starts the program itself as well."""
+    if arguments and arguments[0] in selfcal.VERBS:
+        import_module(f"selfcal.{selfcal.VERBS[str(arguments[0])]}.{arguments[0]}")  # once for all forks
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        number = os.fork()
+        if number == 0:
+            _command([str(argument) for argument in arguments], cwd, out.fileno(), err.fileno())
+        code = _ended(number)
+        said = []
+        for stream in (out, err):
+            stream.seek(0)
+            said.append(stream.read().decode())
+    return subprocess.CompletedProcess([*COMMAND, *map(str, arguments)], code, *said)
+
+
+def _command(arguments: list[str], cwd: Path | None, out: int, err: int) -> NoReturn:
+    """In the fork: the command, and the end of the process."""
+    code = 70
+    try:
+        for stream, number in ((os.open(os.devnull, os.O_RDONLY), 0), (out, 1), (err, 2)):
+            os.dup2(stream, number)
+        os.chdir(cwd or ".")
+        sys.argv = [*COMMAND, *arguments]
+        warnings.resetwarnings()
+        utf_8 = {"closefd": False, "encoding": "utf-8"}
+        with open(1, "w", **utf_8) as sys.stdout, open(2, "w", **utf_8) as sys.stderr:
+            try:
+                cli.main()
+            except SystemExit as error:
+                code = error.code if isinstance(error.code, int) else int(error.code is not None)
+            except BaseException:
+                traceback.print_exc()
+                code = 1
+    finally:
+        os._exit(code)
+
+
+def _ended(number: int) -> int:
+    """Exit code of a child process, which is ended if it does not end by itself."""
+    child = os.pidfd_open(number)
+    try:
+        if not select.select([child], [], [], TIMEOUT_S)[0]:
+            os.kill(number, signal.SIGKILL)
+            raise TimeoutError(f"a command did not end within {TIMEOUT_S} s")
+    finally:
+        os.close(child)
+        status = os.waitpid(number, 0)[1]
+    return os.waitstatus_to_exitcode(status)
 
 
 def _multicast() -> bool:
@@ -88,8 +177,7 @@ def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
             code = 0
         finally:
             os._exit(code)
-    status = os.waitpid(number, 0)[1]
-    return os.waitstatus_to_exitcode(status)
+    return _ended(number)
 
 
 @pytest.fixture

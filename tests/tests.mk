@@ -57,16 +57,17 @@ calibration: setup-dev
 	SELFCAL_CALIBRATION=$(or $(RECORDS),1000) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
 	    $(PYTEST) -s tests/agree/test_calibration.py
 
-# Records of each kind of disturbed log; `make test` looks at a few.
+# Many records of each kind of disturbed log; and the tests of every room but the firmware's that make test leaves out
+# (tests/long_tests.txt).
 cases: setup-dev setup-all
 	SELFCAL_CASES=$(or $(RECORDS),1) $(BIN)/python tests/long_run.py $(if $(RECORDS),--part) $@ \
-	    $(PYTEST) -s -n 2 tests/cases tests/tools/test_docs.py
+	    $(PYTEST) -s -n 2 tests --ignore=tests/port --ignore=tests/tools/test_hostile.py
 
+# All trials, ten times; and the tests of the firmware that make test leaves out.
 campaigns: setup-dev
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
-	    tests/port/test_firmware_faults.py tests/port/test_firmware_commands.py tests/port/test_firmware_m0.py \
-	    tests/port/test_firmware_icm42688.py tests/port/test_module_gain.py tests/tools/test_hostile.py
+	    tests/port tests/tools/test_hostile.py tests/tools/test_monitor_hostile.py
 	@printf '%-40s %9s %9s\n' campaign trials survivors && cat $(BUILD)/campaigns.txt
 
 c-tests: $(TESTS_PLAIN) $(TESTS_SANITIZED) $(TESTS_FIXED)

@@ -21,6 +21,8 @@ from selfcal.model import PARTS, Model
 from selfcal.verbs.codegen import codegen
 from selfcal.wire import AxisReport, Decoder
 
+from conftest import CAMPAIGN
+
 ROOT = Path(__file__).resolve().parents[2]
 
 parts = pytest.importorskip("parts.board", reason="unicorn or pyelftools is missing: make setup-dev")
@@ -33,10 +35,8 @@ from unicorn import arm_const as arm  # noqa: E402
 CORES = {name: core for name, (core, _, _) in image_sizes.BOARDS.items()}
 T = TypeVar("T")
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
-#: SELFCAL_CAMPAIGN=N (`make campaigns`): fault campaigns with N times as many trials, or the number that is asked for;
-#: their rows go to build/campaigns.txt as well.
-MANY = int(os.environ.get("SELFCAL_CAMPAIGN", "1"))
-
+#: Of a fault campaign's trials; the rows of `make campaigns` go to build/campaigns.txt as well.
+MANY = CAMPAIGN
 
 #: SELFCAL_EXTENDED=1 runs the suites with a model as `diagnose` extends it: two columns and the outlier gate.
 EXTENDED = os.environ.get("SELFCAL_EXTENDED", "") == "1"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +30,7 @@ from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import build, can_bus, replay, write_rows
 from selfcal.wire import ROOT, Decoder
 
-from conftest import needs_multicast
+from conftest import needs_multicast, run
 from wire_stream import lines, message, serial_line, stream
 
 SUMS = ROOT / "tools" / "selfcal" / "models" / "sums.yaml"
@@ -197,12 +196,7 @@ def test_a_module_of_version_3_is_refused_by_the_monitor(tmp_path: Path) -> None
     with can.Logger(str(tmp_path / "old.log")) as logger:
         for line in sent:
             logger(message(line))
-    done = subprocess.run(
-        [sys.executable, "-m", "selfcal.cli", "monitor", "--read", str(tmp_path / "old.log")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run("monitor", "--read", tmp_path / "old.log")
     assert done.returncode == 2
     assert complaint in done.stderr.splitlines()[-1]
     assert "bias" not in done.stderr
@@ -245,7 +239,7 @@ def test_an_old_module_beside_a_new_one_does_not_end_the_view(
     ],
 )
 def test_user_errors_are_one_line(options: list[str], complaint: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "selfcal.cli", *options], capture_output=True, text=True, check=False)
+    done = run(*options)
     assert done.returncode == 2
     assert complaint in done.stderr
     assert done.stderr.count("\n") == 1

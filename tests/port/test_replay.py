@@ -11,7 +11,6 @@ import json
 import os
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +30,7 @@ from selfcal.verbs import replay as replay_module
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import build, replay, run, write_rows
 
+from conftest import run as started
 from conftest import shared_recording
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -245,8 +245,7 @@ def test_units_of_the_recording_come_back(tmp_path: Path) -> None:
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "selfcal.cli", "replay", *map(str, arguments)]
-    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    return started("replay", *arguments)
 
 
 def assert_one_line(done: subprocess.CompletedProcess[str], complaint: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import long_run
 import pytest
 
-from conftest import ROOT
+from conftest import COLLECTED, ROOT, long_tests
 
 
 @pytest.fixture(autouse=True)
@@ -38,3 +38,12 @@ def test_a_whole_run_is_written_down(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_part_is_not(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
     assert run(monkeypatch, "--part", "tolerances", "false") == 1
     assert not record.exists()
+
+
+def test_every_long_test_is_there(pytestconfig: pytest.Config) -> None:
+    """Of the files that were collected: a line of tests/long_tests.txt names a test."""
+    names = pytestconfig.stash[COLLECTED]
+    known = names | {name.partition("[")[0] for name in names}
+    files = {name.partition("::")[0] for name in names}
+    left, kept = long_tests()
+    assert [name for name in sorted(left | kept) if name not in known and name.partition("::")[0] in files] == []
