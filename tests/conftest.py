@@ -166,7 +166,10 @@ needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip 
 
 
 def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
-    """As the product's child, without the start of a new Python for each file."""
+    """As the product's child, without the start of a new Python and of the reader's library for each file."""
+    for module in (f"selfcal.loaders.{one.module}", one.library):
+        if module:
+            import_module(module)
     number = os.fork()
     if number == 0:
         code = 70
