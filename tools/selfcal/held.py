@@ -37,6 +37,8 @@ CHANCE, RUN_MOST = 0.01, 5
 #: Rows to a reading in a stretch at most, net evidence of a stretch, nats, and stretches at most. The chance that a row
 #: of it does not repeat, and equal readings that are supposed among those of a stretch.
 RATIO_MOST, STRETCH_NATS, STRETCHES, MISSED, SUPPOSED = 5, 12.0, 8, 0.02, 2.0
+#: Of a channel that is read anew each period: rows of one at least, changes at least, and their evidence, nats.
+PERIOD_LEAST, CHANGES_LEAST, PERIOD_NATS = 2.5, 8, 20.0
 #: Rows in a bin of the phase, and bins at most.
 IN_BIN, BINS = 50, 100
 
@@ -123,6 +125,43 @@ def _slower(same: Mask, ratio: int, chance: float) -> Slower:
         if nats > best.nats:
             best = Slower(ratio, rows, nats)
     return best
+
+
+def updates(values: Array, at: Rows) -> Rows | None:
+    """Rows at which a channel [n] is read anew, where its value is held in between or bridged by straight lines; None
+    where no one period shows. `at` [n]: places of the rows on the logger's grid.
+
+    A new value may equal the last one, so all changes lie whole periods apart. Chance would spread them evenly."""
+    steps = np.diff(values)
+    bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
+    held_rows = np.flatnonzero(steps) + 1
+    rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
+    if rows.size <= CHANGES_LEAST:
+        return None
+    gaps = np.diff(at[rows])
+    nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
+    if nats < PERIOD_NATS:
+        return None
+    times = np.maximum(1, np.rint(gaps / period))
+    count = np.concatenate([[0.0], np.cumsum(times)])
+    before, after = (math.floor(float(rest) / period) for rest in (at[rows[0]] - at[0], at[-1] - at[rows[-1]]))
+    count = np.concatenate([[-before], count, [count[-1] + after]])
+    place = np.concatenate([[at[rows[0]] - before * period], at[rows], [at[rows[-1]] + after * period]])
+    every = np.interp(np.arange(count[0], count[-1] + 1.0), count, place)
+    return np.unique(np.minimum(np.searchsorted(at, np.rint(every)), at.size - 1))
+
+
+def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
+    """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
+    period = float(np.quantile(gaps, 0.05, method="lower")) / part
+    for _ in range(20):
+        times = np.maximum(1, np.rint(gaps / period))
+        few = times <= 3 * part
+        period = float(gaps[few].sum() / times[few].sum())
+    if period < PERIOD_LEAST:
+        return 0.0, period
+    off = np.abs(gaps - np.rint(gaps / period) * period)
+    return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
 
 
 def _in_runs(same: Mask, at: Rows) -> Held | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
 from selfcal.diagnosis.fit import Fit, Sums, ln_det, ln_likelihood, run
-from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, NOISES, inconstancy
+from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, inconstancy
 from selfcal.diagnosis.record import smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
 from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array
-from selfcal.forms import formed, slope
+from selfcal.forms import slope
 
 Complex = NDArray[np.complex128]
 #: Probability of an interval.
@@ -33,8 +33,8 @@ ZOOMS, FINER = 3, 8
 FINE, POSSIBLE, DRAWS = 21, 6.0, 4000
 #: Steps of the drift's parameters at least and at most, and nodes of one drift at most.
 NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
-#: ln of the number of independent looks: seven structures and their numbers.
-LN_STRUCTURES = math.log(20.0)
+#: ln of the number of independent looks: ten structures and their numbers.
+LN_STRUCTURES = math.log(28.0)
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
 TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
 #: Both columns lose their slow power below this bin first: a spectrum as steep as a temperature's would fill the bands
@@ -43,9 +43,25 @@ CORNER = 20.0
 
 
 @dataclass(frozen=True)
+class Input:
+    """An input: `values` [n] about its `reference` in `unit`. `noises` [k, n]: drawn noise of its readings, empty where
+    the readings act themselves. `widths_s`: means that may smooth that noise; centred, so that they have no lag.
+    `held_s`: from one reading of a held input to the next, `taken` in words as which its readings were taken."""
+
+    values: Array
+    unit: str
+    reference: float = 0.0
+    noises: Array = field(default_factory=lambda: np.empty((0, 0)))
+    widths_s: tuple[float, ...] = (0.0,)
+    held_s: float = 0.0
+    taken: str = ""
+
+
+@dataclass(frozen=True)
 class Structure:
-    """A form of G(s). `columns(number)` [k, n] are what its k coefficients multiply, `keys` their names; `numbers` the
-    smoothings, windows or time constants to try, s. `transfer(c, number, s)` is G. `poles`: its order."""
+    """A form of the influence. `columns(number)` [k, n] are what its k coefficients multiply, `keys` their names;
+    `numbers` the smoothings, windows or time constants to try, s. `transfer(c, number, s)` is G(s), of a curve its
+    slope at the reference. `poles`: its order."""
 
     name: str
     poles: int
@@ -86,10 +102,15 @@ class Posterior:
         s = np.asarray(2j * np.pi * frequency_hz, np.complex128)
         return self.structure.transfer(self.c[:, :, None], self.lag[:, None], s[None, :])
 
+    @property
+    def delay_s(self) -> Array:
+        """[draws]: how late slow changes arrive, s: the slope of the phase at frequency 0."""
+        slowest = np.array([1e-6 / (2.0 * math.pi * max(1.0, float(self.lag.max(initial=0.0))))])
+        return np.asarray(-np.angle(self.at(slowest) / self.at(np.zeros(1)))[:, 0] / (2.0 * math.pi * slowest[0]))
+
 
 def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure]:
-    """Every structure for an input [n] with its samples dt s apart. `widths_s`: means that may smooth the input's own
-    noise; centred, so that they have no lag."""
+    """Every structure for an input [n] with its samples dt s apart, smoothed by means of `widths_s`."""
     span = u.size * dt
     lags = _lags(u.size, dt)
     windows_s = tuple(dict.fromkeys(max(one, dt) for one in RATE_WINDOWS_S if one <= span / 6.0))
@@ -98,11 +119,11 @@ def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure
     def level(width: float) -> Array:
         return smoothed(u, max(1, round(width / dt)))
 
-    def late(lag: float, values: Array = u) -> Array:
-        return formed(values, "lag", lag, 0.0, dt)
+    def behind(lag: float) -> Array:
+        return late(u, lag, dt)
 
     def decay(lag: float) -> Array:
-        # A lag begins at rest in `formed`; before the record the input may have moved.
+        # A lag begins at rest; before the record the input may have moved.
         gone: Array = np.exp(-np.arange(u.size) * dt / lag)
         return gone
 
@@ -116,24 +137,51 @@ def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure
             lambda c, _, s: c[:, 0] + c[:, 1] * s,
         ),
         Structure(
+            "square", 0, ("gain", "square"), widths,
+            lambda w: np.array([(value := level(w)), value**2]), lambda c, _, s: c[:, 0] + 0.0 * s,
+        ),
+        Structure(
+            "cube", 0, ("gain", "square", "cube"), widths,
+            lambda w: np.array([(value := level(w)), value**2, value**3]), lambda c, _, s: c[:, 0] + 0.0 * s,
+        ),
+        Structure(
             "late rate", 1, ("rate", "start"), lags,
-            lambda lag: np.array([(u - late(lag)) / lag, decay(lag)]), lambda c, lag, s: c[:, 0] * s / (1.0 + lag * s),
+            lambda lag: np.array([(u - behind(lag)) / lag, decay(lag)]),
+            lambda c, lag, s: c[:, 0] * s / (1.0 + lag * s),
         ),
         Structure(
             "lag", 1, ("gain", "start"), lags,
-            lambda lag: np.array([late(lag), decay(lag)]), lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
+            lambda lag: np.array([behind(lag), decay(lag)]), lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
         ),
         Structure(
             "lag and direct", 1, ("gain", "direct", "start"), lags,
-            lambda lag: np.array([(slow := late(lag)), u - slow, decay(lag)]),
+            lambda lag: np.array([(slow := behind(lag)), u - slow, decay(lag)]),
             lambda c, lag, s: (c[:, 0] + c[:, 1] * lag * s) / (1.0 + lag * s),
         ),
         Structure(
+            "lag and square", 1, ("gain", "square", "start", "start_square"), lags,
+            lambda lag: np.array([(slow := behind(lag)), slow**2, (gone := decay(lag)), gone * slow]),
+            lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
+        ),
+        Structure(
             "second order", 2, ("gain", "start", "start_rate"), lags,
-            lambda lag: np.array([late(lag, late(lag)), (gone := decay(lag)), gone * np.arange(u.size) * dt / lag]),
+            lambda lag: np.array([
+                late(behind(lag), lag, dt), (gone := decay(lag)), gone * np.arange(u.size) * dt / lag
+            ]),
             lambda c, lag, s: c[:, 0] / (1.0 + lag * s) ** 2,
         ),
     ]  # fmt: skip
+
+
+def late(values: Array, lag_s: float, dt: float) -> Array:
+    """[n]: `values` [n] behind a first-order lag, at rest at the first one.
+
+    Exact for samples between which the input moves on straight lines, and for means over each interval of an input that
+    is constant there. A module's lag takes each sample for the whole interval before it: half an interval less."""
+    kept = math.exp(-dt / lag_s)
+    mean = -lag_s / dt * math.expm1(-dt / lag_s)
+    about = values - values[0]
+    return np.asarray(values[0] + lfilter([1.0 - mean, mean - kept], [1.0, -kept], about))
 
 
 def tried(state: State, structure: Structure) -> Tried:
@@ -244,20 +292,17 @@ def _drifts(state: State, block: Array) -> Iterator[tuple[Fit, Array, float]]:
                 yield fit, theta, volume + float(theta[is_size].sum())
 
 
-def undistorted(state: State, u: Array, one: Tried, widths_s: Sequence[float], noisy: bool) -> Array:
-    """[k, k]: what the coefficients of an input [n] that was smoothed become for the input itself.
+def undistorted(state: State, given: Input, one: Tried) -> Array:
+    """[k, k]: what the coefficients of an input that was smoothed become for the input itself.
 
-    The smoothed columns z are instruments for the plain ones x: c = (z x)^-1 (z z) c_z. An input that is `noisy` has
-    read what acts with a white noise of its own, which is in z x as well. Second differences show that noise; drawn
-    anew, it is taken out."""
+    The smoothed columns z are instruments for the plain ones x: c = (z x)^-1 (z z) c_z. Readings of what acts have a
+    noise of their own, which is in z x as well: it is drawn anew and taken out. In powers it is neglected."""
     number, own = one.number, one.structure.own
     plain = one.structure.numbers[0] if one.structure.poles == 0 else number
-    sd = math.sqrt(float(np.var(np.diff(u, 2))) / 6.0) if noisy else 0.0
-    random = np.random.default_rng(1)
-    inputs = [u, *(sd * random.standard_normal((NOISES, u.size)) if noisy else ())]
+    inputs = [given.values, *given.noises]
     pairs = []
     for values in inputs:
-        same = next(each for each in structures(values, state.dt, widths_s) if each.name == one.structure.name)
+        same = next(each for each in structures(values, state.dt, given.widths_s) if each.name == one.structure.name)
         pairs += [same.columns(number)[:own], same.columns(plain)[:own]]
     rest = one.structure.columns(number)[own:]
     series = state.series.beside(np.vstack([*([rest] if len(rest) else []), *pairs]))
@@ -270,7 +315,7 @@ def undistorted(state: State, u: Array, one: Tried, widths_s: Sequence[float], n
         at = 2 * own * k
         return cross[at + i * own : at + (i + 1) * own, at + j * own : at + (j + 1) * own]
 
-    noise = sum(of(k, 0, 1) for k in range(1, len(inputs))) / NOISES
+    noise = sum(of(k, 0, 1) for k in range(1, len(inputs))) / max(1, len(inputs) - 1)
     found: Array = np.linalg.pinv(of(0, 0, 1) - noise) @ of(0, 0, 0)
     return found
 
@@ -280,7 +325,7 @@ def source(state: State, u: Array, one: Tried, drawn: Posterior) -> tuple[str, s
 
     A common cause that reaches the input first, and all of it, always looks as the input does."""
     columns = one.structure.columns(one.number)
-    ahead = [formed(u[::-1], "lag", lag, 0.0, state.dt)[::-1] for lag in _lags(u.size, state.dt)]
+    ahead = [late(u[::-1], lag, state.dt)[::-1] for lag in _lags(u.size, state.dt)]
     both = state.scores([np.vstack([columns, column]) for column in ahead], one.fit)
     if net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST:
         return "cannot tell", "the input's later values explain the output as well: feedback, or a common cause"
@@ -293,6 +338,8 @@ def source(state: State, u: Array, one: Tried, drawn: Posterior) -> tuple[str, s
     slower = np.mean(own.get("direct", 0.0) < own["gain"]) if "gain" in own else 0.0
     if slower < 0.5 + PROBABILITY / 2.0:
         return "cannot tell", "the output moves before the input: feedback, or a common cause"
+    if "direct" in own:
+        return "cannot tell", "a part comes at once, the rest late: two ways, or a common cause that both answer late"
     if one.gain - state.with_columns(ahead[int(np.argmax(state.scores(ahead, one.fit)))])[0] < ALIKE:
         return "cannot tell", "the output may follow the input, or the input the output"
     return "input first", "the output follows the input; a common cause that reaches the input first looks the same"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -14,13 +15,15 @@ from rich.table import Table
 
 from selfcal import units
 from selfcal.diagnosis import transfer
-from selfcal.diagnosis.forms import SMOOTHING_S
+from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
 from selfcal.diagnosis.state import NET_LEAST, State
 from selfcal.diagnosis.statemodel import Array
-from selfcal.diagnosis.transfer import PROBABILITY, Posterior
+from selfcal.diagnosis.transfer import PROBABILITY, Input, Posterior
 from selfcal.document import check_writable, recording_entry, write_json
 from selfcal.errors import UserError, printable
+from selfcal.forms import POWER
+from selfcal.held import updates
 from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.plot import check_picture, save_picture
@@ -36,6 +39,8 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 #: Frequencies of the response that is written, and draws that its band is of.
 FREQUENCIES, BAND_DRAWS = 60, 1000
 LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
+#: How the readings of a held input were taken.
+LINES = "straight lines between readings"
 NO_INFLUENCE = "this record shows no influence of the input"
 #: Words for the keys of an estimate.
 WORDS = {
@@ -43,6 +48,9 @@ WORDS = {
     "rate": "rate coefficient",
     "direct": "gain of fast changes",
     "lag_s": "time constant",
+    "delay_s": "delay of slow changes",
+    "square": "square coefficient",
+    "cube": "cube coefficient",
 }
 
 
@@ -90,17 +98,24 @@ def response(
         raise UserError(f"{recording.path}: more than {REFUSED_FROM:,} samples at this rate: take a lower --decimate")
     if record.axes[output].below_lattice:
         raise UserError(f"{recording.path}: {output}: {BELOW_LATTICE}")
-    u, unit, noisy = _input(recording, record, input)
+    inputs = _inputs(recording, record, input)
     state = record.axes[output]
     # The model file may state the input's influence: it is the question here.
     state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") != input))
+    answer, given = _answer(state, inputs)
     document = {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
-        "input": {"column": input, "unit": unit},
+        "input": {
+            "column": input,
+            "unit": given.unit,
+            "reference": given.reference,
+            **({"held_s": given.held_s, "taken": given.taken} if given.taken else {}),
+        },
         "output": {"axis": output, "unit": state.unit},
         "judged_at_hz": record.rate_hz,
-        **_answer(state, u, unit, noisy),
+        "delay_resolution_s": max(state.dt, given.held_s if given.taken == LINES else 0.0),
+        **answer,
     }
     if plot is not None:
         plot_response(document, plot)
@@ -109,27 +124,54 @@ def response(
     return document
 
 
-def _input(recording: Recording, record: Record, name: str) -> tuple[Array, str, bool]:
-    """Values [n] of the input about their median, their unit, and whether they read what acts with a noise of their
-    own. The reading of another axis acts itself."""
+def _inputs(recording: Recording, record: Record, name: str) -> list[Input]:
+    """The input about its median, as it may act. The reading of another axis acts itself. What a channel reads acts:
+    behind its noise, and between the readings of a held one. The held readings may act themselves as well: a part that
+    compensates by its own temperature."""
     if name in record.axes:
-        values, unit, noisy = bridged(record.axes[name].y), record.axes[name].unit, False
-    elif name in record.channel_names.values():
-        values, noisy = record.channel_of(name), True
-        unit = recording.columns[name].unit
-        values = units.convert(values, dict(SIDE_CHANNELS.values())[name], unit)
-    else:
+        return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
+    if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
         reason = "does not change" if known else "is neither temp, nor supply, nor an axis of the model"
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
-    return values - float(np.median(values)), unit, noisy
+    unit = recording.columns[name].unit
+    values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
+    clock = recording.clock
+    rows = updates(recording.columns[name].values, clock.place)
+    read_at = clock.time_s if rows is None else clock.time_s[rows]
+    held_s = float(read_at[-1] - read_at[0]) / max(1, read_at.size - 1)
+    random = np.random.default_rng(1)
+    if rows is None or held_s < 2.0 / record.rate_hz:
+        noises = _noise_of(values) * random.standard_normal((NOISES, values.size))
+        return [_about(Input(values, unit, noises=noises, widths_s=(0.0, *SMOOTHING_S)))]
+    # The middle of each cell of the grid.
+    time = record.time_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
+    time += float(recording.clock_of(next(iter(record.axes))).time_s[0])
+    read = recording.columns[name].values[rows]
+    drawn = _noise_of(read) * random.standard_normal((NOISES, read.size))
+    noises = np.array([np.interp(time, read_at, one) for one in drawn])
+    lines = Input(np.interp(time, read_at, read), unit, 0.0, noises, (0.0, *SMOOTHING_S), held_s, LINES)
+    return [_about(lines), _about(Input(values, unit, held_s=held_s, taken="held readings"))]
 
 
-def _answer(state: State, u: Array, unit: str, noisy: bool) -> dict[str, Any]:
-    """Everything that is found of an axis and an input [n] in `unit`, as the document has it."""
+def _about(given: Input) -> Input:
+    """The input about its median."""
+    reference = float(np.median(given.values))
+    return replace(given, values=given.values - reference, reference=reference)
+
+
+def _noise_of(values: Array) -> float:
+    """Deviation of a white noise by second differences, which hardly see what changes slowly."""
+    return math.sqrt(float(np.var(np.diff(values, 2))) / 6.0)
+
+
+def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
+    """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
     dt = state.dt
-    widths = (0.0, *SMOOTHING_S) if noisy else (0.0,)
-    found = [transfer.tried(state, one) for one in transfer.structures(u, dt, widths)]
+    each = [[transfer.tried(state, one) for one in transfer.structures(u.values, dt, u.widths_s)] for u in inputs]
+    found = max(each, key=lambda tried: max(one.score for one in tried))
+    given = inputs[each.index(found)]
+    u, unit = given.values, given.unit
     chosen = max(found, key=lambda one: one.score)
     net = transfer.worth(state, chosen)
     shown = chosen.score > 0.0 and net >= NET_LEAST
@@ -138,15 +180,14 @@ def _answer(state: State, u: Array, unit: str, noisy: bool) -> dict[str, Any]:
     poles = np.array([one.structure.poles for one in found])
     orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
     likely = sorted(orders, key=lambda order: -orders[order])
-    held = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
+    within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
-        whole = transfer.undistorted(state, u, chosen, widths, noisy)
-        drawn = transfer.posterior(state, chosen, whole)
+        drawn = transfer.posterior(state, chosen, transfer.undistorted(state, given, chosen))
         verdict, reason = transfer.source(state, u, chosen, drawn)
         entry |= {
             "structure": chosen.structure.name,
-            "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, held)), "probability": orders},
+            "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
             "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
             "estimate": _estimate(drawn, state.unit, unit),
             "source": {"verdict": verdict, "reason": reason},
@@ -158,16 +199,18 @@ def _answer(state: State, u: Array, unit: str, noisy: bool) -> dict[str, Any]:
             "source": {"verdict": "none", "reason": NO_INFLUENCE},
             "would_have_been_found": {"gain": least, "unit": coefficient_unit(state.unit, unit)},
         }
-    return entry | {"empirical": _empirical(state, u)}
+    return entry | {"empirical": _empirical(state, u)}, given
 
 
 def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
     """Posterior of each number of the structure."""
-    keys = drawn.structure.keys[: drawn.structure.own]
-    values = dict(zip(keys, drawn.c.T, strict=True))
+    values = dict(zip(drawn.structure.keys[: drawn.structure.own], drawn.c.T, strict=True))
     if drawn.structure.poles:
         values["lag_s"] = drawn.lag
-    named = {"rate": coefficient_unit(output, f"{unit}/s"), "lag_s": "s"}
+    if drawn.structure.name in ("static and rate", "lag and direct", "second order"):
+        values["delay_s"] = drawn.delay_s
+    named = {"rate": coefficient_unit(output, f"{unit}/s"), "lag_s": "s", "delay_s": "s"}
+    named |= {key: coefficient_unit(output, units.power(unit, exponent)) for key, exponent in POWER.items()}
     return {
         key: {
             "mean": float(draws.mean()),
@@ -221,7 +264,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     source, axis = document["source"], document["output"]["axis"]
-    line(f"{document['input']['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")
+    given = document["input"]
+    line(f"{given['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")
+    if "held_s" in given:
+        line(f"{given['column']} is read every {given['held_s']:.4g} s: taken as {given['taken']}")
     if not document["influence"]:
         least = document["would_have_been_found"]
         line(str(source["reason"]))
@@ -238,6 +284,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     for key, one in document["estimate"].items():
         table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
     console.print(table)
+    if set(document["estimate"]) & set(POWER):
+        line(f"gain at {given['reference']:.4g} {given['unit']}, from which the powers count")
+    if given.get("taken") == LINES:
+        line(f"a delay of less than {document['delay_resolution_s']:.4g} s is not resolved")
     line(f"source: {source['verdict']}: {source['reason']}")
 
 
