@@ -12,14 +12,16 @@ import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import binom
 
 from selfcal import units
 from selfcal.diagnosis import transfer
+from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
 from selfcal.diagnosis.state import NET_LEAST, State
 from selfcal.diagnosis.statemodel import Array
-from selfcal.diagnosis.transfer import PROBABILITY, Input, Posterior
+from selfcal.diagnosis.transfer import PROBABILITY, Empirical, Input, Posterior, Tried
 from selfcal.document import check_writable, recording_entry, write_json
 from selfcal.errors import UserError, printable
 from selfcal.forms import POWER
@@ -36,6 +38,10 @@ SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
 #: time constants are in memory together.
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
+#: Other methods take means over so many seconds at least of a channel with a noise of its own, and so many steps.
+NOISY_STEP_S, STEPS_LEAST = 10.0, 150
+#: Probability by chance of so few coherent bands that hold the answer, below which the spectra differ.
+SPECTRA_LEAST = 0.005
 #: Frequencies of the response that is written, and draws that its band is of.
 FREQUENCIES, BAND_DRAWS = 60, 1000
 LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
@@ -181,6 +187,7 @@ def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Inpu
     orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
     likely = sorted(orders, key=lambda order: -orders[order])
     within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
+    seen = transfer.empirical(u, bridged(state.y), dt)
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
         drawn = transfer.posterior(state, chosen, transfer.undistorted(state, given, chosen))
@@ -192,6 +199,7 @@ def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Inpu
             "estimate": _estimate(drawn, state.unit, unit),
             "source": {"verdict": verdict, "reason": reason},
             "frequency_response": _band(drawn, state.y.size, dt),
+            **_methods(state, given, chosen, drawn, seen),
         }
     else:
         least = state.least(u)
@@ -199,7 +207,7 @@ def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Inpu
             "source": {"verdict": "none", "reason": NO_INFLUENCE},
             "would_have_been_found": {"gain": least, "unit": coefficient_unit(state.unit, unit)},
         }
-    return entry | {"empirical": _empirical(state, u)}, given
+    return entry | {"empirical": _empirical(seen)}, given
 
 
 def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
@@ -222,6 +230,44 @@ def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
     }
 
 
+def _methods(state: State, given: Input, chosen: Tried, drawn: Posterior, seen: Empirical) -> dict[str, Any]:
+    """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
+    keys = set(chosen.structure.keys)
+    if "gain" not in keys or keys & set(POWER):
+        return {}
+    finest = max(state.dt, NOISY_STEP_S if given.noises.size else 0.0, abs(float(np.median(drawn.delay_s))) / 3.0)
+    steps = max(1, min(round(finest / state.dt), state.y.size // STEPS_LEAST))
+    own, columns = chosen.structure.own, chosen.structure.columns(chosen.number)
+    parts = chosen.fit.c[-len(columns) :, None] * columns
+    found = beside(state, chosen.fit, given.values, parts[:own].sum(axis=0), parts[own:].sum(axis=0), steps)
+    step_s = steps * state.dt
+    clear = seen.coherence > seen.chance
+    off = np.abs(seen.ratio - drawn.at(seen.frequency_hz).mean(axis=0))[clear]
+    held = int(np.count_nonzero(off <= seen.within[clear]))
+    return {
+        "methods_step_s": step_s,
+        "spectra": {
+            "bands": off.size,
+            "hold_answer": held,
+            "agrees": bool(binom.cdf(held, off.size, PROBABILITY) >= SPECTRA_LEAST),
+        },
+        "methods": {
+            name: {
+                "order": one.estimate.order,
+                "evidence_nats": {str(order): nats for order, nats in one.estimate.evidence.items()},
+                "gain": one.estimate.gain,
+                "delay_s": one.estimate.delay * step_s,
+                "if_answer_holds": {
+                    "gain": [float(one.least[0]), float(one.most[0])],
+                    "delay_s": [float(one.least[1] * step_s), float(one.most[1] * step_s)],
+                },
+                "agrees": one.agrees,
+            }
+            for name, one in found.items()
+        },
+    }
+
+
 def _band(drawn: Posterior, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
     frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
@@ -236,9 +282,8 @@ def _band(drawn: Posterior, n: int, dt: float) -> dict[str, list[float]]:
     return {"frequency_hz": frequency.tolist(), **{key: values.tolist() for key, values in named.items()}}
 
 
-def _empirical(state: State, u: Array) -> dict[str, list[float]]:
+def _empirical(found: Empirical) -> dict[str, list[float]]:
     """The ratio of spectra. Its phase is known nowhere that the band holds 0."""
-    found = transfer.empirical(u, bridged(state.y), state.dt)
     size = np.abs(found.ratio)
     turn = np.degrees(np.where(found.within < size, np.arcsin(np.minimum(found.within / size, 1.0)), math.pi))
     phase = np.degrees(np.angle(found.ratio))
@@ -289,6 +334,22 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     if given.get("taken") == LINES:
         line(f"a delay of less than {document['delay_resolution_s']:.4g} s is not resolved")
     line(f"source: {source['verdict']}: {source['reason']}")
+    if "methods" not in document:
+        return
+    line("")
+    line(f"other methods, means of {document['methods_step_s']:g} s; in brackets 90 % if the answer holds")
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("", "order", "static gain", "delay, s", "agrees"):
+        table.add_column(heading, no_wrap=True)
+    for name, one in document["methods"].items():
+        cells = []
+        for key in ("gain", "delay_s"):
+            low, high = one["if_answer_holds"][key]
+            cells.append(f"{one[key]:.3g} ({low:.3g} to {high:.3g})")
+        table.add_row(name, str(one["order"]), *cells, "yes" if one["agrees"] else "no")
+    console.print(table)
+    spectra = document["spectra"]
+    line(f"ratio of spectra: {spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
 
 
 def plot_response(document: Mapping[str, Any], path: Path | str) -> None:

@@ -1,0 +1,174 @@
+"""Other ways to identify an influence, beside the answer by prediction error: least squares, correlation, subspace.
+
+Input u and output y pass the whitening filter of the fitted drift first, so that G(s) stays between them and the noise
+of y is white. All work on means over one step, a third of the delay that they look for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from scipy.linalg import lstsq, qr, svd
+from scipy.signal import fftconvolve
+
+from selfcal.diagnosis.fit import Fit, run
+from selfcal.diagnosis.forms import LONGEST_LAG
+from selfcal.diagnosis.state import State
+from selfcal.diagnosis.statemodel import Array
+
+#: Orders of ARX and of a state model at most, taps of the weighting function, and block rows of the subspace.
+ORDERS, TAPS, BLOCK_ROWS = 4, (1, 2, 4, 8, 16, 32), (5, 8, 12)
+#: Residual sum of squares, free numbers, and gain and delay, of one order.
+Tried = tuple[float, int, tuple[float, float]]
+#: Drawn records of the answer.
+DRAWS = 20
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The `order` that a method chose with the `evidence` of each, nats below the best (half BIC), the static `gain`
+    and the delay of slow changes, `delay` steps."""
+
+    order: int
+    evidence: Mapping[int, float]
+    gain: float
+    delay: float
+
+
+@dataclass(frozen=True)
+class Beside:
+    """One method beside the answer: its `estimate`, and least and most [2] of gain and delay over records that the
+    answer makes. Of 20 records the next one is between them with 90 %."""
+
+    estimate: Estimate
+    least: Array
+    most: Array
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the answer explains the estimate: within twice the range, and half a step of the delay."""
+        own = np.array([self.estimate.gain, self.estimate.delay])
+        more = 0.5 * (self.most - self.least) + np.array([0.0, 0.5])
+        return bool(np.all((own >= self.least - more) & (own <= self.most + more)))
+
+
+def arx(u: Array, y: Array) -> Estimate:
+    """A(q) y = B(q) u + e by least squares. White noise that enters at the output pulls the poles towards 0."""
+
+    def tried(order: int) -> Tried:
+        past = _delayed(y, range(1, order + 1))
+        c, rss = _solved(np.hstack([-past, _delayed(u, range(order + 1))])[ORDERS:], y[ORDERS:])
+        a, b = np.concatenate([[1.0], c[:order]]), c[order:]
+        return rss, c.size, (_ratio(b.sum(), a.sum()), _delay(b) - _delay(a))
+
+    return _likeliest({order: tried(order) for order in range(1, ORDERS + 1)}, y.size - ORDERS)
+
+
+def correlation(u: Array, y: Array) -> Estimate:
+    """The weighting function by the equations of Wiener and Hopf. Its order is the number of taps."""
+    most = max(taps for taps in TAPS if 4 * taps <= y.size)
+
+    def tried(taps: int) -> Tried:
+        h, rss = _solved(_delayed(u, range(taps))[most:], y[most:])
+        return rss, taps, (float(h.sum()), _delay(h))
+
+    return _likeliest({taps: tried(taps) for taps in TAPS if taps <= most}, y.size - most)
+
+
+def subspace(u: Array, y: Array) -> Estimate:
+    """A state model by PO-MOESP (Verhaegen, Automatica 30, 1994): past input and output are the instruments. Of several
+    heights of the block matrices each order keeps the likeliest. A pole slower than a third of the record is none."""
+    before = np.concatenate([[0.0], u[:-1]])
+    slowest = math.exp(-1.0 / (LONGEST_LAG * y.size))
+
+    def tried(seen: Array) -> Tried:
+        """`seen` [rows, order]: the observability matrix."""
+        order = seen.shape[1]
+        free = 1 + 2 * order
+        F = lstsq(seen[:-1], seen[1:], check_finite=False)[0]
+        if order and np.abs(np.linalg.eigvals(F)).max() >= slowest:
+            return math.inf, free, (0.0, 0.0)
+        modes = np.empty((y.size, order))
+        modes[0] = seen[0]
+        for k in range(1, y.size):
+            modes[k] = modes[k - 1] @ F
+        driven = fftconvolve(before[:, None], modes, axes=0)[: y.size] if order else modes
+        c, rss = _solved(np.hstack([u[:, None], driven, modes]), y)
+        once = np.linalg.solve((np.eye(order) - F).T, seen[0])
+        twice = np.linalg.solve((np.eye(order) - F).T, once)
+        gain = float(c[0] + once @ c[1 : 1 + order])
+        return rss, free, (gain, _ratio(float(twice @ c[1 : 1 + order]), gain))
+
+    found: dict[int, Tried] = {}
+    for rows in BLOCK_ROWS:
+        count = y.size - 2 * rows + 1
+        U, Y = (np.array([one[k : k + count] for k in range(2 * rows)]) for one in (u, y))
+        (upper,) = qr(np.vstack([U[rows:], U[:rows], Y[:rows], Y[rows:]]).T, mode="r", check_finite=False)
+        left, _, _ = svd(upper[rows : 3 * rows, 3 * rows :].T, check_finite=False)
+        for order in range(ORDERS + 1):
+            found[order] = min(found.get(order, (math.inf, 0, (0.0, 0.0))), tried(left[:, :order]))
+    return _likeliest(found, y.size)
+
+
+#: Methods by name.
+METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
+    {"arx": arx, "correlation": correlation, "subspace": subspace}
+)
+
+
+def beside(state: State, fit: Fit, u: Array, answer: Array, before: Array, steps: int) -> dict[str, Beside]:
+    """What each method makes of an input [n] and the record in means of `steps` samples, and what it would make of
+    records that the `answer` [n] to that input and the fitted noise make. `before` [n]: what the input left from before
+    the record; it is taken out."""
+    rest = replace(state, y=state.y - before)
+    _, white, _ = run(rest.series.beside(np.array([u, answer])), fit.terms, fit.theta, innovations=True)
+    white = np.nan_to_num(white)
+    known, _ = np.linalg.qr(white[:, 1:-2])
+    white = white[:, [0, -2, -1]]
+    white -= known @ (known.T @ white)
+    count = white.shape[0] // steps
+    y, given, due = white[: count * steps].reshape(count, steps, 3).mean(axis=1).T
+    noise = float(np.std(y - due))
+    random = np.random.default_rng(1)
+    drawn = [due + noise * random.standard_normal(count) for _ in range(DRAWS)]
+    found = {}
+    for name, method in METHODS.items():
+        each = [method(given, one) for one in drawn]
+        spread = np.array([[one.gain, one.delay] for one in each])
+        found[name] = Beside(method(given, y), spread.min(axis=0), spread.max(axis=0))
+    return found
+
+
+def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
+    """The order of the least half BIC."""
+    score = {
+        order: -0.5 * n * math.log(max(rss, 1e-300)) - 0.5 * free * math.log(n)
+        for order, (rss, free, _) in tried.items()
+        if math.isfinite(rss)
+    }
+    best = max(score, key=lambda order: score[order])
+    return Estimate(best, {order: one - score[best] for order, one in score.items()}, *tried[best][2])
+
+
+def _delayed(values: Array, steps: Iterable[int]) -> Array:
+    """[n, k]: values [n] so many steps late, 0 before their begin."""
+    return np.array([np.concatenate([np.zeros(k), values[: values.size - k]]) for k in steps]).T
+
+
+def _solved(columns: Array, y: Array) -> tuple[Array, float]:
+    """Least squares: coefficients [k] and the residual sum of squares."""
+    c = np.asarray(lstsq(columns, y, check_finite=False)[0])
+    return c, float(np.sum((y - columns @ c) ** 2))
+
+
+def _delay(h: Array) -> float:
+    """Mean delay of a weighting function [k], steps."""
+    return _ratio(float(np.arange(h.size) @ h), float(h.sum()))
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b else 0.0
