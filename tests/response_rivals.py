@@ -7,7 +7,7 @@ The records are those of tests/common/influences.py: 50 min at 1 Hz, a lag of 8 
 behind the temperature. `spectra` fits g / (1 + T s) to the ratio of scipy's cross spectrum and spectrum by coherence.
 `output error` is scipy's least squares over gain, lag, bias and ramp. `arx` and `subspace` take the readings less a
 ramp, in means of a third of the lag; behind the filter of the drift they are those of the JSON. A lag is the delay of
-slow changes.
+slow changes. An error of more than 100 % counts as 100 %.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ INFLUENCES: dict[str, tuple[Callable[[Drawn], dict[str, float]], str]] = {
 
 
 def spectra(u: Floats, y: Floats, dt: float) -> tuple[float, float]:
-    size = u.size // 8
+    size = u.size // 3
     frequency, cross = csd(u, y, 1.0 / dt, nperseg=size, detrend="linear")
     own, theirs = (welch(one, 1.0 / dt, nperseg=size, detrend="linear")[1] for one in (u, y))
     ratio = (cross / own)[1:-1]
@@ -47,7 +47,8 @@ def spectra(u: Floats, y: Floats, dt: float) -> tuple[float, float]:
         left = weight * (x[0] / (1.0 + math.exp(x[1]) * turn) - ratio)
         return np.concatenate([left.real, left.imag])
 
-    gain, ln_lag = least_squares(off, [float(np.abs(ratio[0])), 3.0]).x
+    bounds = ([-np.inf, math.log(dt)], [np.inf, math.log(u.size * dt)])
+    gain, ln_lag = least_squares(off, [float(np.abs(ratio[0])), 3.0], bounds=bounds).x
     return float(gain), math.exp(ln_lag)
 
 
@@ -101,7 +102,7 @@ def main() -> None:
                 each.setdefault(name, []).append((gain / truth["gain"] - 1.0, lag / truth["lag_s"] - 1.0))
     print(f"{given.influence}, {given.records} records: mean and rms error, % of the gain; of the lag")
     for name, rows in each.items():
-        off = 100.0 * np.array(rows)
+        off = np.clip(100.0 * np.array(rows), -100.0, 100.0)
         mean, rms = off.mean(axis=0), np.sqrt((off**2).mean(axis=0))
         print(f"{name:28s} {mean[0]:+8.1f} {rms[0]:8.1f}   {mean[1]:+8.1f} {rms[1]:8.1f}")
 

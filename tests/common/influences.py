@@ -23,9 +23,10 @@ FINE = 10
 
 
 def late(values: Array, lag_s: float, step_s: float) -> Array:
-    """Behind a first-order lag, from the first value on."""
+    """Behind a first-order lag, from the first value on: the mean of its state before and after each step."""
     a = math.exp(-step_s / lag_s)
-    return np.asarray(lfilter([1.0 - a], [1.0, -a], values, zi=[a * values[0]])[0])
+    both = np.full(2, 0.5 * (1.0 - a))
+    return np.asarray(lfilter(both, [1.0, -a], values, zi=[(both[1] + a) * values[0]])[0])
 
 
 def wander(random: np.random.Generator, n: int, step_s: float, sd: float, time_s: float) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.fit import Fit, Sums, ln_det, ln_likelihood, run
+from selfcal.diagnosis.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
 from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, inconstancy
 from selfcal.diagnosis.record import smoothed
 from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
@@ -35,6 +35,8 @@ FINE, POSSIBLE, DRAWS = 21, 6.0, 4000
 NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
 #: ln of the number of independent looks: ten structures and their numbers.
 LN_STRUCTURES = math.log(28.0)
+#: Structures within so many nats of the best are scored beside a drift of two terms.
+NEAR = 10.0
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
 TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
 #: Both columns lose their slow power below this bin first: a spectrum as steep as a temperature's would fill the bands
@@ -205,6 +207,25 @@ def tried(state: State, structure: Structure) -> Tried:
     return Tried(structure, number, gain, score, fit, tuple(sorted(seen.items())))
 
 
+def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
+    """The structures with scores beside a drift of two terms, and the fit with that drift where it is clearly better.
+
+    A drift of one term that follows quick errors of a structure leaves slow columns some nats of their own."""
+    if state.extras.flicker:
+        return list(found)
+    best = max(found, key=lambda one: one.score)
+    base = max(state.rich.ln_likelihood, state.best.ln_likelihood)
+
+    def refitted(one: Tried) -> tuple[Fit, float]:
+        fit = refit(state.series.beside(one.structure.columns(one.number)), state.rich)
+        clearly = fit.ln_likelihood > one.fit.ln_likelihood + ALIKE
+        return fit if clearly else one.fit, fit.ln_likelihood - base - one.gain
+
+    of_best = refitted(best)[1]
+    near = [refitted(one) if one.score > best.score - NEAR else (one.fit, of_best) for one in found]
+    return [replace(one, score=one.score + more, fit=fit) for one, (fit, more) in zip(found, near, strict=True)]
+
+
 def worth(state: State, one: Tried) -> float:
     """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
     columns = one.structure.columns(one.number)
@@ -217,7 +238,7 @@ def worth(state: State, one: Tried) -> float:
 def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Posterior:
     """Draws over coefficients, the time constant, and the drift: every near one, and its parameters."""
     structure = one.structure
-    drifts = list(_drifts(state, structure.columns(one.number)))
+    drifts = list(_drifts(state, structure.columns(one.number), one.fit))
     grid = np.array([one.number])
     if structure.poles:
         # The largest drift that is possible leaves most time constants possible.
@@ -257,13 +278,14 @@ def _ln_weight(sums: Sums) -> float:
     return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
 
 
-def _drifts(state: State, block: Array) -> Iterator[tuple[Fit, Array, float]]:
+def _drifts(state: State, block: Array, known: Fit) -> Iterator[tuple[Fit, Array, float]]:
     """Parameters of every drift that the record leaves possible beside columns [k, n], on a lattice about each
-    fit, and ln of the prior share of each.
+    fit, and ln of the prior share of each. `known`: the structure's; of two terms it is taken alone.
 
     A size is as likely as any other up to the largest. Uniform in its logarithm, most weight would be on no drift at
     all wherever the record hardly shows one, and intervals of slow coefficients would be too narrow."""
     fits = [state.fitted_with(terms, block) for terms in state.bases()]
+    fits = fits if known.terms in state.bases() else [known]
     walk = max(one.ln_likelihood for one in fits if one.terms.walk)
     for fit in fits:
         terms = fit.terms
