@@ -18,7 +18,7 @@ void tearDown(void) {}
 static void the_spline_has_the_quadratic_between_the_nodes(void) {
     for (int i = -8; i <= 8; i++) {
         const double ln_alpha = known.alpha + 0.13 * (double)i;
-        selfcal_cells_row(&work, (selfcal_real_t)ln_alpha);
+        selfcal_cells_row(&work, (selfcal_real_t)ln_alpha, &work.scratch.grid.row);
         for (int k = -8; k <= 8; k++) {
             const double ln_rho = known.rho + 0.11 * (double)k;
             cell_t cell;
@@ -35,7 +35,7 @@ static void the_spline_has_the_quadratic_between_the_nodes(void) {
 static void parameters_of_a_cell(void) {
     selfcal_real_t ln_value[SELFCAL_PARAMETERS];
     cell_t cell;
-    selfcal_cells_row(&work, (selfcal_real_t)known.alpha);
+    selfcal_cells_row(&work, (selfcal_real_t)known.alpha, &work.scratch.grid.row);
     selfcal_cells_make(&work, (selfcal_real_t)known.rho, &cell);
     selfcal_cells_parameters(&work, &cell, ln_value);
     TEST_ASSERT_FLOAT_WITHIN(1e-5F, (float)known.ln_sigma + 0.5F * logf(DT), (float)ln_value[SELFCAL_N]);
@@ -46,14 +46,14 @@ static void parameters_of_a_cell(void) {
 /* Beyond the outermost node nothing is known. */
 static void beyond_the_nodes(void) {
     cell_t cell;
-    selfcal_cells_row(&work, (selfcal_real_t)known.alpha);
+    selfcal_cells_row(&work, (selfcal_real_t)known.alpha, &work.scratch.grid.row);
     selfcal_cells_make(&work, bank.rho_lo[0] - R(0.01), &cell);
     TEST_ASSERT_TRUE(cell.off_grid);
 }
 
 /* rho is the drift over the noise: its limits are those of the priors' corners. */
 static void limits(void) {
-    selfcal_cells_limits(&work);
+    selfcal_cells_limits(&work, &work.search);
     TEST_ASSERT_FLOAT_WITHIN(1e-5F, -9.0F - 2.0F + 0.5F * logf(DT), (float)work.search.limit_lo[0]);
     TEST_ASSERT_FLOAT_WITHIN(1e-5F, 2.0F + 8.0F + 0.5F * logf(DT), (float)work.search.limit_hi[0]);
     TEST_ASSERT_EQUAL_FLOAT(-8.0F, (float)work.search.limit_lo[1]);
@@ -64,7 +64,7 @@ static void limits(void) {
  * n (-d + e^(2 d)/2 - 1/2). */
 static void reach(void) {
     selfcal_real_t ln_value[SELFCAL_PARAMETERS] = {R(0.0)}, half[2] = {R(0.0), R(0.0)};
-    selfcal_cells_row(&work, (selfcal_real_t)known.alpha);
+    selfcal_cells_row(&work, (selfcal_real_t)known.alpha, &work.scratch.grid.row);
     ln_value[SELFCAL_N] = R(-3.0);
     ln_value[SELFCAL_SIGMA_M] = R(-4.0);
     reach_t found = selfcal_cells_reach(&work, ln_value, half);

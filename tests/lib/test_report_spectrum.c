@@ -48,13 +48,13 @@ static expectation_t expected_at(uint16_t k, double aside) {
 /* A row for every node, as selfcal_spectrum_step() adds it. */
 static void fit(void) {
     work.truth.ln_v = expected_at(0, 0.0).ln_v;
-    set_lines(&work);
+    set_lines((selfcal_real_t)bank.weight, &work.truth, &work.scratch.fit);
     for (uint16_t k = 0; k < model.nodes; k++) {
         const expectation_t e = expected_at(k, 0.0);
         const double more = added(second, &e) * (double)e.per_v; /* of the variance expected */
-        add_row(&work, &e, (selfcal_real_t)(0.5 * log1p(more)), R(0.0));
+        add_row(&work, &e, (selfcal_real_t)(0.5 * log1p(more)), R(0.0), &work.scratch.fit);
     }
-    selfcal_spectrum_solve(&work);
+    selfcal_spectrum_solve(&work.scratch.fit, &work.truth);
 }
 
 /* ln of the innovations' variance at the nodes and halfway to the next: what the lines leave of the second drift. Lines
@@ -87,12 +87,12 @@ static void the_lines_stand_for_a_second_drift(void) {
 
 /* A record that is as supposed has no lines. */
 static void nothing_beyond_the_supposed_is_fitted(void) {
-    set_lines(&work);
+    set_lines((selfcal_real_t)bank.weight, &work.truth, &work.scratch.fit);
     for (uint16_t k = 0; k < model.nodes; k++) {
         const expectation_t e = expected_at(k, 0.0);
-        add_row(&work, &e, R(0.0), R(0.0));
+        add_row(&work, &e, R(0.0), R(0.0), &work.scratch.fit);
     }
-    selfcal_spectrum_solve(&work);
+    selfcal_spectrum_solve(&work.scratch.fit, &work.truth);
     for (unsigned m = 0; m < unknowns(&work.truth); m++) {
         TEST_ASSERT_EQUAL_FLOAT(0.0F, (float)work.truth.power[m]);
     }
@@ -100,7 +100,7 @@ static void nothing_beyond_the_supposed_is_fitted(void) {
 
 /* Lines are even in ln omega from 1/n to 6, which stands for pi, at most LINES_APART. */
 static void lines_cover_the_records_frequencies(void) {
-    set_lines(&work);
+    set_lines((selfcal_real_t)bank.weight, &work.truth, &work.scratch.fit);
     const unsigned lines = work.truth.lines;
     TEST_ASSERT_TRUE(lines >= 8U && lines <= SELFCAL_LINES && lines % 2U == 0U);
     const double n = (double)bank.weight;
