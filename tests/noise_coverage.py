@@ -3,14 +3,17 @@
     python tests/noise_coverage.py flicker --hours 1 --records 400 --seed 7
     python tests/noise_coverage.py counted --hours 1 --records 100 --seed 7
 
-walk, markov: the paper's laws at readings of 4 Hz, each judged by its own law of the default model. N 0.04; K from 1e-4
-to 1e-3; sigma_m from 0.005 to 0.05 with correlation times from 30 to 600 s.
+constant, walk, markov: the paper's laws at readings of 4 Hz, each judged by its own law of the default model. N 0.04; K
+from 1e-4 to 1e-3; sigma_m from 0.005 to 0.05 with correlation times from 30 to 600 s.
 
 known: a ramp, a line of 300 s and a turn-on of 250 s beside a walk of K 3e-4, three regressors of `identify`. Each
 coefficient has half to one and a half times the sd of its prior.
 
 flicker: two-sided density B^2 / (2 pi f) at readings of 10 Hz, by Fourier synthesis over 16 times the record, beside
 white noise of N 0.04. B from 0.005 to 0.05. The law is `flicker` of sums.yaml alone, at its nodes of the host.
+
+sheet: the same noise by the default model, the numbers of the data sheet. `walk` and `markov` have them too: their bias
+instability is the first minimum of the true Allan deviation over 0.664, where it is within half the record.
 
 counted: differences of white remainders of sd Q beside white noise and a random walk, readings of 4 Hz. N from 0.0074
 to 0.054, Q / N from 0.4 to 3 sqrt(s), K / N of 0.0037 to 0.027 /s. What `identify` states by itself is counted.
@@ -32,13 +35,18 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Model
+from selfcal.model import DEFAULT, Group, Model
+from selfcal.one_over_f import SURE, weigh, with_white
 from selfcal.recording import as_float
-from selfcal.tables import make_tables
+from selfcal.result import AxisResult
+from selfcal.summary import summarize
+from selfcal.tables import Tables, make_tables
+from selfcal.units import FLICKER_FLOOR
 from selfcal.verbs.identify import identify
 
 Floats = NDArray[np.float64]
-#: By parameter: truth, 5 %, median and 95 %; and whether the grid of nodes is flagged.
+#: By parameter: truth, 5 %, median and 95 %; and a flag: the grid of nodes is too coarse, or of `sheet` and the default
+#: laws, the drift is 1/f noise.
 Found = tuple[dict[str, tuple[float, float, float, float]], bool]
 
 FLICKER_HZ, LONGER, COUNTED_HZ = 10.0, 16, 4.0
@@ -57,37 +65,87 @@ def one_over_f(random: np.random.Generator, n: int, rate: float, B: float) -> Fl
 
 def flicker(random: np.random.Generator, seconds: float) -> Iterator[Found]:
     model = replace(Model.load(DEFAULT.parent / "sums.yaml"), hypotheses={"flicker": 1.0})
-    tables = make_tables(model, FLICKER_HZ, ("gx",))
-    n = round(seconds * FLICKER_HZ)
+    tables, group = make_tables(model, FLICKER_HZ, ("gx",)), model.group_of("gx")
     while True:
-        N, B = 0.04, math.exp(random.uniform(math.log(0.005), math.log(0.05)))
-        y = 0.1 + one_over_f(random, n, FLICKER_HZ, B) + N * math.sqrt(FLICKER_HZ) * random.standard_normal(n)
+        y, truth = with_one_over_f(random, seconds)
         bank = Bank(tables)
         bank.push(as_float(y)[:, None])
-        found = bank.report(0).parameters["flicker"]
-        told = {name: (truth, *quantiles(found[name])) for name, truth in (("N", N), ("B", B))}
-        yield told, found["B"].off_grid
+        result = with_white(bank.report(0), group, tables.dt_s, round(seconds / tables.dt_s), tables.block)
+        found = result.parameters["flicker"]
+        yield {name: (value, *quantiles(found[name])) for name, value in truth.items()}, found["B"].off_grid
+
+
+def sheet(random: np.random.Generator, seconds: float) -> Iterator[Found]:
+    model = Model.load(DEFAULT)
+    tables = make_tables(model, FLICKER_HZ, ("gx",))
+    while True:
+        y, truth = with_one_over_f(random, seconds)
+        _, found, sure = numbers_of(tables, model.group_of("gx"), y)
+        told = {"ARW": (truth["N"], *found["arw"])} if "arw" in found else {}
+        if "bias_instability" in found:
+            told["bias instability"] = (truth["B"], *found["bias_instability"])
+        yield told, sure
+
+
+def with_one_over_f(random: np.random.Generator, seconds: float) -> tuple[Floats, dict[str, float]]:
+    """Readings and truth."""
+    N, B = 0.04, math.exp(random.uniform(math.log(0.005), math.log(0.05)))
+    n = round(seconds * FLICKER_HZ)
+    y = 0.1 + one_over_f(random, n, FLICKER_HZ, B) + N * math.sqrt(FLICKER_HZ) * random.standard_normal(n)
+    return y, {"N": N, "B": B}
+
+
+def numbers_of(
+    tables: Tables, group: Group, y: Floats
+) -> tuple[AxisResult, dict[str, tuple[float, float, float]], bool]:
+    """What a bank reports of readings, the identified numbers of the data sheet, and whether the drift is 1/f noise."""
+    samples = as_float(y)
+    bank = Bank(tables)
+    bank.push(samples[:, None])
+    result = bank.report(0)
+    beside = weigh(tables, group, samples, np.zeros(samples.size, np.int64))
+    found = summarize(result, group, tables.dt_s, samples.size // tables.block, tables.block, beside)
+    known = {key: quantiles(number.estimate) for key, number in found.items() if number.estimate.identified}
+    return result, known, beside is not None and beside.probability >= SURE
 
 
 def of_default(random: np.random.Generator, seconds: float, law: str) -> Iterator[Found]:
-    tables = make_tables(Model.load(DEFAULT), COUNTED_HZ, ("gx",))
+    model = Model.load(DEFAULT)
+    tables = make_tables(model, COUNTED_HZ, ("gx",))
     n, dt = round(seconds * COUNTED_HZ), 1.0 / COUNTED_HZ
+    tau = np.geomspace(1.0, 0.5 * seconds, 4000)
     while True:
         truth = {"N": 0.04}
+        drift: Floats = np.zeros(n)
+        allan = truth["N"] ** 2 / tau
         if law == "random_walk":
             truth["K"] = math.exp(random.uniform(math.log(1e-4), math.log(1e-3)))
             drift = truth["K"] * math.sqrt(dt) * random.standard_normal(n).cumsum()
-        else:
+            allan += truth["K"] ** 2 * tau / 3.0
+        elif law == "gauss_markov":
             truth["sigma_m"] = math.exp(random.uniform(math.log(0.005), math.log(0.05)))
             truth["alpha"] = 1.0 / math.exp(random.uniform(math.log(30.0), math.log(600.0)))
             phi = math.exp(-truth["alpha"] * dt)
             steps = truth["sigma_m"] * math.sqrt(1.0 - phi**2) * random.standard_normal(n)
             steps[0] = truth["sigma_m"] * random.standard_normal()
             drift = np.asarray(lfilter([1.0], [1.0, -phi], steps))
-        bank = Bank(tables)
-        bank.push(as_float(0.1 + drift + truth["N"] / math.sqrt(dt) * random.standard_normal(n))[:, None])
-        found = bank.report(0).parameters[law]
-        yield {name: (value, *quantiles(found[name])) for name, value in truth.items()}, found["N"].off_grid
+            x = truth["alpha"] * tau
+            allan += 2.0 * truth["sigma_m"] ** 2 / x * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
+        y = 0.1 + drift + truth["N"] / math.sqrt(dt) * random.standard_normal(n)
+        result, found, sure = numbers_of(tables, model.group_of("gx"), y)
+        told = {name: (value, *quantiles(result.parameters[law][name])) for name, value in truth.items()}
+        walk = {"random_walk": truth.get("K", 0.0), "gauss_markov": _walk(truth)}.get(law, 0.0)
+        least = np.flatnonzero((allan[1:-1] < allan[:-2]) & (allan[1:-1] <= allan[2:]))
+        lowest = math.sqrt(allan[least[0] + 1]) / FLICKER_FLOOR if least.size else math.nan
+        for key, value in (("arw", truth["N"]), ("rrw", walk), ("bias_instability", lowest)):
+            if key in found and value > 0.0:
+                told[key] = (value, *found[key])
+        yield told, sure
+
+
+def _walk(truth: Mapping[str, float]) -> float:
+    """K of the walk that a Gauss-Markov drift is over short times."""
+    return truth.get("sigma_m", 0.0) * math.sqrt(2.0 * truth.get("alpha", 0.0))
 
 
 def known(random: np.random.Generator, seconds: float) -> Iterator[Found]:
@@ -143,6 +201,8 @@ def counted(random: np.random.Generator, seconds: float) -> Iterator[Found]:
 
 DRAWN: Mapping[str, Callable[[np.random.Generator, float], Iterator[Found]]] = {
     "flicker": flicker,
+    "sheet": sheet,
+    "constant": lambda random, seconds: of_default(random, seconds, "constant"),
     "counted": counted,
     "walk": lambda random, seconds: of_default(random, seconds, "random_walk"),
     "markov": lambda random, seconds: of_default(random, seconds, "gauss_markov"),

@@ -34,7 +34,7 @@ class Identified:
     """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
     known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
     its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the
-    `summary`. `halved_after`: see summary.py."""
+    `summary`. `halved_after`: see summary.py. `more_laws`: probabilities of the laws where the drift is 1/f noise."""
 
     unit: str
     group_unit: str
@@ -45,6 +45,7 @@ class Identified:
     sampled: Sampled | None = None
     summary: Mapping[str, Number] = field(default_factory=dict)
     halved_after: Mapping[str, float | None] = field(default_factory=dict)
+    more_laws: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def adequate(self) -> bool:
@@ -146,6 +147,7 @@ def to_document(
                 "allan": _allan(axis),
                 **regressors_entry(axis.scored),
                 **({"halved_after_s": dict(axis.halved_after)} if axis.halved_after else {}),
+                **({"more_laws": dict(axis.more_laws)} if axis.more_laws else {}),
             }
             for name, axis in found.items()
         },

@@ -3,6 +3,8 @@
 The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
 Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
 has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
+Of 1/f noise it is B, and the white noise is that beside 1/f noise (one_over_f.py). Its law is weighed beside the
+model's own; the walk is theirs alone.
 Coloured noise of a spectral ratio below 1 is white noise beside quantization noise; at the bank's interval dt
 Q = N sqrt(dt) sqrt(1 / ratio^2 - 1) / 2. The number is there where such noise is sure. Each law counts by its
 probability.
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from selfcal import units
 from selfcal.allan import LONGEST, Terms, fit_of, posterior_draws, terms_of
 from selfcal.model import Group
+from selfcal.one_over_f import FLICKER, SURE, Beside, white_of
 from selfcal.result import HALF_90, AxisResult, Estimate
 
 _Floats = NDArray[np.float64]
@@ -37,6 +40,7 @@ NO_WALK = "no walk is sure"
 WIDE = "the record leaves it open"
 NO_MINIMUM = "the Allan deviation has no minimum up to half the record"
 BELOW = "the Allan deviation rises from the shortest averaging time on"
+ONE_OVER_F = "the drift is 1/f noise"
 
 
 @dataclass(frozen=True)
@@ -47,43 +51,60 @@ class Number:
     reason: str = ""
 
 
-def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, Number]:
+def summarize(
+    result: AxisResult, group: Group, dt_s: float, n: int, block: int, beside: Beside | None = None
+) -> dict[str, Number]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
-    record is too short for an Allan deviation."""
+    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result."""
     if n < 2 * LONGEST:
         return {}
-    m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
-    white, walk, counted, floor, reached, weight = [], [], [], [], [], []
+    more = 0.0 if beside is None else beside.probability
+    laws: list[tuple[str, float, Mapping[str, Estimate], Group, float, int, int]] = [
+        (law, probability * (1.0 - more), result.parameters[law], group, dt_s, n, block)
+        for law, probability in result.probability.items()
+        if probability >= _LEAST
+    ]
+    of_model = len(laws)
+    if beside is not None and more >= _LEAST:
+        laws.append((FLICKER, more, beside.estimates, beside.group, beside.dt_s, beside.n, beside.block))
+    white, walk, counted, floor, reached, weight, own = [], [], [], [], [], [], []
     drifts, open_drifts = 0.0, 0.0  # probability of the laws with a drift, and of those that leave its size open
-    for law, probability in result.probability.items():
-        estimates = result.parameters[law]
+    for number, (law, probability, estimates, of, every_s, length, samples) in enumerate(laws):
         medians = {name: estimate.median for name, estimate in estimates.items()}
-        if not probability >= _LEAST or not all(math.isfinite(value) for value in medians.values()):
+        if not all(math.isfinite(value) for value in medians.values()):
             continue
-        fit = fit_of(law, medians, group, dt_s, n, m, block=block)
+        m = np.geomspace(1.0, length / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(length / 2.0)))
+        fit = fit_of(law, medians, of, every_s, length, m, block=samples)
         draws = posterior_draws(estimates, fit.covariance, _DRAWS)
-        sizes = [estimates[name].identified for name in ("K", "sigma_m") if name in estimates]
+        sizes = [estimates[name].identified for name in ("K", "sigma_m", "B") if name in estimates]
         drifts += probability * bool(sizes)
         open_drifts += probability * (bool(sizes) and not any(sizes))
-        white.append(draws["N"])
         walk.append(_walk(draws))
-        counted.append(_quantization(draws, dt_s))
-        lowest = [
-            _minimum(terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block), m)
-            for row in zip(*draws.values(), strict=True)
-        ]
+        counted.append(_quantization(draws, every_s))
+        weight.append(np.full(_DRAWS, probability / _DRAWS))
+        own.append(np.full(_DRAWS, number < of_model))
+        if law == FLICKER:
+            white.append(white_of(draws, every_s, samples))
+            floor.append(draws["B"] * units.FLICKER_FLOOR)
+            hidden = white[-1] ** 2 / (0.5 * length * every_s) > floor[-1] ** 2  # below the white noise everywhere
+            reached.append(hidden.astype(float))
+            continue
+        white.append(draws["N"])
+        rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
+        lowest = [_minimum(terms_of(of.laws[law], row, every_s, samples), m) for row in rows]
         floor.append(np.array([value for value, _ in lowest]))
         reached.append(np.array([place for _, place in lowest]))
-        weight.append(np.full(_DRAWS, probability / _DRAWS))
     if not weight:
         return {}
     w = np.concatenate(weight) / np.concatenate(weight).sum()
     k, q, place = np.concatenate(walk), np.concatenate(counted), np.concatenate(reached)
-    has_walk, has_floor = float(w[k > 0.0].sum()), float(w[place == 0].sum())
+    w_walk = w * np.concatenate(own)
+    w_walk = w_walk / w_walk.sum() if w_walk.any() else w
+    has_walk, has_floor = float(w_walk[k > 0.0].sum()), float(w[place == 0].sum())
     found = {
         "arw": _number(np.concatenate(white), w),
-        "rrw": _number(np.where(np.isnan(k), 0.0, k), w),
+        "rrw": _number(np.where(np.isnan(k), 0.0, k), w_walk),
         "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
@@ -91,7 +112,9 @@ def summarize(result: AxisResult, group: Group, dt_s: float, n: int, block: int)
     prior = group.priors["K"]
     widest = HALF_90 * prior.ln_sd  # of ln(q95 / q05): half the prior's sd
     left_open = open_drifts > 0.5 * drifts
-    if has_walk < _SURE:
+    if more >= SURE:
+        found["rrw"] = _without(found["rrw"], ONE_OVER_F)
+    elif has_walk < _SURE:
         none = found["rrw"].estimate
         found["rrw"] = _without(Number(replace(none, q95=max(none.q95, prior.min))), NO_WALK)  # a limit is above 0
     elif left_open or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:

@@ -296,7 +296,9 @@ def make_tables(
                 model.laws[name],
                 math.log(probability),
                 *grids(name),
-                priors=tuple(_priors(model.group_of(axis), name) for axis in names) if model.laws[name].is_sum else (),
+                priors=tuple(priors_of(model.group_of(axis), name) for axis in names)
+                if model.laws[name].is_sum
+                else (),
             )
             for name, probability in model.hypotheses.items()
         ),
@@ -317,7 +319,7 @@ def make_tables(
     )
 
 
-def _priors(group: Group, law: str) -> tuple[PriorRow, ...]:
+def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:
     """In each place the prior of the parameter that the law has there, else that of the axis."""
     of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
     chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))

@@ -26,6 +26,7 @@ from selfcal.fail_on import check
 from selfcal.gate import gated
 from selfcal.loaders import Reading
 from selfcal.model import DEFAULT, Model
+from selfcal.one_over_f import weigh, with_white
 from selfcal.plot import check_picture
 from selfcal.priors import add_sources, for_record
 from selfcal.readings import look
@@ -348,23 +349,36 @@ def identify_axis(
             )
             advance()
     kept = kept_out_of(blocks, recording, int(readings.moving.sum()))
+    at = tables.dt_s, blocks.mean.size, tables.block
+    told = [in_unit(with_white(result, group, *at), group.unit, unit) for result in results]
     if not regressors:
-        judged = with_readings(judge(blocks, tables, group, results[0]), readings, group, unit, tables.dt_s)
-        curve = curve_of_samples(samples) if draw else None
-        of = results[0], group, tables.dt_s, blocks.mean.size, tables.block
-        known = in_unit(results[0], group.unit, unit)
-        return Identified(unit, group.unit, known, judged, kept, None, curve, summarize(*of), halved_after(*of))
-    if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
-        raise OutsidePriors
-    inside = combine(choices, results, model.hypotheses, group.unit)
-    used = _used(mask_of(regressors, choices[inside.best]))
-    judged = judge(blocks, tables, group, results[inside.best], used)
+        best, inside, scored, known = 0, results[0], None, told[0]
+    else:
+        if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
+            raise OutsidePriors
+        combined = combine(choices, results, model.hypotheses, group.unit)
+        best, inside = combined.best, combined.result
+        scored = combine(choices, told, model.hypotheses, unit)
+        known = scored.result
+    mask = mask_of(regressors, choices[best])
+    used = _used(mask)
+    judged = judge(blocks, tables, group, results[best], used)
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
-    explained = columns[:, used].astype(np.float64) @ coefficients_of(results[inside.best])
+    explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
-    scored = combine(choices, [in_unit(result, group.unit, unit) for result in results], model.hypotheses, unit)
-    of = inside.result, group, tables.dt_s, blocks.mean.size, tables.block
-    return Identified(unit, group.unit, scored.result, judged, kept, scored, curve, summarize(*of), halved_after(*of))
+    beside = weigh(tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset)
+    return Identified(
+        unit,
+        group.unit,
+        known,
+        judged,
+        kept,
+        scored,
+        curve,
+        summarize(inside, group, *at, beside),
+        halved_after(inside, group, *at),
+        beside.laws(known.probability) if beside else {},
+    )
 
 
 def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:

@@ -35,6 +35,7 @@ from selfcal.live import View, frame_counts
 from selfcal.loaders import Reading
 from selfcal.model import Model
 from selfcal.on_wire import places, sent
+from selfcal.one_over_f import weigh, with_white
 from selfcal.plot import check_picture, plot_run
 from selfcal.priors import add_sources, for_record
 from selfcal.readings import look
@@ -625,10 +626,14 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
         judged = with_readings(
             judge(blocks, tables, group, result, used), readings, group, unit, tables.dt_s, as_fed=True
         )
-    told = in_unit(result, group.unit, unit)
+    at = tables.dt_s, blocks.mean.size, tables.block
+    told = in_unit(with_white(result, group, *at), group.unit, unit)
+    mask = (1 << len(tables.regressors)) - 1 if scored is not None and scored.best == 1 else 0
     scored = replace(scored, result=told) if scored else None
-    numbers = summarize(result, group, tables.dt_s, blocks.mean.size, tables.block)
-    return Identified(unit, group.unit, told, judged, blocks.kept_out, scored, summary=numbers)
+    beside = None if gate else weigh(tables, group, samples, recording.missing_before, columns, mask)
+    numbers = summarize(result, group, *at, beside)
+    more = beside.laws(told.probability) if beside else {}
+    return Identified(unit, group.unit, told, judged, blocks.kept_out, scored, summary=numbers, more_laws=more)
 
 
 def _with_coefficients(

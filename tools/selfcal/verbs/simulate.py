@@ -18,6 +18,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.errors import UserError, printable
 from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
 from selfcal.model import Group, Model
+from selfcal.one_over_f import FLICKER, beside_its_law
 from selfcal.output import check_place
 from selfcal.tables import bank_block
 
@@ -46,7 +47,8 @@ def simulate(
     scene = _scene(model, seed)
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = truth_of(model, seed)
-    axes = [_axis(truth[name], model.group_of(name)) for name in model.axes]
+    dt_s = scene.bank_block / scene.rate_hz
+    axes = [_axis(truth[name], model.group_of(name), dt_s, scene.bank_block) for name in model.axes]
     applied = [_apply(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
     asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
     for name, axis in asked:
@@ -62,7 +64,7 @@ def simulate(
         truth[name] |= {
             "bias_now": now,
             # Rounding to the lattice adds lsb^2 / 12 to each sample's variance: the white noise that a record shows.
-            "N_with_lattice": math.sqrt(axis.N**2 + axis.lsb**2 / 12.0 / scene.rate_hz),
+            "N_with_lattice": math.sqrt(truth[name]["N"] ** 2 + axis.lsb**2 / 12.0 / scene.rate_hz),
             "units": {key: units.parameter_unit(key, truth[name]["unit"]) for key in model.group_of(name).priors},
         }
     meta = {
@@ -229,10 +231,12 @@ def _pick(probability: Mapping[str, float], u: float) -> str:
     return next(reversed(list(probability)))
 
 
-def _axis(truth: Mapping[str, Any], group: Group) -> _reference.Axis:
+def _axis(truth: Mapping[str, Any], group: Group, dt_s: float, block: int) -> _reference.Axis:
+    """`dt_s`: the bank's interval, of `block` readings. 1/f noise above the law's fastest term is white there."""
     axis = _reference.Axis()
     law = _laws(group)[truth["hypothesis"]]
-    axis.law, axis.bias, axis.N = law.as_tuple, truth["bias"], truth["N"]
+    white = beside_its_law(truth, dt_s, block) if truth["hypothesis"] == FLICKER else truth["N"]
+    axis.law, axis.bias, axis.N = law.as_tuple, truth["bias"], white
     axis.drift, axis.second = law.node(truth)
     axis.range, axis.lsb = group.range, group.lsb
     return axis
