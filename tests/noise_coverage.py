@@ -17,6 +17,7 @@ instability is the first minimum of the true Allan deviation over 0.664, where i
 
 counted: differences of white remainders of sd Q beside white noise and a random walk, readings of 4 Hz. N from 0.0074
 to 0.054, Q / N from 0.4 to 3 sqrt(s), K / N of 0.0037 to 0.027 /s. What `identify` states by itself is counted.
+`counted_law` is its law `moving_average` alone.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Group, Model
+from selfcal.model import DEFAULT, Group, Model, Prior
 from selfcal.one_over_f import SURE, weigh, with_white
 from selfcal.recording import as_float
 from selfcal.result import AxisResult
@@ -178,25 +179,52 @@ def quantiles(one: object) -> tuple[float, float, float]:
     return low, middle, high
 
 
-def counted(random: np.random.Generator, seconds: float) -> Iterator[Found]:
+def counted_readings(random: np.random.Generator, seconds: float) -> tuple[Floats, dict[str, float]]:
+    """Readings and truth."""
     n = round(seconds * COUNTED_HZ)
+    N = 0.02 * math.exp(random.uniform(-1.0, 1.0))
+    K = 0.01 * N * math.exp(random.uniform(-1.0, 1.0))
+    Q = N * math.exp(random.uniform(math.log(0.4), math.log(3.0)))
+    y = 0.1 + K / math.sqrt(COUNTED_HZ) * random.standard_normal(n).cumsum()
+    y += N * math.sqrt(COUNTED_HZ) * random.standard_normal(n)
+    y += np.diff(Q * random.standard_normal(n + 1)) * COUNTED_HZ
+    return y, {"N": N, "K": K, "Q": Q}
+
+
+def counted(random: np.random.Generator, seconds: float) -> Iterator[Found]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log.npz"
         while True:
-            N = 0.02 * math.exp(random.uniform(-1.0, 1.0))
-            K = 0.01 * N * math.exp(random.uniform(-1.0, 1.0))
-            Q = N * math.exp(random.uniform(math.log(0.4), math.log(3.0)))
-            y = 0.1 + K / math.sqrt(COUNTED_HZ) * random.standard_normal(n).cumsum()
-            y += N * math.sqrt(COUNTED_HZ) * random.standard_normal(n)
-            y += np.diff(Q * random.standard_normal(n + 1)) * COUNTED_HZ
-            np.savez(log, **{"t[s]": np.arange(n) / COUNTED_HZ, "gx[deg/s]": y})
+            y, truth = counted_readings(random, seconds)
+            np.savez(log, **{"t[s]": np.arange(y.size) / COUNTED_HZ, "gx[deg/s]": y})
             axis = identify(log).axes["gx"]
             found, numbers = axis.parameters[axis.law], axis["summary"]
-            told = {name: (truth, *quantiles(found[name])) for name, truth in (("N", N), ("K", K)) if name in found}
+            told = {name: (truth[name], *quantiles(found[name])) for name in ("N", "K") if name in found}
             if "quantization_noise" in numbers:
                 one = numbers["quantization_noise"]
-                told["Q"] = (Q, one["q05"], one["median"], one["q95"])
+                told["Q"] = (truth["Q"], one["q05"], one["median"], one["q95"])
             yield told, bool(found["N"].off_grid)
+
+
+def counted_law(random: np.random.Generator, seconds: float) -> Iterator[Found]:
+    """By the law that `identify` adds, alone, within the ratios that it lays."""
+    model = replace(Model.load(DEFAULT.parent / "sums.yaml"), hypotheses={"moving_average": 1.0})
+    wide = Prior("log_uniform", 0.05, 5.0)
+    model = replace(
+        model, groups=tuple(replace(one, priors={**one.priors, "spectral_ratio": wide}) for one in model.groups)
+    )
+    tables, group = make_tables(model, COUNTED_HZ, ("gx",)), model.group_of("gx")
+    while True:
+        y, truth = counted_readings(random, seconds)
+        bank = Bank(tables)
+        bank.push(as_float(y)[:, None])
+        result = bank.report(0)
+        found = result.parameters["moving_average"]
+        told = {name: (truth[name], *quantiles(found[name])) for name in ("N", "K")}
+        numbers = summarize(result, group, tables.dt_s, y.size // tables.block, tables.block)
+        if "quantization_noise" in numbers:
+            told["Q"] = (truth["Q"], *quantiles(numbers["quantization_noise"].estimate))
+        yield told, found["N"].off_grid
 
 
 DRAWN: Mapping[str, Callable[[np.random.Generator, float], Iterator[Found]]] = {
@@ -204,6 +232,7 @@ DRAWN: Mapping[str, Callable[[np.random.Generator, float], Iterator[Found]]] = {
     "sheet": sheet,
     "constant": lambda random, seconds: of_default(random, seconds, "constant"),
     "counted": counted,
+    "counted_law": counted_law,
     "walk": lambda random, seconds: of_default(random, seconds, "random_walk"),
     "markov": lambda random, seconds: of_default(random, seconds, "gauss_markov"),
     "known": known,
