@@ -8,14 +8,19 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
+from selfcal.batch.drift import Series, drifts_of
 from selfcal.batch.population import FALSE_ALARM, Measured, Population, populations
+from selfcal.batch.summary import apart_words
 from selfcal.engines.library import Bank
 from selfcal.model import DEFAULT, Model, read_yaml
 from selfcal.recording import save
@@ -25,7 +30,7 @@ from selfcal.tables import make_tables
 from selfcal.units import factor
 from selfcal.verbs.fleet import fleet
 
-from conftest import case_records, run
+from conftest import CASE_RECORDS, case_records, run
 
 Array = NDArray[np.float64]
 #: Units of a batch, bank samples of a record, and the population: middle and spread of ln N and ln K.
@@ -134,27 +139,185 @@ def test_a_batch_without_groups_has_none() -> None:
     assert sum(len(one.unlike) for one in found) <= expected + 3.0 * math.sqrt(expected) + 1.0
 
 
-def batch_of_files(folder: Path, units: int, seed: int, odd: dict[int, str], samples: int = 3600) -> None:
-    """Recordings at 1 Hz of one gyro axis on a lattice, spread of ln K 0.15; `odd` units with their fault."""
+def test_of_two_stations_none_is_blamed() -> None:
+    """Whichever is shifted, and whichever is larger: the line states that the two differ. Of three one is named."""
+    random = np.random.default_rng(41)
+    for sizes, shifted in (((30, 30), 0), ((30, 30), 1), ((20, 40), 0), ((20, 40), 1), ((6, 6), 1)):
+        names = ["east"] * sizes[0] + ["west"] * sizes[1]
+        add = 0.9 * np.array([name == ("east", "west")[shifted] for name in names], float)
+        (found,) = populations([drawn(random, len(names), 0.1, 0.03, add=add)], [("station", names)])
+        (apart,) = found.apart
+        assert {apart.name, apart.against} == {"east", "west"}
+        sign = 1.0 if apart.name == ("east", "west")[shifted] else -1.0
+        assert apart.offset == pytest.approx(0.9 * sign, abs=0.25)  # 4 sd of a difference of six and six
+        words = apart_words(found.measured, apart)
+        assert f"station {apart.against}'s, the two differ, " in words and "not the parts'" not in words
+        # neither is the reference: the middle is between both, within 4 sd of a mean of 6 and of the difference
+        assert found.fit.middle.median == pytest.approx(1.45, abs=0.17)
+    names = [("east", "west", "south")[k % 3] for k in range(60)]
+    add = 0.9 * np.array([name == "west" for name in names], float)
+    (found,) = populations([drawn(random, 60, 0.1, 0.03, add=add)], [("station", names)])
+    (apart,) = found.apart
+    assert (apart.name, apart.against) == ("west", None)
+    assert "the station's, not the parts'" in apart_words(found.measured, apart)
+
+
+@pytest.mark.parametrize("units", [6, 10])
+def test_small_batches_have_no_false_station(units: int) -> None:
+    """FALSE_ALARM a batch, by Student's tails: robust spreads of five to ten units named one in 1 to 2 % of them."""
+    random, batches = np.random.default_rng(6), case_records(60, 2000)
+    names = [("station", ["ab"[k % 2] for k in range(units)]), ("lot", ["xyz"[3 * k // units] for k in range(units)])]
+    apart = unlike = 0
+    for _ in range(batches):
+        found = populations([drawn(random, units, 0.15, 0.05, name=f"gx.{p}") for p in ("N", "K")], names)
+        apart += any(one.apart for one in found)
+        unlike += sum(len(one.unlike) for one in found)
+    # 3 sd of a Poisson count; a batch with a group may have both its sides odd
+    for count, expected in ((apart, FALSE_ALARM * batches), (unlike, FALSE_ALARM * units * batches)):
+        assert count <= expected + 3.0 * math.sqrt(expected) + 1.0, (apart, unlike)
+
+
+@pytest.mark.parametrize("units", [6, 9, 30])
+def test_how_far_off_a_unit_must_be_to_be_seen(units: int) -> None:
+    """The unit nearest to the middle, moved by a tenth less or more than `seen_from`. Six units see a few times less
+    than 30 do: Student's tail at 1 in 1000 of 4 degrees of freedom over the normal's is 8.6 / 3.3."""
+    random, seen = np.random.default_rng(units), []
+    for _ in range(12):
+        one = drawn(random, units, 0.15, 0.02)
+        (found,) = populations([one], [])
+        if found.unlike:
+            continue
+        k = int(np.argmin(np.abs(one.y - np.median(one.y))))
+        for times, there in ((0.9, False), (1.1, True)):
+            y = one.y.copy()
+            y[k] = np.delete(one.y, k).mean() + times * found.seen_from
+            (moved,) = populations([replace(one, y=y)], [])
+            assert (k in {far.at for far in moved.unlike}) is there, (units, times)
+        seen.append(found.seen_from / 0.15)
+    assert {6: 5.0, 9: 3.8, 30: 3.0}[units] < np.mean(seen) < {6: 13.0, 9: 8.0, 30: 4.6}[units]
+
+
+def series(
+    random: np.random.Generator, units: int, dates: int, *, again: float, slope: dict[int, float]
+) -> list[Series]:
+    """A bias of each unit at several dates: it comes out differently by `again` at each start."""
+    found = []
+    for at in range(units):
+        days = np.sort(random.uniform(0.0, 90.0, dates))
+        y = random.standard_normal() + slope.get(at, 0.0) * days + again * random.standard_normal(dates)
+        found.append(
+            Series(at, "gz.bias", "deg/s", False, days, y + 0.01 * random.standard_normal(dates), np.full(dates, 0.01))
+        )
+    return found
+
+
+def test_a_drifting_unit_is_named() -> None:
+    """A slope of 15 of its standard deviations; a unit that scatters ten times as the others hides none and has none.
+    Units without a slope have one in FALSE_ALARM of them: 3 sd of a Poisson count."""
+    random = np.random.default_rng(12)
+    sd = 0.05 / (26.0 * math.sqrt(4))  # of 4 dates spread over 90 days
+    for units in (1, 12):
+        made = series(random, units, 4 if units > 1 else 9, again=0.05, slope={0: 15.0 * sd})
+        made += [
+            replace(one, at=units, y=10.0 * one.y) for one in series(random, 1, 4, again=0.05, slope={})[: units - 1]
+        ]
+        found = {one.at: one for one in drifts_of(made)}
+        assert [at for at, one in found.items() if one.significant] == [0]
+        assert found[0].per_day == pytest.approx(15.0 * sd, abs=4.0 * found[0].sd)
+    pairs = [replace(one, days=one.days[:2], y=one.y[:2], s=one.s[:2]) for one in made[:3]]
+    assert drifts_of(pairs) == []  # nothing shows what a start changes
+    assert {one.at for one in drifts_of([*pairs, *made[3:]])} == set(range(13))
+    units = case_records(300, 10_000)
+    false = 0
+    for dates in (2, 3, 6):
+        still = series(random, units, dates, again=0.05, slope={})
+        false += sum(one.significant for one in drifts_of([*still, *series(random, 20, 3, again=0.05, slope={})]))
+    expected = FALSE_ALARM * 3 * (units + 20)
+    assert false <= expected + 3.0 * math.sqrt(expected)
+
+
+def test_coefficients_are_a_population(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The amplitude at turn-on and the coefficient of the temperature, of units that read in deg/s and in mrad/s.
+
+    Middle and spread are within 3 sd of theirs (the interval's half is 1.64). The unit with four times the coefficient
+    is unlike, the table has both coefficients, and no prior comes of them."""
+    monkeypatch.chdir(tmp_path)
+    tree = read_yaml(DEFAULT, "model file")
+    tree["regressors"] = [
+        {
+            "name": "temperature",
+            "kind": "column",
+            "column": "temp",
+            "unit": "degC",
+            "reference": 25,
+            "sd": {"gyro": 0.1},
+        },
+        {"name": "settling", "kind": "turn_on", "tau_s": 120, "sd": {"gyro": 1.0}},
+    ]
+    Path("m.yaml").write_text(yaml.safe_dump(tree))
+    random, n = np.random.default_rng(31), 900
+    truth = {"temperature": (0.01, 0.001), "settling": (-0.3, 0.05)}
+    rows = ["file,device,date"]
+    for k in range(14):
+        temp = 25.0 + 6.0 * np.sin(2.0 * math.pi * np.arange(n) / 300.0 + k) + 0.01 * random.standard_normal(n)
+        of = {name: middle + spread * random.standard_normal() for name, (middle, spread) in truth.items()}
+        of["temperature"] *= 4.0 if k == 5 else 1.0
+        y = of["temperature"] * (temp - 25.0) + of["settling"] * np.exp(-np.arange(n) / 120.0)
+        y += (
+            0.2 * random.standard_normal()
+            + 0.03 * random.standard_normal(n)
+            + np.cumsum(5e-4 * random.standard_normal(n))
+        )
+        unit = ("deg/s", "mrad/s")[k % 2]
+        save(f"u{k}.npz", {"gx": (unit, y * factor("deg/s", unit)), "temp": ("degC", temp)}, 1.0)
+        rows.append(f"u{k}.npz,d{k},2026-03-{1 + k:02}")
+    Path("units.csv").write_text("\n".join(rows))
+    result = fleet(["u*.npz"], "t.csv", model="m.yaml", units_table="units.csv", report="t.html", write_model="b.yaml")
+    assert list(result["unlike"]) == ["d5"] and "gx.temperature" in result["unlike"]["d5"][0]
+    for name, (middle, spread) in truth.items():
+        one = result["population"][f"gx.{name}"]
+        assert one["units"] == 14 and one["unit"] == ("deg/s/degC" if name == "temperature" else "deg/s")
+        for key, value in (("middle", middle), ("spread", spread)):
+            low, at, high = (one[key][of] for of in ("q05", "median", "q95"))
+            assert at - 1.9 * (at - low) < value < at + 1.9 * (high - at), (name, key, one[key])
+    with Path("t.csv").open(newline="") as stream:
+        units = {
+            row["recording"]: row["parameter_unit"]
+            for row in csv.DictReader(stream)
+            if row["parameter"] == "temperature"
+        }
+    assert units["u0.npz"] == "deg/s/degC" and units["u1.npz"] == "mrad/s/degC"
+    assert "gx.settling" in Path("t.html").read_text() and "own_priors" in Path("b.yaml").read_text()
+    assert read_yaml(Path("b.yaml"), "model file")["regressors"] == tree["regressors"]
+
+
+def batch_of_files(
+    folder: Path, units: int, seed: int, odd: dict[int, str], samples: int = 3600, axes: Sequence[str] = ("gx",)
+) -> None:
+    """Recordings at 1 Hz on a lattice, spread of ln K 0.15; `odd` units with their fault on one of the `axes`."""
     random = np.random.default_rng(seed)
     folder.mkdir()
     for k in range(units):
-        kind = odd.get(k, "")
-        N = 0.05 * math.exp(0.05 * random.standard_normal())
-        K = 2e-3 * math.exp(0.15 * random.standard_normal()) * (3.0 if kind == "walk" else 1.0)
-        y = 0.3 * random.standard_normal() + np.cumsum(K * random.standard_normal(samples))
-        y += N * random.standard_normal(samples)
-        lattice = 0.02 if kind == "range" else 0.01
-        if kind == "step":
-            y[samples // 3 :] += 1.0
-        if kind == "noise":
-            y += 0.05 * random.standard_normal(samples)
-        y = np.rint(y / lattice) * lattice
-        if kind == "clipped":
-            y = np.clip(y, -np.inf, np.quantile(y, 0.9))
-        if kind == "stuck":
-            y[500:2000] = y[500]
-        save(folder / f"u{k:04}.npz", {"gx": ("deg/s", y)}, 1.0)
+        columns: dict[str, tuple[str, Array]] = {}
+        faulty = axes[int(random.integers(len(axes)))] if len(axes) > 1 else axes[0]
+        for axis in axes:
+            kind = odd.get(k, "") if axis == faulty else ""
+            N = 0.05 * math.exp(0.05 * random.standard_normal())
+            K = 2e-3 * math.exp(0.15 * random.standard_normal()) * (3.0 if kind == "walk" else 1.0)
+            y = 0.3 * random.standard_normal() + np.cumsum(K * random.standard_normal(samples))
+            y += N * random.standard_normal(samples)
+            lattice = 0.02 if kind == "range" else 0.01
+            if kind == "step":
+                y[samples // 3 :] += 1.0
+            if kind == "noise":
+                y += 0.05 * random.standard_normal(samples)
+            y = np.rint(y / lattice) * lattice
+            if kind == "clipped":
+                y = np.clip(y, -np.inf, np.quantile(y, 0.9))
+            if kind == "stuck":
+                y[500:2000] = y[500]
+            columns[axis] = ("deg/s" if axis.startswith("g") else "m/s^2", y)
+        save(folder / f"u{k:04}.npz", columns, 1.0)
 
 
 def test_units_of_one_kind_are_one_population(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,11 +356,13 @@ def test_units_of_one_kind_are_one_population(tmp_path: Path, monkeypatch: pytes
     assert read["r01"] == "mrad/s/sqrt(Hz)" and read["r02"] == "deg/h/sqrt(Hz)"
 
 
+AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 KINDS = ("walk", "step", "clipped", "stuck", "range", "noise")
 
 
 def test_odd_units_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two of each kind of fault are named, or have no result; hardly another unit is: a mean of one in 300."""
+    """Two of each kind of fault are named, or have no result; hardly another unit is: a mean of one in 300. In `make
+    cases` each is on one of six axes."""
     monkeypatch.chdir(tmp_path)
     batches, units = case_records(1, 2), case_records(60, 300)
     missed: list[str] = []
@@ -205,7 +370,7 @@ def test_odd_units_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for seed in range(batches):
         places = np.random.default_rng(seed).permutation(units)[: 2 * len(KINDS)]
         odd = {int(k): KINDS[n % len(KINDS)] for n, k in enumerate(places)}
-        batch_of_files(tmp_path / f"b{seed}", units, 100 + seed, odd)
+        batch_of_files(tmp_path / f"b{seed}", units, 100 + seed, odd, axes=AXES if CASE_RECORDS else AXES[:1])
         result = fleet([f"b{seed}/*"], f"t{seed}.csv")
         named = {int(name[1:]): words for name, words in {**result["unlike"], **result["not_judged"]}.items()}
         missed += [f"{seed}: {k} {kind}" for k, kind in odd.items() if k not in named]

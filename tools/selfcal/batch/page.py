@@ -8,12 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
 from selfcal import units as unit_module
 from selfcal.batch.population import Array, Population
-from selfcal.batch.summary import Batch, apart_words, plain, shared_words
+from selfcal.batch.summary import Batch, apart_words, plain, seen_from_words, shared_words
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, draw, number, scrolled
 from selfcal.diagnosis.page import frame
 from selfcal.errors import printable
@@ -27,16 +28,19 @@ LONGEST = 200
 INDIVIDUALS, RANGES = 2.66, 3.267
 
 
-def write_page(path: Path | str, document: Mapping[str, Any], batch: Batch) -> None:
+def write_page(
+    path: Path | str, document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str] | None = None
+) -> None:
     """Write page() to `path`, whole or not at all."""
-    write_text(path, page(document, batch))
+    write_text(path, page(document, batch, pages or {}))
 
 
-def page(document: Mapping[str, Any], batch: Batch) -> str:
-    """The page of the document `selfcal.fleet/1` and the batch that it is made of."""
+def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
+    """The page of the document `selfcal.fleet/1` and the batch that it is made of. `pages`: where the own page of a
+    device is, from this page's folder on."""
     head = f"<header><h1>{document['recordings']} recordings of {document['devices']} devices</h1>"
     body = [
-        *_todo(document, batch),
+        *_todo(document, batch, pages),
         *_population(batch),
         *_distributions(document, batch),
         *_control(batch),
@@ -56,16 +60,18 @@ def _glance(document: Mapping[str, Any]) -> Iterator[str]:
         "beyond a limit, or with the cause asked for": len(document["failed"]),
         "not judged": len(document["not_judged"]),
         "unlike the batch": len(document["unlike"]),
+        "drifting": len(document["drifting"]),
     }
     for what, count in counted.items():
         yield f"<p class={'bad' if count else 'good'}>{count} devices {what}</p>"
 
 
-def _todo(document: Mapping[str, Any], batch: Batch) -> Iterator[str]:
+def _todo(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> Iterator[str]:
     yield "<section aria-labelledby=todo><h2 id=todo>What to do</h2>"
     kinds = (
         ("failed", "Beyond a limit: set these aside"),
         ("unlike", "Unlike the batch: look at these first"),
+        ("drifting", "Drifting from recording to recording: measure these again, calibrate them more often"),
         ("not_judged", "Not judged: record these again, or longer"),
     )
     for key, heading in kinds:
@@ -75,13 +81,12 @@ def _todo(document: Mapping[str, Any], batch: Batch) -> Iterator[str]:
         lines = []
         for name, reasons in list(devices.items())[:MOST_LINES]:
             shown = "; ".join(_text(one) for one in reasons[:6]) + ("; ..." if len(reasons) > 6 else "")
-            lines.append(
-                f"<li><b>{_text(name)}</b>: {shown}{_command(batch, name) if key != 'not_judged' else ''}</li>"
-            )
+            more = _own_page(batch, name, pages) if key != "not_judged" else ""
+            lines.append(f"<li><b>{_text(name)}</b>: {shown}{more}</li>")
         yield f"<h3>{heading}</h3><ul class=findings>{''.join(lines[:OPEN_LINES])}</ul>"
         if len(devices) > OPEN_LINES:
-            more = len(devices) - OPEN_LINES
-            yield f"<details><summary>{more} more</summary><ul class=findings>{''.join(lines[OPEN_LINES:])}</ul>"
+            yield f"<details><summary>{len(devices) - OPEN_LINES} more</summary>"
+            yield f"<ul class=findings>{''.join(lines[OPEN_LINES:])}</ul>"
             yield "" if len(devices) <= MOST_LINES else "<p>The JSON names the others.</p>"
             yield "</details>"
     groups = [f"{a.kind} {a.name}: {apart_words(p.measured, a)}" for p in batch.populations for a in p.apart]
@@ -95,8 +100,10 @@ def _todo(document: Mapping[str, Any], batch: Batch) -> Iterator[str]:
     yield "</section>"
 
 
-def _command(batch: Batch, name: str) -> str:
-    """The command that makes a device's own page."""
+def _own_page(batch: Batch, name: str, pages: Mapping[str, str]) -> str:
+    """The link to a device's own page, or the command that makes it."""
+    if name in pages:
+        return f"<br><a href='{escape(quote(pages[name]))}'>page of its last recording</a>"
     if name not in batch.devices:
         return ""
     path = batch.devices[name][-1].source.path
@@ -105,7 +112,10 @@ def _command(batch: Batch, name: str) -> str:
 
 def _population(batch: Batch) -> Iterator[str]:
     yield "<section aria-labelledby=population><h2 id=population>The population</h2>"
-    head = "".join(f"<th scope=col>{one}</th>" for one in ("quantity", "units", "middle", "unit", "spread", "left out"))
+    head = "".join(
+        f"<th scope=col>{one}</th>"
+        for one in ("quantity", "units", "middle", "unit", "spread", "unlike from", "left out")
+    )
     rows = []
     for one in batch.populations:
         measured, middle, spread = one.measured, plain(one.measured, one.fit.middle), one.fit.spread
@@ -115,12 +125,14 @@ def _population(batch: Batch) -> Iterator[str]:
             unit_module.typeset(measured.unit),
             f"{number(spread.median, 2)} [{number(spread.q05, 2)}, {number(spread.q95, 2)}]"
             + (" of ln" if measured.logarithm else ""),
+            seen_from_words(one),
             str(len(one.unlike)),
         )
         rows.append(f"<tr><th scope=row>{measured.name}</th>{''.join(f'<td>{escape(c)}</td>' for c in cells)}</tr>")
     if rows:
         caption = (
-            "Medians and 90 % intervals of the population's middle and spread, without the units that are unlike it."
+            "Medians and 90 % intervals of the population's middle and spread, without the units that are unlike it. "
+            "A unit that is off by less than 'unlike from' does not show in a batch of so many units."
         )
         yield scrolled("Population", caption, f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>")
     else:

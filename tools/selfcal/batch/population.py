@@ -6,7 +6,9 @@ mean m and spread t. Its recording measures x with the error that its own poster
     y | x ~ N(x, s^2)      x ~ N(m + group, t^2)
 
 m has a flat prior and is integrated out in closed form. t has Jeffreys' prior, t sqrt(sum (t^2 + s^2)^-2), on a grid.
-A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'.
+So a few units give tails as Student's: "far off" means the same in a batch of 5 as in one of 500.
+A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two
+groups alone nobody can say which is off: each is then half the difference away from the mean.
 """
 
 from __future__ import annotations
@@ -24,14 +26,16 @@ from selfcal.result import HALF_90, of_mixture
 Array = NDArray[np.float64]
 #: Units that make a population, and that make a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
-#: Points of the grid of spreads, and its reach from the spread of the estimates.
-_POINTS, _LEAST, _MOST = 160, 1e-3, 8.0
+#: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
+_POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
+#: A weight that counts for nothing, and has a logarithm.
+_NO_WEIGHT = 1e-300
 #: Probability that a sound unit is called unlike, and that a batch without groups is said to have one.
 FALSE_ALARM = 1e-3
 #: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
 _MAD, _MEDIAN = 1.4826, 1.2533
-#: Robust standard deviations beyond which an estimate is not fitted at first.
-_FIRST = 4.0
+#: Robust standard deviations beyond which an estimate is not fitted at first: of n units times 1 + _OF_FEW / n.
+_FIRST, _OF_FEW = 4.0, 10.0
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
 
@@ -97,30 +101,46 @@ class Fit:
     def log_p(self, y: Array, s: Array) -> Array:
         """ln of the probability that a unit of the population lies as far off as `y` [n], on either side."""
         sd = np.sqrt(self.t**2 + s[:, None] ** 2 + self.variance)
-        tail = math.log(2.0) + log_ndtr(-np.abs(y[:, None] - self.mean) / sd)
-        high = tail.max(axis=1)
-        mixed: Array = np.minimum(high + np.log((self.weight * np.exp(tail - high[:, None])).sum(axis=1)), 0.0)
-        return mixed
+        return _tail(self.weight, (y[:, None] - self.mean) / sd)
 
 
 def fit(y: Array, s: Array) -> Fit:
     """The population of measured `y` [n] with errors `s` [n]."""
-    variance = s**2
-    scale = math.sqrt(float(np.var(y, ddof=1)) + float(np.median(variance)))
+    t, weight, mean, variance = _on_grid(y, s, np.ones((1, y.size), np.bool_))
+    return Fit(t, weight, mean[0], variance[0])
+
+
+def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+    """Spreads [p] and their weights [p], with the mean of each side and its variance [sides, p]. Each unit is on one of
+    the `sides` [sides, n], which have one spread."""
+    errors = s**2
+    residual = y - sum(side * y[side].mean() for side in sides)
+    scale = math.sqrt(float(residual @ residual) / (y.size - len(sides)) + float(np.median(errors)))
     t = scale * np.geomspace(_LEAST, _MOST, _POINTS)
-    w = 1.0 / (t[:, None] ** 2 + variance)
-    total = w.sum(axis=1)
-    mean = (w @ y) / total
-    square = (w * (y - mean[:, None]) ** 2).sum(axis=1)
+    w = 1.0 / (t[:, None] ** 2 + errors)
+    total = w @ sides.T
+    mean = (w @ (sides * y).T) / total
+    square = (w * (y - mean @ sides) ** 2).sum(axis=1)
     prior = np.log(t) + 0.5 * np.log((w**2).sum(axis=1))
-    ln = prior + 0.5 * np.log(w).sum(axis=1) - 0.5 * np.log(total) - 0.5 * square + np.log(t)  # d ln t
+    ln = prior + 0.5 * np.log(w).sum(axis=1) - 0.5 * np.log(total).sum(axis=1) - 0.5 * square + np.log(t)  # d ln t
     weight = np.exp(ln - ln.max())
-    return Fit(t, weight / weight.sum(), mean, 1.0 / total)
+    return t, weight / weight.sum(), mean.T, 1.0 / total.T
+
+
+def _tail(weight: Array, off: Array) -> Array:
+    """ln of the two-sided probability [...] of being `off` [..., p] standard deviations away, over weighted spreads."""
+    tail = math.log(2.0) + log_ndtr(-np.abs(off)) + np.log(np.maximum(weight, _NO_WEIGHT))
+    high = tail.max(axis=-1)
+    mixed: Array = np.minimum(high + np.log(np.exp(tail - high[..., None]).sum(axis=-1)), 0.0)
+    return mixed
 
 
 @dataclass(frozen=True)
 class Apart:
-    """A group whose units all differ: `kind` (station, day, lot) and its `name`; by `offset` (of ln y, or of y)."""
+    """A group whose units all differ: `kind` (station, day, lot) and its `name`; by `offset` (of ln y, or of y).
+
+    `against`: the name of the only other group, "" for units without one; None: the others are of several groups.
+    `also`: groups of other kinds that have the same units."""
 
     kind: str
     name: str
@@ -128,6 +148,7 @@ class Apart:
     offset: float
     log_p: float
     also: tuple[str, ...] = ()
+    against: str | None = None
 
 
 @dataclass(frozen=True)
@@ -142,11 +163,13 @@ class Unlike:
 
 @dataclass(frozen=True)
 class Population:
-    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it; they are left out."""
+    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it; they are left out.
+    `offset` [n] of each unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
 
     measured: Measured
     fit: Fit
     offset: Array
+    seen_from: float
     apart: tuple[Apart, ...] = ()
     unlike: tuple[Unlike, ...] = field(default=())
 
@@ -187,22 +210,35 @@ def populations(measured: Sequence[Measured], groupings: Sequence[Grouping]) -> 
 def _population(
     one: Measured, groupings: Sequence[Grouping], of_unit: Mapping[int, int], group_limit: float
 ) -> Population:
+    limit = np.array([math.log(FALSE_ALARM / of_unit[at]) for at in one.at.tolist()])
     offset = np.zeros(one.y.size)
     apart: list[Apart] = []
     for _ in range(_ROUNDS):
-        found = _most_apart(one, offset, groupings, {(known.kind, known.name) for known in apart})
-        if found is None or found.log_p > group_limit:
+        found = _most_apart(one, offset, groupings, {(known.kind, known.name) for known in apart}, limit, group_limit)
+        if found is None:
             break
         apart.append(found)
-        offset = offset + found.offset * _members(one, groupings, found)
-    limit = np.array([math.log(FALSE_ALARM / of_unit[at]) for at in one.at.tolist()])
+        inside = _members(one, groupings, found)
+        offset = offset + found.offset * (inside - (0.0 if found.against is None else 0.5))
     centred = one.y - offset
     kept = _kept(centred, one.s, limit)
     population = fit(centred[kept], one.s[kept])
     log_p = population.log_p(centred, one.s)
     off = centred - population.middle.median
     unlike = [Unlike(int(one.at[k]), one.name, float(off[k]), float(log_p[k])) for k in np.flatnonzero(~kept).tolist()]
-    return Population(one, population, offset, tuple(apart), tuple(unlike))
+    seen_from = _seen_from(centred[kept], one.s[kept], float(np.median(limit)))
+    return Population(one, population, offset, seen_from, tuple(apart), tuple(unlike))
+
+
+def _seen_from(y: Array, s: Array, limit: float) -> float:
+    """How far off a unit is unlike, at ln probability `limit`, by all others of the population `y` [n]: the unit that
+    is odd makes them one fewer, so the unit nearest to their mean leaves."""
+    fewer = np.arange(y.size) != int(np.argmin(np.abs(y - np.median(y))))
+    others = fit(y[fewer], s[fewer])
+    error = float(np.median(s))
+    off = math.hypot(others.spread.median, error) * np.geomspace(0.5, 500.0, 400)
+    log_p = others.log_p(others.middle.median + off, np.full(off.size, error))
+    return float(np.exp(np.interp(-limit, -log_p, np.log(off))))
 
 
 def _kept(y: Array, s: Array, limit: Array) -> NDArray[np.bool_]:
@@ -210,7 +246,7 @@ def _kept(y: Array, s: Array, limit: Array) -> NDArray[np.bool_]:
 
     It begins without the units that are far off in robust standard deviations, so that a few do not hide each other."""
     middle, spread = robust(y, s)
-    kept = np.abs(y - middle) <= _FIRST * np.sqrt(spread**2 + s**2)
+    kept = np.abs(y - middle) <= _FIRST * (1.0 + _OF_FEW / y.size) * np.sqrt(spread**2 + s**2)
     for _ in range(_ROUNDS):
         back = ~kept & (fit(y[kept], s[kept]).log_p(y, s) > limit)
         if not back.any():
@@ -237,35 +273,61 @@ def _members(one: Measured, groupings: Sequence[Grouping], group: Apart) -> Arra
 
 
 def _most_apart(
-    one: Measured, offset: Array, groupings: Sequence[Grouping], known: set[tuple[str, str]]
+    one: Measured,
+    offset: Array,
+    groupings: Sequence[Grouping],
+    known: set[tuple[str, str]],
+    limit: Array,
+    group_limit: float,
 ) -> Apart | None:
-    """The group that differs most from the others, by medians: a few odd units move them little."""
+    """The group that differs most from the others, None without one beyond ln probability `group_limit`.
+
+    Medians, which a few odd units move little, choose; the exact test of the units without odd ones decides. Medians
+    see less: half the logarithm of the probability makes a candidate."""
     centred = one.y - offset
-    best: Apart | None = None
     same: dict[bytes, list[str]] = {}
+    candidates: list[tuple[float, str, str, NDArray[np.bool_], str | None]] = []
     for kind, names in groupings:
-        for name in dict.fromkeys(names[at] for at in one.at.tolist()):
+        there = dict.fromkeys(names[at] for at in one.at.tolist())
+        for name in there:
             inside = np.array([names[at] == name for at in one.at.tolist()])
             if not name or (kind, name) in known or inside.sum() < FEWEST_OF_GROUP:
                 continue
+            others = [other for other in there if other != name]
             if inside.sum() > 0.5 * inside.size or (~inside).sum() < FEWEST_OF_GROUP:
                 continue
             same.setdefault(inside.tobytes(), []).append(f"{kind} {name}")
-            _, within = robust(centred[inside], one.s[inside])
-            _, without = robust(centred[~inside], one.s[~inside])
-            spread = max(within, without)
-            difference = float(np.median(centred[inside]) - np.median(centred[~inside]))
-            variance = [
-                _MEDIAN**2 * float(np.mean(spread**2 + one.s[side] ** 2)) / int(side.sum())
-                for side in (inside, ~inside)
-            ]
-            log_p = math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
-            if best is None or log_p < best.log_p:
-                best = Apart(kind, name, one.name, difference, log_p)
-                places = inside.tobytes()
-    if best is None:
-        return None
-    return Apart(best.kind, best.name, one.name, best.offset, best.log_p, tuple(same[places][1:]))
+            against = others[0] if len(others) == 1 else None
+            candidates.append((_by_medians(centred, one.s, inside), kind, name, inside, against))
+    for log_p, kind, name, inside, against in sorted(candidates, key=lambda candidate: candidate[0]):
+        if log_p > 0.5 * group_limit:
+            break
+        difference, exact = _difference(centred, one.s, inside, limit)
+        if exact <= group_limit:
+            also = [other for other in same[inside.tobytes()] if other != f"{kind} {name}"]
+            return Apart(kind, name, one.name, difference, exact, tuple(also), against)
+    return None
+
+
+def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
+    """ln of the probability that the medians of two sides differ as they do, by robust spreads of many units."""
+    spread = max(robust(y[side], s[side])[1] for side in (inside, ~inside))
+    difference = float(np.median(y[inside]) - np.median(y[~inside]))
+    variance = [_MEDIAN**2 * float(np.mean(spread**2 + s[side] ** 2)) / int(side.sum()) for side in (inside, ~inside)]
+    return math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
+
+
+def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: Array) -> tuple[float, float]:
+    """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
+
+    Units that are odd on their own side count on neither."""
+    side_of = np.where(inside, np.median(y[inside]), np.median(y[~inside]))
+    kept = _kept(y - side_of, s, limit)
+    if min((kept & inside).sum(), (kept & ~inside).sum()) < FEWEST_OF_GROUP:
+        return 0.0, 0.0
+    _, weight, mean, variance = _on_grid(y[kept], s[kept], np.array([inside[kept], ~inside[kept]]))
+    difference, sd = mean[0] - mean[1], np.sqrt(variance.sum(axis=0))
+    return float(weight @ difference), float(_tail(weight, difference / sd))
 
 
 def sd_of(log_p: float) -> float:

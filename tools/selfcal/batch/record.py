@@ -6,18 +6,21 @@ import contextlib
 import hashlib
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from selfcal.batch.table import Unit
 from selfcal.checks import CHECK_LIMIT
 from selfcal.errors import UserError, first_line, printable
 from selfcal.output import whole
-from selfcal.spread import Job, Row
+from selfcal.spread import Job, Row, spread
 
 #: What is kept of an axis of `identify`, and of one of `diagnose`.
-IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "bias_now", "adequate", "error")
+IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "not_judged", "unfinished", "error")
 #: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
 READINGS = ("saturation", "outliers", "held_samples", "motion", "stuck")
@@ -25,6 +28,9 @@ INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_v
 FAR = 8.0
 #: Distinct readings from which on their lattice is known.
 LEAST_DISTINCT = 8
+#: Devices that have an own page at most, and letters that a page's name does not have.
+MOST_PAGES = 20
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 #: Why a recording whose workers die has no result.
 KILLED = "its worker process was killed each time, maybe for want of memory"
 
@@ -84,6 +90,40 @@ def _diagnosis(path: str, names: Sequence[str], given: Mapping[str, Any]) -> dic
         name: _of(axis, DIAGNOSED) | {"causes": sorted({one["cause"] for one in axis.get("findings", [])})}
         for name, axis in axes.items()
     }
+
+
+def own_pages(
+    folder: Path | str,
+    names: Sequence[str],
+    devices: Mapping[str, Sequence[Unit]],
+    options: Options,
+    keeper: ByContent,
+    count: int | None,
+) -> dict[str, str]:
+    """Write the page of `diagnose` of the last recording of each device, MOST_PAGES at most, into `folder`.
+
+    A page that is there of the same recording and options is not made anew. Returns where each is from the folder
+    above."""
+    place = Path(folder)
+    place.mkdir(exist_ok=True)
+    jobs = {}
+    for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
+        source = devices[name][-1].source
+        known = keeper.place((source.path, source.content)).stem[:12]
+        jobs[name] = (str(Path(source.path).absolute()), str(place / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
+    todo = [job for job in jobs.values() if not Path(job[1]).exists()]
+    spread(partial(_paged, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
+    return {name: f"{place.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
+
+
+def _paged(options: Options, job: Job) -> list[Row]:
+    """Write the page of one recording. `job`: its absolute path, the page's place."""
+    from selfcal.verbs.diagnose import diagnose
+
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(UserError, MemoryError):
+        given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
+        diagnose(job[0], report=job[1], **given)
+    return [{}]
 
 
 def _of(axis: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
@@ -147,4 +187,5 @@ class ByContent:
 
 def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
     """All that decides a record beside its recording; `model`: its content."""
-    return {"schema": "selfcal.fleet/1", **asdict(options), "model": model, "version": version}
+    kept = [*IDENTIFIED, *DIAGNOSED]
+    return {"schema": "selfcal.fleet/1", "kept": kept, **asdict(options), "model": model, "version": version}

@@ -1,17 +1,18 @@
-"""A batch as a whole: its population, the units unlike it, and the causes that a station, a day or a lot has."""
+"""A batch as a whole: its population, the units unlike it or drifting, and the causes of a station, a day or a lot."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaln
 
 from selfcal import units as unit_module
+from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
     FALSE_ALARM,
     FEWEST,
@@ -27,7 +28,8 @@ from selfcal.batch.population import (
 from selfcal.batch.table import Unit, bias_of
 from selfcal.errors import UserError
 from selfcal.laws import RATIOS
-from selfcal.model import Model, Prior
+from selfcal.model import Group, Model, Prior, Regressor
+from selfcal.regressors import coefficient_unit, offered
 from selfcal.result import HALF_90
 
 #: Nats that one unit may weigh in the choice of the batch's law: an odd one decides nothing.
@@ -38,12 +40,13 @@ OTHER_LAW = 12.0
 COMMON = 0.1
 #: Relative difference of two lattices.
 LATTICE = 0.05
-#: Of a recording beside a log-normal prior, at least: else it says nothing of the quantity.
+#: Of a recording beside a normal prior, of a quantity or of its logarithm: with less it says nothing of the quantity.
 LEAST_WEIGHT = 0.1
 #: What groups units, by the attribute of a source.
 KINDS = ("station", "day", "lot")
 #: Devices of a line at most.
 MOST_NAMED = 20
+SECONDS_A_DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Batch:
     devices: Mapping[str, Sequence[Unit]]
     populations: Sequence[Population]
     unlike: Mapping[str, Sequence[str]]
+    drifts: Sequence[Drift]
     shared: Sequence[Shared]
     left_out: Mapping[tuple[str, str], Sequence[str]]
 
@@ -85,7 +89,8 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     names = list(devices)
     groupings = [(kind, [group_of(kind, devices[name][-1]) for name in names]) for kind in KINDS]
     laws = _laws(devices)
-    found = populations(list(_measured(devices, laws, model)), groupings)
+    known = _known(devices, laws, model)
+    found = populations(list(_measured(known, names, laws, model)), groupings)
     shared = _shared(devices, groupings)
     unlike: dict[str, list[str]] = {}
     for population in found:
@@ -94,16 +99,16 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     for name, words in _marked(devices, laws, shared):
         unlike.setdefault(name, []).append(words)
     others = {key: list(one) for key, one in left_out.items()}
-    return Batch(devices, found, dict(sorted(unlike.items())), shared, others)
+    return Batch(devices, found, dict(sorted(unlike.items())), drifts_of(_series(known, names)), shared, others)
 
 
 def _in_group_units(unit: Unit, model: Model) -> Unit:
     """The recording with each axis in the unit of its group. An axis of another kind has an `error` instead."""
-    axes = {name: _converted(axis, model.group_of(name).unit) for name, axis in unit.axes.items()}
+    axes = {name: _converted(axis, model.group_of(name).unit, offered(model, name)) for name, axis in unit.axes.items()}
     return Unit(unit.source, {**unit.record, "axes": axes})
 
 
-def _converted(axis: Mapping[str, Any], to: str) -> Mapping[str, Any]:
+def _converted(axis: Mapping[str, Any], to: str, regressors: Sequence[Regressor]) -> Mapping[str, Any]:
     if "error" in axis or axis["bias_now"]["unit"] == to:
         return axis
     bias = axis["bias_now"]
@@ -117,6 +122,11 @@ def _converted(axis: Mapping[str, Any], to: str) -> Mapping[str, Any]:
         for law, of in axis["parameters"].items()
     }
     found = {**axis, "bias_now": {"mean": mean, "sd": bias["sd"] * factor, "unit": to}, "parameters": parameters}
+    unit_of = {one.name: coefficient_unit(to, one.unit) for one in regressors}
+    found["regressors"] = {
+        name: {"coefficients": {of: _scaled(e, factor, unit_of[name]) for of, e in one["coefficients"].items()}}
+        for name, one in axis.get("regressors", {}).items()
+    }
     return found | ({"lattice": axis["lattice"] * factor} if "lattice" in axis else {})
 
 
@@ -125,7 +135,10 @@ def _estimate_in(estimate: Mapping[str, Any], name: str, to: str) -> Mapping[str
     if name in RATIOS:
         return estimate
     unit = unit_module.parameter_unit(name, to)
-    factor = unit_module.factor(estimate["unit"], unit)
+    return _scaled(estimate, unit_module.factor(estimate["unit"], unit), unit)
+
+
+def _scaled(estimate: Mapping[str, Any], factor: float, unit: str) -> Mapping[str, Any]:
     numbers = {key: estimate[key] for key in ("mean", "median", "sd", "q05", "q95") if estimate.get(key) is not None}
     return {**estimate, **{key: factor * value for key, value in numbers.items()}, "unit": unit}
 
@@ -170,54 +183,113 @@ def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
     return found
 
 
-def _measured(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model: Model) -> Iterator[Measured]:
-    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
-    place = {name: k for k, name in enumerate(devices)}
+@dataclass(frozen=True)
+class Known:
+    """A quantity, or its logarithm, by one recording alone: `y` with the error `s`."""
+
+    y: float
+    s: float
+    identified: bool
+    unit: str
+    logarithm: bool
+
+
+#: The recordings of a batch: by axis, device and recording, with its date in days, what it says of each quantity.
+OfAxis = dict[str, list[tuple[float | None, dict[str, Known]]]]
+
+
+def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model: Model) -> dict[str, OfAxis]:
+    found: dict[str, OfAxis] = {}
     for axis, law in laws.items():
-        sound, group = sound_of(devices, axis), model.group_of(axis)
-        at = np.array([place[name] for name in sound], np.intp)
-        parameters = list(next(iter(sound.values()))[0]["parameters"][law])
-        for name in parameters:
-            estimates = [[one["parameters"][law][name] for one in axes] for axes in sound.values()]
-            known = [_joined(of, group.priors.get(name)) for of in estimates]
-            kept = np.array([one is not None and one[2] for one in known])
-            if kept.sum() < max(FEWEST, 0.5 * kept.size):
-                continue  # the batch does not identify it
-            there = [k for k, one in enumerate(known) if one is not None]
-            y, s = np.array([known[k][:2] for k in there], np.float64).T  # type: ignore[index]
-            unit = unit_module.parameter_unit(name, group.unit)
-            yield Measured(f"{axis}.{name}", unit, law, y, s, at[there])
-        bias = [bias_of(axes[-1]) for axes in sound.values()]
-        y = np.array([one["median"] for one in bias])
-        s = np.array([(one["q95"] - one["q05"]) / (2.0 * HALF_90) for one in bias])
-        yield Measured(f"{axis}.bias", group.unit, law, y, s, at, logarithm=False)
+        group, regressors = model.group_of(axis), offered(model, axis)
+        for device, units in devices.items():
+            for unit in units:
+                if "error" not in unit.axes.get(axis, {"error": ""}):
+                    day = None if unit.moment is None else unit.moment.timestamp() / SECONDS_A_DAY
+                    known = _of_recording(unit.axes[axis], law, group, regressors)
+                    found.setdefault(axis, {}).setdefault(device, []).append((day, known))
+    return found
 
 
-def _joined(estimates: Sequence[Mapping[str, Any]], prior: Prior | None) -> tuple[float, float, bool] | None:
-    """ln of a quantity by the recordings alone, its error, and whether one identifies it; None: none measures it.
+def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]) -> dict[str, Known]:
+    """What one recording says of each parameter of a law, each coefficient of a regressor, and the bias."""
+    parameters: Mapping[str, Mapping[str, Any]] = axis["parameters"][law]
+    found = {name: _parameter(one, group.priors.get(name)) for name, one in parameters.items()}
+    for one in regressors:
+        for column, estimate in axis.get("regressors", {}).get(one.name, {"coefficients": {}})["coefficients"].items():
+            found[column] = _coefficient(estimate, one.sd[group.name])
+    bias = bias_of(axis)
+    s = (bias["q95"] - bias["q05"]) / (2.0 * HALF_90)
+    found["bias"] = Known(bias["median"], s, identified=True, unit=group.unit, logarithm=False)
+    return {name: one for name, one in found.items() if one is not None}
 
-    A uniform `prior` leans upwards by s^2 in the logarithm. A log-normal one is one more measurement."""
-    found = []
-    for one in estimates:
-        median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
-        if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf or one["off_grid"]:
-            continue
-        s = math.log(q95 / q05) / (2.0 * HALF_90)
-        y = math.log(median)
-        if prior is not None and prior.law == "uniform":
-            y -= s**2
-        if prior is not None and prior.law == "log_normal":
-            own = s**-2 - prior.sd**-2
-            if own < LEAST_WEIGHT * prior.sd**-2:
-                continue
-            y = (y * s**-2 - math.log(prior.median) * prior.sd**-2) / own
-            s = own**-0.5
-        found.append((y, s))
-    if not found:
+
+def _parameter(one: Mapping[str, Any], prior: Prior | None) -> Known | None:
+    """ln of a parameter. A uniform `prior` leans upwards by s^2 in the logarithm. None: the recording says nothing."""
+    median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
+    if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf or one["off_grid"]:
         return None
-    weight = np.array([s**-2 for _, s in found])
-    y = float(weight @ np.array([y for y, _ in found]) / weight.sum())
-    return y, float(weight.sum() ** -0.5), any(one["identified"] for one in estimates)
+    s = math.log(q95 / q05) / (2.0 * HALF_90)
+    y = math.log(median)
+    if prior is not None and prior.law == "uniform":
+        y -= s**2
+    known = Known(y, s, one["identified"], one["unit"], logarithm=True)
+    return (
+        _without(known, math.log(prior.median), prior.sd) if prior is not None and prior.law == "log_normal" else known
+    )
+
+
+def _coefficient(one: Mapping[str, Any], sd: float) -> Known | None:
+    """A coefficient, whose prior is about 0. It is identified where the recording halves that prior's sd."""
+    mean, s = one["mean"], one["sd"]
+    if mean is None or s is None or not 0.0 < s < math.inf:
+        return None
+    return _without(Known(mean, s, s <= 0.5 * sd, one["unit"], logarithm=False), 0.0, sd)
+
+
+def _without(one: Known, mean: float, sd: float) -> Known | None:
+    """Less a normal prior, which is one more measurement. None: hardly anything is left."""
+    own = one.s**-2 - sd**-2
+    if own < LEAST_WEIGHT * sd**-2:
+        return None
+    return replace(one, y=(one.y * one.s**-2 - mean * sd**-2) / own, s=own**-0.5)
+
+
+def _measured(
+    known: Mapping[str, OfAxis], names: Sequence[str], laws: Mapping[str, str], model: Model
+) -> Iterator[Measured]:
+    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
+    place = {name: k for k, name in enumerate(names)}
+    for axis, of_axis in known.items():
+        there = dict.fromkeys(name for of in of_axis.values() for _, one in of for name in one if name != "bias")
+        for name in (*there, "bias"):
+            own = {device: [one[name] for _, one in of if name in one] for device, of in of_axis.items()}
+            own = {device: of if name != "bias" else of[-1:] for device, of in own.items() if of}
+            identified = sum(any(one.identified for one in of) for of in own.values())
+            if identified < max(FEWEST, 0.5 * len(of_axis)):
+                continue  # the batch does not identify it
+            y, s = np.array([_joined(of) for of in own.values()], np.float64).T
+            at = np.array([place[device] for device in own], np.intp)
+            one = next(iter(own.values()))[0]
+            yield Measured(f"{axis}.{name}", one.unit, laws[axis], y, s, at, one.logarithm)
+
+
+def _joined(known: Sequence[Known]) -> tuple[float, float]:
+    weight = np.array([one.s**-2 for one in known])
+    return float(weight @ np.array([one.y for one in known]) / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[Series]:
+    """Each quantity of each device that has recordings of two dates or more."""
+    for axis, of_axis in known.items():
+        for at, device in enumerate(names):
+            dated = [(day, one) for day, one in of_axis.get(device, ()) if day is not None]
+            for name in dict.fromkeys(name for _, one in dated for name in one):
+                own = [(day, one[name]) for day, one in dated if name in one]
+                days = np.array([day for day, _ in own])
+                if np.unique(days).size > 1:
+                    y, s = np.array([(one.y, one.s) for _, one in own], np.float64).T
+                    yield Series(at, f"{axis}.{name}", own[0][1].unit, own[0][1].logarithm, days, y, s)
 
 
 def _off(population: Population, off: float, log_p: float) -> str:
@@ -311,9 +383,17 @@ def document_of(batch: Batch) -> dict[str, Any]:
         for k, at in enumerate(measured.at.tolist()):
             own = population.shrunken(k)
             units.setdefault(names[at], {})[measured.name] = vars(plain(measured, own)) | {"unit": measured.unit}
+    drift: dict[str, dict[str, Any]] = {}
+    drifting: dict[str, list[str]] = {}
+    for one in batch.drifts:
+        drift.setdefault(names[one.at], {})[one.quantity] = one.entry()
+        if one.significant:
+            drifting.setdefault(names[one.at], []).append(_drift_words(one))
     return {
         "population": {one.measured.name: _entry(one, names) for one in batch.populations},
         "unlike": batch.unlike,
+        "drifting": drifting,
+        "drift": drift,
         "shared_causes": [vars(one) for one in batch.shared],
         "units": units,
     }
@@ -333,6 +413,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "of": "ln" if measured.logarithm else "value",
         "middle": vars(plain(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
+        "unlike_from": math.exp(population.seen_from) if measured.logarithm else population.seen_from,
         "left_out": [names[one.at] for one in population.unlike],
         "apart": [vars(one) for one in population.apart],
     }
@@ -346,7 +427,8 @@ def lines_of(batch: Batch) -> Iterator[str]:
         kind = "spread of ln" if measured.logarithm else "spread"
         yield (
             f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "
-            f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}]"
+            f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}], "
+            f"unlike from {seen_from_words(one)}"
         )
     for (axis, reason), names in batch.left_out.items():
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
@@ -358,11 +440,26 @@ def lines_of(batch: Batch) -> Iterator[str]:
         yield f"{shared.kind} {shared.name}: {shared_words(shared)}"
 
 
+def seen_from_words(population: Population) -> str:
+    """How far off a unit must be to be unlike."""
+    measured, off = population.measured, population.seen_from
+    return f"{math.exp(off):.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
+
+
+def _drift_words(one: Drift) -> str:
+    rate = f"{100.0 * math.expm1(one.per_day):+.3g} %" if one.logarithm else f"{one.per_day:+.3g} {one.unit}"
+    return f"{one.quantity} {rate} a day, {one.recordings} recordings in {one.days:.3g} days, {sd_of(one.log_p):.1f} sd"
+
+
 def apart_words(measured: Measured, apart: Apart) -> str:
     """How a group differs, and whose that is."""
-    how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
     also = f"; the same units are {', '.join(apart.also)}" if apart.also else ""
-    return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
+    how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
+    if apart.against is None:
+        return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
+    other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
+    said = f"the two differ, {sd_of(apart.log_p):.1f} sd: which one is off, two alone do not show"
+    return f"{measured.name} is {how} {other}, {said}{also}"
 
 
 def shared_words(shared: Shared) -> str:

@@ -1,4 +1,4 @@
-"""The table of a batch: a row for each parameter of the most probable law, axis by axis, as CSV or Parquet."""
+"""The table of a batch: a row for each parameter of the most probable law and each coefficient, as CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -84,7 +84,10 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
         known["causes"] = ";".join(unit.causes(name))
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
         known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
-        for parameter, estimate in {**axis["parameters"][law], "bias": bias_of(axis)}.items():
+        coefficients = {
+            column: one for of in axis.get("regressors", {}).values() for column, one in of["coefficients"].items()
+        }
+        for parameter, estimate in {**axis["parameters"][law], **coefficients, "bias": bias_of(axis)}.items():
             numbers = {key: estimate[key] for key in ("median", "q05", "q95")}
             yield {**head, "axis": name, "parameter": parameter, **numbers, "parameter_unit": estimate["unit"], **known}
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from selfcal.batch.files import DATE_FORM, sources_of
 from selfcal.batch.prior_file import lines_of as lines_of_priors
 from selfcal.batch.prior_file import write_model as write_priors
-from selfcal.batch.record import ByContent, Options, examined, killed, settings_of
+from selfcal.batch.record import ByContent, Options, examined, killed, own_pages, settings_of
 from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import Unit, check_table, rows_of, write_table
 from selfcal.document import check_writable, write_json
@@ -65,7 +65,8 @@ def fleet(
     changed file is done anew. The other options are those of `identify`, for each recording.
     Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
     and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
-    `report`: the page to write. `write_model`: the model file with the batch's priors (batch/prior_file.py).
+    `report`: the page to write. With `diagnose`, devices that need a look have an own page in `report`.units.
+    `write_model`: the model file with the batch's priors (batch/prior_file.py).
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     check_table(output)
@@ -85,7 +86,12 @@ def fleet(
     for one in outputs:
         if one.resolve() in given:
             raise UserError(f"{one}: is one of the recordings: give it a name of its own")
-    own_files = [*outputs, folder, *(Path(one) for one in (model, limits, units_table) if one is not None)]
+    own_files = [
+        *outputs,
+        folder,
+        Path(f"{report}.units"),
+        *(Path(one) for one in (model, limits, units_table) if one is not None),
+    ]
     named = sources_of([str(one) for one in patterns], units_table, serial_from, own_files)
     for copy, other in named.copies.items():
         note(f"{copy}: the same recording as {other}: counted once")
@@ -133,7 +139,9 @@ def fleet(
     if report is not None:
         from selfcal.batch.page import write_page
 
-        write_page(report, document, summary)
+        flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
+        pages = own_pages(f"{report}.units", flagged, summary.devices, options, keeper, workers) if diagnose else {}
+        write_page(report, document, summary, pages)
     return document
 
 
@@ -215,6 +223,7 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"{document['recordings']} recordings of {document['devices']} devices"
     yield from document["words"]
     yield from _listed("unlike the batch", document["unlike"])
+    yield from _listed("drifting", document["drifting"])
     yield from _listed("failed", document["failed"])
     yield from _listed("not judged", document["not_judged"])
 

@@ -1,0 +1,125 @@
+"""The drift of a unit from recording to recording: the slope of each quantity over the dates, and whether it is one.
+
+A unit's quantity y (ln N, ln K, ... or the bias itself) at the day d, measured with the error s of its posterior:
+
+    y = a + b d + e,    e ~ N(0, s^2 + r^2)
+
+r is how far a quantity comes out differently at each new start. All units that have three dates or more have one r:
+the one whose weighted squares of the residuals are as many as their degrees of freedom. So b over its standard
+deviation is Student's t of as many. A unit that scatters more than the others has an r of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc
+from scipy.stats import t as student
+
+from selfcal.batch.population import FALSE_ALARM, Array
+
+#: Halvings of the search for r^2.
+_HALVINGS = 40
+
+
+@dataclass(frozen=True)
+class Series:
+    """A quantity of the device at place `at` over its recordings: `days` [n], `y` [n] (ln of it if `logarithm`) and its
+    errors `s` [n]."""
+
+    at: int
+    quantity: str
+    unit: str
+    logarithm: bool
+    days: Array
+    y: Array
+    s: Array
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom beside a line."""
+        return self.y.size - 2
+
+    def line(self, square: float) -> tuple[float, float, float]:
+        """Slope, its standard deviation, and the weighted squares of the residuals, at r^2."""
+        w = 1.0 / (self.s**2 + square)
+        days = self.days - w @ self.days / w.sum()
+        y = self.y - w @ self.y / w.sum()
+        information = float(w @ days**2)
+        slope = float(w @ (days * y)) / information
+        return slope, information**-0.5, float(w @ (y - slope * days) ** 2)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a one by chance."""
+
+    at: int
+    quantity: str
+    unit: str
+    logarithm: bool
+    per_day: float
+    sd: float
+    log_p: float
+    recordings: int
+    days: float
+    significant: bool
+
+    def entry(self) -> dict[str, Any]:
+        """As the JSON has it."""
+        names = ("per_day", "sd", "log_p", "recordings", "days", "significant")
+        return {"of": "ln" if self.logarithm else "value"} | {name: getattr(self, name) for name in names}
+
+
+def drifts_of(series: Iterable[Series]) -> list[Drift]:
+    """The slope of each. FALSE_ALARM, that a unit without drift has one, is shared among its quantities."""
+    quantities: dict[str, list[Series]] = {}
+    of_unit: dict[int, int] = {}
+    for one in series:
+        quantities.setdefault(one.quantity, []).append(one)
+        of_unit[one.at] = of_unit.get(one.at, 0) + 1
+    found = []
+    for of in quantities.values():
+        alike = _alike([one for one in of if one.freedom > 0])
+        common, freedom = _square(alike), sum(one.freedom for one in alike)
+        for one in of:
+            own = one.freedom > 0 and not any(one is other for other in alike)
+            square, degrees = (_square([one]), one.freedom) if own else (common, freedom)
+            if degrees == 0:
+                continue  # two dates alone: what a new start changes is unknown
+            slope, sd, _ = one.line(square)
+            log_p = math.log(2.0) + float(student.logsf(abs(slope) / sd, degrees))
+            significant = log_p <= math.log(FALSE_ALARM / of_unit[one.at])
+            days = float(np.ptp(one.days))
+            found.append(
+                Drift(one.at, one.quantity, one.unit, one.logarithm, slope, sd, log_p, one.y.size, days, significant)
+            )
+    return found
+
+
+def _square(series: Sequence[Series]) -> float:
+    """r^2 of them all: 0 where their errors are scatter enough."""
+    freedom = sum(one.freedom for one in series)
+    low, high = 0.0, max((float(np.var(one.y)) * one.y.size for one in series), default=0.0)
+    if not freedom or sum(one.line(0.0)[2] for one in series) <= freedom:
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if sum(one.line(middle)[2] for one in series) > freedom else (low, middle)
+    return high
+
+
+def _alike(series: Sequence[Series]) -> list[Series]:
+    """Those that scatter as the others do: the others leave in rounds, each with the r of those that are left."""
+    kept = list(series)
+    while len(kept) > 1:
+        square, limit = _square(kept), FALSE_ALARM / len(kept)
+        alike = [one for one in kept if chdtrc(one.freedom, one.line(square)[2]) > limit]
+        if len(alike) == len(kept) or not alike:
+            break
+        kept = alike
+    return kept
