@@ -16,7 +16,7 @@ import yaml
 
 from selfcal.errors import UserError
 from selfcal.model import DEFAULT, Model
-from selfcal.verbs.plan import LEAST, Wish, _half_interval, plan, rows_of
+from selfcal.verbs.plan import LEAST, Wish, _half_interval, coefficient_rows, plan, rows_of
 
 from conftest import case_records, run
 
@@ -45,9 +45,10 @@ PARTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 }
 
 
-def part(folder: Path, **truth: Any) -> Path:
+def part(folder: Path, *, regressors: tuple[dict[str, Any], ...] = (), **truth: Any) -> Path:
     """A model file of this part."""
     tree = yaml.safe_load(DEFAULT.read_text())
+    tree["regressors"] = list(regressors)
     tree["simulate"]["axes"] = {"gz": truth}
     place = folder / "part.yaml"
     place.write_text(yaml.safe_dump(tree))
@@ -97,6 +98,48 @@ def test_the_information_is_that_of_known_cases() -> None:
     assert rates[0] > rates[1] > rates[2]
 
 
+THERMAL = {"name": "warm", "kind": "column", "column": "temp", "unit": "degC", "reference": 20, "sd": {"gyro": 0.02}}
+
+
+@pytest.mark.parametrize(("name", "want"), [("walk", "warm within 10 %"), ("markov", "warm within 7 deg/h/degC")])
+def test_the_planned_swing_suffices(tmp_path: Path, name: str, want: str) -> None:
+    """At the swing that is planned, of one sweep and of cycles, nine records of ten have the coefficient: the same
+    shares of other records as for a length. A swing a tenth smaller is too small where records hardly differ. The
+    closed form of the smallest variance, by the exact covariance of walk and white noise, needs less by a little."""
+    records = case_records(60, 200)
+    off = (0.1, 0.07) if records == 200 else (3.0 * math.sqrt(0.09 * 2 / records),) * 2
+    model = part(tmp_path, regressors=(THERMAL,), **PARTS[name][0])
+    document = plan(model, want=["N within 6 %", want], records=records)
+    entry, loaded = document["wishes"][1], Model.load(model)
+    samples = round(entry["duration_s"])
+    assert document["duration_s"] == entry["duration_s"] == math.ceil(document["wishes"][0]["duration_s"])
+    assert (entry["channel"], entry["unit"]) == ("temp", "degC")
+    most = 0.002 if name == "walk" else 7.0 / 3600.0
+    assert entry["most"] == pytest.approx(most)
+    swings = [one["swing"] for one in entry["cycling"]]
+    assert swings == sorted(swings, reverse=True)  # a drift hides slow changes more
+    for one in entry["cycling"]:
+
+        def share(swing: float, cycles: float = one["cycles"]) -> float:
+            rows = [coefficient_rows(loaded, "gz", samples, cycles, swing, 10**6 + 19 * k)[0] for k in range(records)]
+            return float(np.mean([row["half"] <= most for row in rows]))
+
+        reached = share(one["swing"])
+        print(f"{name}, {want}: {one}, reached by {reached:.3f}")
+        assert 0.9 - off[0] <= reached
+        if reached > 0.9 + off[1]:
+            assert share(0.9 * one["swing"]) <= 0.9 + off[1]
+    if name == "walk":
+        at = np.arange(samples)
+        truth = PARTS[name][0]
+        covariance = truth["K"] ** 2 * np.minimum.outer(at, at) + truth["N"] ** 2 * np.eye(samples)
+        for one in entry["cycling"]:
+            z = 0.5 * one["swing"] * np.cos(2.0 * math.pi * one["cycles"] * (at + 0.5) / samples)
+            design = np.stack([z, np.ones(samples)], axis=1)
+            least = np.linalg.inv(design.T @ np.linalg.solve(covariance, design) + np.diag([0.02**-2, 0.0]))[0, 0]
+            assert 0.7 < 1.6449 * math.sqrt(least) / most <= 1.0
+
+
 def test_wishes_that_are_none(tmp_path: Path) -> None:
     for text, words in (
         ("K soon", "takes 'K within 20 %', 'bias within 0.001 deg/s' or 'law decided 95 %'"),
@@ -109,7 +152,11 @@ def test_wishes_that_are_none(tmp_path: Path) -> None:
             Wish.of(text, "deg/s")
         assert words in str(caught.value)
     assert Wish.of("N within 1 deg/sqrt(h)", "deg/s").most == pytest.approx(1.0 / 60.0)
-    model = part(tmp_path, hypothesis="constant", N=0.02)
+    model = part(tmp_path, hypothesis="constant", N=0.02, regressors=(THERMAL,))
+    with pytest.raises(UserError, match=r"takes a unit as deg/s/degC, or %"):
+        plan(model, want=["warm within 2 deg/s"], records=20)
+    (alone,) = plan(model, want=["warm within 0.1 deg/s/degC"], records=20)["wishes"]
+    assert alone["duration_s"] == 3600.0 and {one["swing"] for one in alone["cycling"]} == {0.0}  # the prior's is 0.033
     with pytest.raises(UserError, match="hardly a part of"):
         plan(model, want=["K within 20 %"], records=20)
     with pytest.raises(UserError, match="no law of"):

@@ -508,7 +508,8 @@ def plan(
     want: Annotated[
         list[str],
         typer.Option(
-            metavar="WISH", help="'K within 20 %', 'bias within 0.001 deg/s', 'law decided 95 %' (repeat for more)"
+            metavar="WISH",
+            help="'K within 20 %', 'bias within 0.001 deg/s', 'law decided 95 %', 'temperature within 10 %' (repeat)",
         ),
     ],
     axis: Annotated[

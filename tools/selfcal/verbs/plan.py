@@ -4,6 +4,10 @@ An ensemble answers: parts as the model file's `simulate` entry states them, wha
 Each is recorded for longer and longer, by readings at the bank's rate, and
 identified. The length is the one at which SHARE of the records have what is
 wanted. The Fisher information of the spectrum says how that length changes with the rate.
+
+A wish of a regressor's coefficient asks for a swing of its channel in a record of that length. The channel follows a
+cosine of half a cycle (one sweep) or more. A cosine of amplitude A over n readings says n A^2 / (2 S) of the
+coefficient, with S the spectrum at its frequency: that gives the swing, and the ensemble corrects it.
 """
 
 from __future__ import annotations
@@ -11,9 +15,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,12 +26,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from selfcal import units
-from selfcal.allan import information_of
+from selfcal.allan import information_of, terms_of
 from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError, printable, short
 from selfcal.laws import PLACES, Law
-from selfcal.model import Model
+from selfcal.model import Model, Regressor
 from selfcal.plot import COLORS, check_picture, save_picture
+from selfcal.regressors import coefficient_unit, offered
 from selfcal.result import HALF_90
 from selfcal.spread import Row, record_seeds, spread
 from selfcal.studies.montecarlo import has_nodes, simulate_bank_samples
@@ -50,6 +56,8 @@ FASTER, WORTH = 10.0, 0.8
 TINY = 1e-12
 #: Readings at least of which an information is taken.
 _FEWEST = 8
+#: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
+CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _LAW = re.compile(rf"law decided {_NUMBER} ?%")
 _SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) within {_NUMBER} (\S+)")
@@ -57,8 +65,8 @@ _SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) 
 
 @dataclass(frozen=True)
 class Wish:
-    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true one. Of a parameter:
-    half its 90 % interval, over its median if `unit` is ""."""
+    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true one. Of a parameter,
+    or a regressor's coefficient: half its 90 % interval, over its median if `unit` is ""."""
 
     text: str
     parameter: str
@@ -66,15 +74,16 @@ class Wish:
     unit: str = ""
 
     @staticmethod
-    def of(text: str, like: str) -> Wish:
-        """A text such as `K within 20 %`, of an axis that reads in `like`. Raises UserError."""
+    def of(text: str, like: str, regressors: Mapping[str, tuple[str, float]] = MappingProxyType({})) -> Wish:
+        """A text such as `K within 20 %`, of an axis that reads in `like`. `regressors`: unit and size of the
+        coefficients that may be wanted. Raises UserError."""
         plain = " ".join(text.split())
         if match := _LAW.fullmatch(plain):
             if not 50.0 <= float(match[1]) < 100.0:
                 raise UserError(f"--want '{short(text)}': a law is decided by 50 % or more, and by less than 100 %")
             return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
         match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
-        if match is None or match[1] not in ("bias", *PLACES):
+        if match is None or match[1] not in ("bias", *PLACES, *regressors):
             raise UserError(
                 f"--want '{short(text)}': takes 'K within 20 %', 'bias within 0.001 {like}' or 'law decided 95 %'"
             )
@@ -83,8 +92,10 @@ class Wish:
         if match.re is _SHARE:
             if match[1] == "bias":
                 raise UserError(f"--want '{short(text)}': a bias may be 0: state a unit, as 'bias within 0.001 {like}'")
-            return Wish(plain, match[1], float(match[2]) / 100.0)
-        unit, own = units.plain(match[3]), units.parameter_unit(match[1], like)
+            unit, size = regressors.get(match[1], ("", 1.0))
+            return Wish(plain, match[1], float(match[2]) / 100.0 * size, unit)
+        unit = units.plain(match[3])
+        own = regressors[match[1]][0] if match[1] in regressors else units.parameter_unit(match[1], like)
         if not units.known(unit) or unit == units.LSB or not units.same_kind(unit, own):
             raise UserError(f"--want '{short(text)}': takes a unit as {own}, or %")
         return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
@@ -105,6 +116,8 @@ def plan(
 
     `axis`: the first that the `simulate` entry states, else the first of all. A wish of a parameter is of the records
     whose law has it. `plot`: a picture of what is reached over the length.
+    A wish of a coefficient, of a regressor of kind `column`, has `cycling`: the swing of its channel that it takes over
+    the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its prior's sd.
     Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
@@ -112,20 +125,23 @@ def plan(
     if plot is not None:
         check_picture(plot)
     loaded = Model.load(model)
-    if loaded.regressors or loaded.half_life_s:
-        raise UserError(f"{loaded.path}: plan takes no regressors and no half_life_s: leave them out of the model")
+    if loaded.half_life_s:
+        raise UserError(f"{loaded.path}: plan takes no half_life_s: leave it out of the model")
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
     group = loaded.group_of(name)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
-    wishes = [Wish.of(text, group.unit) for text in want]
-    there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias"}
+    columns = {one.name: one for one in offered(loaded, name) if _as_is(one)}
+    sizes = {one.name: (coefficient_unit(group.unit, one.unit), one.sd[group.name]) for one in columns.values()}
+    wishes = [Wish.of(text, group.unit, sizes) for text in want]
+    there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias", *columns}
     for wish in wishes:
         if wish.parameter not in there:
             raise UserError(f"--want '{wish.text}': no law of {loaded.path} has {wish.parameter}")
     seeds = record_seeds(records, seed)
-    ensemble = _Ensemble(loaded, name, wishes, seeds, scheduler)
-    lengths = [ensemble.length(k) for k in range(len(wishes))]
+    plain = replace(loaded, regressors=())
+    ensemble = _Ensemble(plain, name, wishes, seeds, scheduler)
+    lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
     truth = ensemble.typical
     entries = []
     for k, wish in enumerate(wishes):
@@ -135,10 +151,16 @@ def plan(
                 "wish": wish.text,
                 "duration_s": None if length is None else length / loaded.bank_rate_hz,
                 "most": wish.most,
-                "curve": ensemble.curve(k),
+                "curve": [] if wish.parameter in columns else ensemble.curve(k),
             }
         )
-    known = [one for one in lengths if one is not None]
+    samples = max((one for one in lengths if one is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
+    for entry, wish in zip(entries, wishes, strict=True):
+        if wish.parameter in columns:
+            entry["duration_s"] = samples / loaded.bank_rate_hz
+            entry["channel"], entry["unit"] = columns[wish.parameter].column, columns[wish.parameter].unit
+            entry["cycling"] = _cycling(loaded, name, wish, columns[wish.parameter], samples, seeds, scheduler)
+    all_known = all(one["duration_s"] is not None for one in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(loaded.path),
@@ -146,7 +168,7 @@ def plan(
         "records": records,
         "share": SHARE,
         "rate_hz": loaded.bank_rate_hz,
-        "duration_s": max(known) / loaded.bank_rate_hz if len(known) == len(lengths) else None,
+        "duration_s": samples / loaded.bank_rate_hz if all_known else None,
         "wishes": entries,
         "rates": _rates(loaded, wishes, lengths, truth),
     }
@@ -155,6 +177,11 @@ def plan(
     if plot is not None:
         _picture(document, plot)
     return document
+
+
+def _as_is(one: Regressor) -> bool:
+    """Whether its column is its channel's value."""
+    return one.kind == "column" and one.form == "static" and one.input == "value" and math.isnan(one.window_s)
 
 
 class _Ensemble:
@@ -226,10 +253,49 @@ class _Ensemble:
         return found
 
 
-def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
-    """One record of the part: its law, truth, and the metric of each wish."""
+def _cycling(
+    model: Model, axis: str, wish: Wish, regressor: Regressor, samples: int, seeds: Sequence[int], scheduler: str | None
+) -> list[dict[str, float]]:
+    """The swing of the regressor's channel, from its lowest to its highest value, that SHARE of the records need."""
+    bare, found = replace(model, regressors=()), []
+    parts = [part_of(bare, axis, seed) for seed in seeds]
+    needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
+    for cycles in CYCLES:
+        omega = np.array([2.0 * math.pi * cycles / samples])
+        power = [
+            float(terms_of(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0]) for law, truth in parts
+        ]
+        swing = math.sqrt(8.0 * float(np.quantile(power, SHARE)) * max(needed, 0.0) / samples)
+        if swing > 0.0:
+            rows = spread(
+                partial(coefficient_rows, replace(model, regressors=(regressor,)), axis, samples, cycles, swing),
+                seeds,
+                settings={},
+                scheduler=scheduler,
+            )
+            # The information of a swing is as its square: each record's own swing by the one that it had.
+            own = [(HALF_90 / row["half"]) ** 2 - regressor.sd[model.group_of(axis).name] ** -2 for row in rows]
+            swing *= math.sqrt(needed / float(np.quantile(own, 1.0 - SHARE)))
+        found.append({"cycles": cycles, "period_s": samples / model.bank_rate_hz / cycles, "swing": swing})
+    return found
+
+
+def coefficient_rows(model: Model, axis: str, samples: int, cycles: float, swing: float, seed: int) -> list[Row]:
+    """Half the 90 % interval of the coefficient of the model's only regressor, whose channel follows a cosine."""
     from selfcal.engines.library import Bank
 
+    (regressor,), group = model.regressors, model.group_of(axis)
+    law, truth = part_of(replace(model, regressors=()), axis, seed)
+    y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
+    off = 0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples)
+    bank = Bank(make_tables(model, model.bank_rate_hz, (axis,)))
+    column = (regressor.reference + off).astype(np.float32)[:, None]
+    bank.push((y + regressor.sd[group.name] * off)[:, None], None, column)
+    return [{"half": HALF_90 * bank.report(0, 1).coefficients[law][0][1]}]
+
+
+def part_of(model: Model, axis: str, seed: int) -> tuple[str, dict[str, float]]:
+    """Law and truth of a part as the model's `simulate` entry states it, within what the grid of nodes has."""
     tables = make_tables(model, model.bank_rate_hz, (axis,))
     for again in range(1000):
         truth = dict(truth_of(model, seed + 7_000_003 * again)[axis])
@@ -237,11 +303,17 @@ def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed:
         if law not in model.laws:
             raise UserError(f"{model.path}: simulate.axes.{axis}: '{law}' is none of the model's hypotheses")
         if has_nodes(model.laws[law], truth, tables):
-            break
-    else:
-        raise UserError(f"{model.path}: the grid has no node for the parts that it draws: more nodes, closer priors")
+            return law, truth
+    raise UserError(f"{model.path}: the grid has no node for the parts that it draws: more nodes, closer priors")
+
+
+def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
+    """One record of the part: its law, truth, and the metric of each wish."""
+    from selfcal.engines.library import Bank
+
+    law, truth = part_of(model, axis, seed)
     y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
-    bank = Bank(tables)
+    bank = Bank(make_tables(model, model.bank_rate_hz, (axis,)))
     bank.push(y[:, None])
     result = bank.report(0)
     metrics = []
@@ -313,7 +385,7 @@ def _picture(document: Mapping[str, Any], path: Path | str) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot
 
-    wishes = document["wishes"]
+    wishes = [wish for wish in document["wishes"] if wish["curve"]]
     figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
         hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
@@ -342,12 +414,22 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
+def _swings(wish: Mapping[str, Any]) -> str:
+    """By how much to change the channel: once, or to and fro."""
+    once, _, often = wish["cycling"]
+    if once["swing"] == 0.0:
+        return f"the prior has it: {wish['channel']} may stay as it is"
+    said = f"in {duration_words(wish['duration_s'])} sweep {wish['channel']} once by {once['swing']:.2g} {wish['unit']}"
+    every = duration_words(often["period_s"])
+    return f"{said}, or cycle it {often['cycles']:g} times by {often['swing']:.2g} {wish['unit']}, {every} each"
+
+
 def _lines(document: Mapping[str, Any]) -> list[str]:
     lines = [f"{document['axis']}: {document['records']} simulated parts, means at {document['rate_hz']:g} Hz"]
     for wish in document["wishes"]:
         there = wish["duration_s"]
         said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
-        lines.append(f"{wish['wish']}: {said}")
+        lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
         for one in document["rates"]:
             times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
             factor = one["rate_hz"] / document["rate_hz"]
