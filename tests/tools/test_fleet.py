@@ -449,6 +449,21 @@ def test_an_axis_of_another_kind_is_left_out_with_a_line() -> None:
     assert units["gx.N"] - units["gy.N"] == 1 == units["gx.bias"] - units["gy.bias"]
 
 
+def test_a_quantity_that_few_units_identify_is_a_line() -> None:
+    """No unit is judged by it, in whichever axis: the lines and the page state that, and how many identify it."""
+    batch = synthetic(10, 6)
+    for k, one in enumerate(batch):
+        if one.error is None and k > 2:
+            estimates = one.record["axes"]["gz"]["parameters"]["random_walk"]
+            estimates["N"] = {**estimates["N"], "identified": False}
+    summary = summed_up(batch, Model.load())
+    document = document_of(summary)
+    assert document["unidentified"] == {"gz.N": {"identified": 3, "units": 9}}
+    assert "gz.N" not in document["population"] and "gz.K" in document["population"]
+    (line,) = [line for line in lines_of(summary) if line.startswith("no population of gz.N: 3 of 9 units identify it")]
+    assert line in page({**_document(batch, None, []), **document}, summary, {})
+
+
 def test_the_page_stays_small(tmp_path: Path) -> None:
     """Of 10 000 units it has less than 1 MB, no script, no address, and the odd units."""
     batch = synthetic(case_records(2000, 10000))

@@ -316,7 +316,7 @@ def batch_of_files(
                 y = np.clip(y, -np.inf, np.quantile(y, 0.9))
             if kind == "stuck":
                 y[500:2000] = y[500]
-            columns[axis] = ("deg/s" if axis.startswith("g") else "m/s^2", y)
+            columns[axis] = ("deg/s", y) if axis.startswith("g") else ("m/s^2", 0.1 * y)  # within the priors
         save(folder / f"u{k:04}.npz", columns, 1.0)
 
 

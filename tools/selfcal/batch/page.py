@@ -14,7 +14,7 @@ import numpy as np
 
 from selfcal import units as unit_module
 from selfcal.batch.population import Array, Population
-from selfcal.batch.summary import Batch, apart_words, plain, seen_from_words, shared_words
+from selfcal.batch.summary import Batch, apart_words, plain, seen_from_words, shared_words, unidentified_lines
 from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, draw, number, scrolled
 from selfcal.diagnosis.page import frame
 from selfcal.errors import printable
@@ -137,6 +137,7 @@ def _population(batch: Batch) -> Iterator[str]:
         yield scrolled("Population", caption, f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>")
     else:
         yield "<p>Fewer than five units have a result: there is no population.</p>"
+    yield from (f"<p>{_text(line)}</p>" for line in list(unidentified_lines(batch))[:MOST_LINES])
     yield "</section>"
 
 

@@ -63,7 +63,9 @@ class Shared:
 
 @dataclass(frozen=True)
 class Batch:
-    """The devices, each with its recordings in the order of their dates, and what they come to."""
+    """The devices, each with its recordings in the order of their dates, and what they come to.
+
+    `unidentified`: quantities without a population, as too few units identify them: how many do, of how many."""
 
     devices: Mapping[str, Sequence[Unit]]
     populations: Sequence[Population]
@@ -71,6 +73,7 @@ class Batch:
     drifts: Sequence[Drift]
     shared: Sequence[Shared]
     left_out: Mapping[tuple[str, str], Sequence[str]]
+    unidentified: Mapping[str, tuple[int, int]]
 
 
 def summed_up(units: Sequence[Unit], model: Model) -> Batch:
@@ -90,7 +93,8 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     groupings = [(kind, [group_of(kind, devices[name][-1]) for name in names]) for kind in KINDS]
     laws = _laws(devices)
     known = _known(devices, laws, model)
-    found = populations(list(_measured(known, names, laws, model)), groupings)
+    unidentified: dict[str, tuple[int, int]] = {}
+    found = populations(list(_measured(known, names, laws, unidentified)), groupings)
     shared = _shared(devices, groupings)
     unlike: dict[str, list[str]] = {}
     for population in found:
@@ -99,7 +103,8 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     for name, words in _marked(devices, laws, shared):
         unlike.setdefault(name, []).append(words)
     others = {key: list(one) for key, one in left_out.items()}
-    return Batch(devices, found, dict(sorted(unlike.items())), drifts_of(_series(known, names)), shared, others)
+    drifts = drifts_of(_series(known, names))
+    return Batch(devices, found, dict(sorted(unlike.items())), drifts, shared, others, unidentified)
 
 
 def _in_group_units(unit: Unit, model: Model) -> Unit:
@@ -256,9 +261,11 @@ def _without(one: Known, mean: float, sd: float) -> Known | None:
 
 
 def _measured(
-    known: Mapping[str, OfAxis], names: Sequence[str], laws: Mapping[str, str], model: Model
+    known: Mapping[str, OfAxis], names: Sequence[str], laws: Mapping[str, str], unidentified: dict[str, tuple[int, int]]
 ) -> Iterator[Measured]:
-    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts."""
+    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts.
+
+    A quantity that too few units identify goes to `unidentified`."""
     place = {name: k for k, name in enumerate(names)}
     for axis, of_axis in known.items():
         there = dict.fromkeys(name for of in of_axis.values() for _, one in of for name in one if name != "bias")
@@ -267,7 +274,8 @@ def _measured(
             own = {device: of if name != "bias" else of[-1:] for device, of in own.items() if of}
             identified = sum(any(one.identified for one in of) for of in own.values())
             if identified < max(FEWEST, 0.5 * len(of_axis)):
-                continue  # the batch does not identify it
+                unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= FEWEST else {}
+                continue
             y, s = np.array([_joined(of) for of in own.values()], np.float64).T
             at = np.array([place[device] for device in own], np.intp)
             one = next(iter(own.values()))[0]
@@ -394,6 +402,7 @@ def document_of(batch: Batch) -> dict[str, Any]:
         "unlike": batch.unlike,
         "drifting": drifting,
         "drift": drift,
+        "unidentified": {name: {"identified": n, "units": of} for name, (n, of) in batch.unidentified.items()},
         "shared_causes": [vars(one) for one in batch.shared],
         "units": units,
     }
@@ -420,7 +429,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
 
 
 def lines_of(batch: Batch) -> Iterator[str]:
-    """A line for each population, each axis left out, each group that is apart and each shared cause."""
+    """A line for each population, each quantity without one, axis left out, group that is apart and shared cause."""
     for one in batch.populations:
         measured = one.measured
         middle, spread = plain(measured, one.fit.middle), one.fit.spread
@@ -430,6 +439,7 @@ def lines_of(batch: Batch) -> Iterator[str]:
             f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}], "
             f"unlike from {seen_from_words(one)}"
         )
+    yield from unidentified_lines(batch)
     for (axis, reason), names in batch.left_out.items():
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         yield f"left out of the population: {axis} of {', '.join(names[:MOST_NAMED])}{more}: {reason}"
@@ -438,6 +448,15 @@ def lines_of(batch: Batch) -> Iterator[str]:
             yield f"{apart.kind} {apart.name}: {apart_words(one.measured, apart)}"
     for shared in batch.shared:
         yield f"{shared.kind} {shared.name}: {shared_words(shared)}"
+
+
+def unidentified_lines(batch: Batch) -> Iterator[str]:
+    """A line for each quantity by which no unit is judged."""
+    for name, (identified, units) in batch.unidentified.items():
+        yield (
+            f"no population of {name}: {identified} of {units} units identify it: "
+            "record longer, or give --model a file with wider priors"
+        )
 
 
 def seen_from_words(population: Population) -> str:
