@@ -37,10 +37,10 @@ from selfcal.limits import (
 )
 from selfcal.loaders import WRITTEN, check_library, format_of
 from selfcal.loaders.child import tables_of
-from selfcal.loaders.headings import Meaning, Sensor, sensors_of, sides_of, split
+from selfcal.loaders.headings import Meaning, Sensor, number_of, sensors_of, sides_of, split
 from selfcal.loaders.sources import Part, chosen
 from selfcal.loaders.table import Hints, Member, Table, parse_meta
-from selfcal.loaders.text_table import TextTable, is_clock, is_date
+from selfcal.loaders.text_table import TextTable, is_clock, is_date, is_row
 from selfcal.loaders.texts import Text, texts_in
 from selfcal.model import SENSORS
 from selfcal.output import together, whole
@@ -59,6 +59,9 @@ _LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
 _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
 _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
 
+
+#: Columns without a unit that begin with a whole number, from which on they may be counts.
+_COUNTS_FROM = 3
 
 #: Size of one LSB, with its unit unless the column's usual one is meant.
 Scale = tuple[float, str | None]
@@ -448,8 +451,9 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) 
         notes += one.notes
         clocks: dict[int, Clock] = {}
         for name, column in one.columns.items():
-            if name in columns and len(files) == 1 and name not in header.sensors:
-                continue  # each sensor's own temperature
+            side = name in dict(SIDE_CHANNELS.values())
+            if name in columns and name not in header.sensors and (len(files) == 1 or not side):
+                continue  # each sensor's own temperature, or a column of no meaning here
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")
             own = one.clock_of(name)
@@ -631,11 +635,14 @@ class _Header:
         #: Columns of a table that lack a unit, or the size of a count: heading, name here, and the usual unit.
         self.without_unit: list[tuple[str, str, str]] = []
         self.without_size: list[tuple[str, str, str]] = []
+        #: Those without a unit that begin with a whole number.
+        self.whole: set[str] = set()
 
     def of_part(self, several: bool) -> _Header:
         """The same for one of the file's parts."""
         one = copy(self)
         one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
+        one.whole = set()
         return one
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
@@ -650,13 +657,18 @@ class _Header:
 
         return knows
 
-    def sensors_of(self, keys: Sequence[str], file: str = "") -> list[Sensor]:
-        """The sensors of a table with these headings."""
+    def sensors_of(self, keys: Sequence[str], file: str = "", before: Sequence[str] | None = None) -> list[Sensor]:
+        """The sensors of a table with these headings, after the lines `before` of a text."""
         taken = {}
         for name, wanted in self.columns.items():
             for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]:
                 taken[key] = name
-        return sensors_of(file or self.path.name, keys, self.sensors, taken)
+        found = []
+        for sensor in sensors_of(file or self.path.name, keys, self.sensors, taken, before):
+            meant = {key: one for key, one in sensor.meant.items() if not one.optional or self._asks(key, one.name)}
+            if any(one.name in self.sensors for one in meant.values()) or len(meant) == len(sensor.meant):
+                found.append(replace(sensor, meant=meant))
+        return found
 
     def fields(
         self,
@@ -680,6 +692,8 @@ class _Header:
         found: list[_Field] = []
         for place, key in enumerate(keys):
             name, unit = split(key)
+            if unit is not None and unit.isdecimal():
+                unit = None  # a place in an array
             size = 1.0
             if key in renamed:
                 name = renamed[key]
@@ -688,6 +702,10 @@ class _Header:
             entry = described.get(split(key)[0], {}) if unit is None else {}
             cell = first[place] if place < len(first) else ""
             dates = is_date(cell)
+            if name in self.sensors and cell.lstrip("-").isdecimal():
+                self.whole.add(key)
+            if name == "t" and unit is None and self._of(self.stated, key, name) is None:
+                unit = self._since_1970(cell)
             if name == "t" and not self.no_time and not dates and is_clock(cell):
                 raise UserError(
                     f"{self.path}: {where}column 't' begins with '{short(cell)}': write dates as "
@@ -709,11 +727,21 @@ class _Header:
         if not self.several:
             self.check_options(names, where)
         if not any(name in self.sensors for name in names):
-            raise UserError(
-                f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}';"
-                " name yours with --column gx=NAME --unit gx=deg/s"
-            )
+            none = f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}'; "
+            if is_row(",".join(keys)):
+                headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in _LSB_UNITS.items())])
+                raise UserError(f"{none}put a line of headings before it, such as {headings}, in the columns' order")
+            raise UserError(f"{none}name yours with --column gx=NAME --unit gx=deg/s")
         return fields
+
+    def _since_1970(self, cell: str) -> str | None:
+        """The unit of a time of our days, since 1970; None for another. In whole seconds a recording has no stamps."""
+        for unit, digits in (("ns", 19), ("us", 16), ("ms", 13), ("s", 10)):
+            whole, point, _ = cell.partition(".")
+            if whole.isdecimal() and len(whole) == digits and whole < "21" and (unit != "s" or point):
+                self.notes.append(f"column 't' has no unit: taken as {unit} since 1970")
+                return unit
+        return None
 
     def check_options(self, names: Sequence[str], where: str = "") -> None:
         """Raise UserError for an option about a column that is not there."""
@@ -746,6 +774,10 @@ class _Header:
                 return options[given]
         return None
 
+    def _asks(self, key: str, name: str) -> bool:
+        """Whether the user states a unit or a size of a column."""
+        return self._of(self.stated, key, name) is not None or self._of(self.scale, key, name) is not None
+
     def _own_names(self, key: str) -> list[str]:
         """A heading, without its unit, and the matrix that it is a column of; none that means a column here."""
         name = split(key)[0]
@@ -758,9 +790,18 @@ class _Header:
         if len(self.without_unit) == 1 and self.without_unit[0][0] == self.without_unit[0][1]:
             name, _, unit = self.without_unit[0]
             return f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}"
-        typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(self.without_unit)]
-        typed += [f"--scale {name}=SIZE[{unit}]" for name, unit in self._by_own_names(self.without_size)]
-        of = [(self.without_unit, "no unit"), (self.without_size, "counts of a size that the log does not state")]
+        counts = [one for one in self.without_unit if one[0] in self.whole]
+        if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # one alone may be a whole number by chance
+            counts = []
+        stated = [one for one in self.without_unit if one not in counts]
+        typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(stated)]
+        typed += [f"--unit {name}={units.LSB}" for name, _ in self._by_own_names(counts)]
+        typed += [f"--scale {name}=SIZE[{unit}]" for name, unit in self._by_own_names([*counts, *self.without_size])]
+        of = [
+            (stated, "no unit"),
+            (counts, "no unit, and whole numbers, which may be counts"),
+            (self.without_size, "counts of a size that the log does not state"),
+        ]
         lacks = "; ".join(f"{what}: {', '.join(short(key) for key, _, _ in keys)}" for keys, what in of if keys)
         return f"columns with {lacks}; give {' '.join(typed)}, or the units that they are in"
 
@@ -806,7 +847,9 @@ class _Header:
             return []
         if not known:
             known_units = f"(known: {', '.join(units.RECORDING_UNITS)})"
-            raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}")
+            example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
+            typed = f"--unit {shlex.quote(f'{name}={example}')}"
+            raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}: give {typed}")
         size = 1.0
         if unit == units.LSB:
             given = self.scale.get("") if scaled is None else scaled
@@ -850,22 +893,25 @@ def _text_parts(path: Path, rate: float | None, header: _Header, skip_bad: bool)
             if text.optional:
                 continue
             raise
-        sensors = header.sensors_of(table.keys, text.name)
+        sensors = header.sensors_of(table.keys, text.name, table.before)
         if not sensors and text.optional:
             continue
-        for sensor in sensors or [Sensor("", {})]:
+        key = number_of(table.keys)
+        numbered = [(key, cell) for cell in table.numbers_in(key)] if key is not None else []
+        for sensor, only in [(one, only) for one in sensors or [Sensor("", {})] for only in numbered or [None]]:
             others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
-            one = _Text(text, rate, header, skip_bad, sensor, others)
+            one = _Text(text, rate, header, skip_bad, sensor, others, only)
             names = {meaning.name for meaning in sensor.meant.values()}
             names |= {split(key)[0] for key in table.keys if key not in sensor.meant}
             axes = frozenset(names & set(header.sensors))
-            found.append(Part(_named(text.source, sensor.source), axes, False, one.span, one.read))
+            own = "" if only is None else ":".join(only)
+            found.append(Part(_named(text.source, sensor.source, own), axes, False, one.span, one.read))
     return found
 
 
 @dataclass(frozen=True)
 class _Text:
-    """A sensor in a text. `others`: headings of other sensors."""
+    """A sensor in a text. `others`: headings of other sensors. `only`: a column, and the cell of this sensor's rows."""
 
     text: Text
     rate: float | None
@@ -873,6 +919,7 @@ class _Text:
     skip_bad: bool
     sensor: Sensor
     others: Collection[str]
+    only: tuple[str, str] | None = None
 
     def span(self) -> tuple[int, float]:
         """Number of readings, and the seconds of them."""
@@ -887,6 +934,8 @@ class _Text:
         header, path = self.header.of_part(several), self.text.path
         with ExitStack() as files:
             table = TextTable(path, files, header.knows_in(self.text), skip_bad=self.skip_bad, opened=self.text.open)
+            if self.only is not None:
+                table.only(*self.only)
             meta = dict(_meta_beside(path))
             keys = [key for key in table.keys if key not in self.others]
             first = [cell for key, cell in zip(table.keys, table.first, strict=False) if key not in self.others]
@@ -909,6 +958,12 @@ class _Text:
             meta["rate_hz"] = stated
 
         def fail(row: int, field: int | None, what: str) -> NoReturn:
+            if row in table.restarts:
+                at = table.line_of(row)
+                what += (
+                    f", where the header is repeated: the logger began anew; cut the log there, "
+                    f"head -n {at - 2} {shlex.quote(path.name)} > first.csv"
+                )
             table.fail(row, None if field is None else fields[field].name, what)
 
         return _checked(path, self.rate, meta, fields, columns, fail, header, table.origin_s, table.places)

@@ -51,6 +51,8 @@ _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "arcsec": (_dimension(angle=1), math.pi / 648_000.0),
     "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
     "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
+    "mdeg": (_dimension(angle=1), math.pi / 180.0 * 1e-3),
+    "dph": (_dimension(angle=1, time=-1), math.pi / 648_000.0),
     "m": (_dimension(length=1), 1.0),
     "mm": (_dimension(length=1), 1e-3),
     "s": (_TIME, 1.0),
@@ -104,9 +106,28 @@ _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d
 #: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
 _LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
 #: Signs that a data sheet has, as this module writes them.
-_SIGNS = str.maketrans({"°": "deg", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "·": " "})
+_SIGNS = str.maketrans(
+    {"°": "deg", "º": "deg", "℃": "degC", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "·": " "}
+)
 #: A power without its sign, `s-1`, `s2`, and factors with blanks or stars between them.
 _POWER, _FACTORS = re.compile(r"(?<=[a-zA-Z])(-?\d)(?![\w.])", re.ASCII), re.compile(r"\s*[\s*]\s*")
+
+#: Other spellings of an atom, in small letters: whole words of a unit. And brackets around a power, `m/(s^2)`.
+_WORDS = {
+    **dict.fromkeys(("degs", "degree", "degrees", "deg"), "deg"),
+    **dict.fromkeys(("rads", "radian", "radians", "rad"), "rad"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds", "s"), "s"),
+    **dict.fromkeys(("msec", "msecs", "millisecond", "milliseconds", "millis", "ms"), "ms"),
+    **dict.fromkeys(("usec", "usecs", "microsecond", "microseconds", "micros", "us"), "us"),
+    **dict.fromkeys(("nsec", "nsecs", "nanosecond", "nanoseconds", "ns"), "ns"),
+    **dict.fromkeys(("hr", "hrs", "hour", "hours", "h"), "h"),
+    **dict.fromkeys(("g", "gs", "gee", "gees"), "g"),
+    **dict.fromkeys(("c", "celsius", "degc"), "degC"),
+    **dict.fromkeys(("k", "kelvin"), "K"),
+    **dict.fromkeys(("counts", "count", "lsb", "lsbs", "raw", "digit", "digits"), LSB),
+    **{name: name for name in ("dps", "mdps", "mdeg", "dph", "mrad", "m", "mm", "mg", "ug")},
+}
+_WORD, _BRACKETS = re.compile(r"(?<!\w)(?:sqrt(?=\()|[a-zA-Z]+(?=-?\d*(?!\w)))"), re.compile(r"/\s*\(([\w^]+)\)")
 
 #: A root as print has it, and a number with its unit, with or without a blank between them.
 _ROOT = re.compile(r"√\(?([a-zA-Z]+)\)?")
@@ -127,7 +148,10 @@ def plain(name: str) -> str:
     spelled = _ROOT.sub(r"sqrt(\1)", name.strip().translate(_SIGNS))
     if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
         return spelled
-    product = _FACTORS.sub("*", _POWER.sub(r"^\1", spelled.replace("^", "")))
+    usual = _WORD.sub(lambda word: _WORDS.get(word[0].lower(), word[0]), _BRACKETS.sub(r"/\1", spelled))
+    if usual == LSB:
+        return usual
+    product = _FACTORS.sub("*", _POWER.sub(r"^\1", usual.replace("^", "").replace(".", " ")))
     try:
         meant = parse(product)
     except UserError:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from selfcal.recording import Scale
 
 #: Text, each with .gz too.
-TEXT = (".csv", ".tsv", ".txt", ".log")
+TEXT = (".csv", ".tsv", ".txt", ".log", ".dat", ".lvm")
 #: Texts of a phone's app together.
 ZIP = ".zip"
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import wrap_file
 
+from selfcal import units
 from selfcal.errors import UserError, note, short
 from selfcal.limits import (
     BLOCK_BYTES,
@@ -33,6 +34,7 @@ from selfcal.limits import (
     MOST_NUMBERS,
     reading,
 )
+from selfcal.loaders.headings import RECEIVED
 
 #: Bytes of a file from which on reading it shows its progress.
 _SLOW_BYTES = 1 << 26
@@ -40,18 +42,34 @@ _SLOW_BYTES = 1 << 26
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
 #: What begins a comment.
 _COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
+#: The last heading of LabVIEW's texts, in small letters.
+_COMMENT_OF_ROWS = "comment"
 #: Nothing but numbers and what separates them.
 _ROW = re.compile(r"[-+.,;\t \"eE\d]*\d[-+.,;\t \"eE\d]*", re.ASCII)
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
+#: A number and its unit, in one cell.
+_WITH_UNIT = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)? ([^\W\d_][\w/^]{0,20})\s*", re.ASCII)
+_QUOTED = ' "'
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 #: A cell that holds no sample.
-_MISSING = re.compile(r"(nan?|n/a|null|none)?", re.ASCII | re.IGNORECASE)
+_MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
+#: A time of day with parts of a second; a date of any form before it, and a zone after it, say nothing more.
+_OF_DAY = re.compile(
+    r"(?:\d{1,4}[./-]\d{1,2}[./-]\d{1,4}[T ,_]+)?(\d{1,2}):(\d\d):(\d\d(?:[.,:]\d{1,9})?)(?: ?([AaPp])[Mm])?"
+    r"(?: ?(?:Z|UTC|[-+]\d\d:?\d\d))?",
+    re.ASCII,
+)
+_DAY_S = 86400.0
+#: What a serial monitor puts before a line.
+_MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
 _NO_TEXT = re.compile("[\0\udc80-\udcff]")
+#: The signs of units, and blanks, in the alphabets of one byte that Excel writes in Europe.
+_SINGLE = {0xDC00 + code: chr(code) for code in b"\xa0\xb0\xb2\xb3\xb5\xb7\xb9\xba"}
 #: Texts in UTF-16, by the mark that they begin with.
 _WIDE = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 #: Lines that may be skipped at least, and their share at most, before a file is no recording.
@@ -59,7 +77,10 @@ _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
 
 #: A sampling rate in a comment, as Xsens writes it.
-_RATE = re.compile(r"(?:sampl\w+|update|output) ?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
+_RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
+
+#: Rows in which the numbers of several sensors are looked for, and so many sensors at most.
+_LOOKED_AT, _MOST_NUMBERED = 1000, 16
 
 #: What opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
@@ -88,7 +109,11 @@ class TextTable:
         `skip_bad`: leave out lines that are no row, and count them as `skipped`. `opened` opens a text in an archive.
         Raises UserError."""
         self.path = path
-        self._before: list[str] = []
+        #: The lines before the header.
+        self.before: list[str] = []
+        self._heads: set[str] = set()
+        #: Lines after the header, from 0, before which it is repeated.
+        self.restarts: list[int] = []
         self._lines = _Lines(path, *(_opened(path, files) if opened is None else opened(files)), skip_bad)
         header, number, self._row = self._header(knows)
         self._batch = self._lines.rest or self._lines.more()
@@ -100,8 +125,17 @@ class TextTable:
         #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
         self.places: NDArray[np.int64] | None = None
         self._origin: datetime | None = None
+        #: Of a time of day: the first, the last one, and the days since, s.
+        self._day = (math.nan, math.nan, 0.0)
+        #: Units after the numbers of a cell, by column.
+        self._ending: dict[int, str] = {}
+        #: The column that numbers the sensors, and the cell of the one that is read.
+        self._only: tuple[int, str] | None = None
         self.where = f"line {number}: "
-        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(self._headings(header))]
+        headings = self._stated(self._headings(header))
+        if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
+            del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
+        self.keys = [self._heading(cell, number, place) for place, cell in enumerate(headings)]
         self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
 
     @property
@@ -111,19 +145,36 @@ class TextTable:
 
     def stated_rate(self) -> float | None:
         """The rate, Hz, that a line before the header states."""
-        match = next(filter(None, (_RATE.search(line) for line in self._before)), None)
+        match = next(filter(None, (_RATE.search(line) for line in self.before)), None)
         return float(match[1]) if match else None
 
     @property
     def origin_s(self) -> float:
         """The first date, s since 1970; 0 without dates. A date without a zone counts as UTC."""
         if self._origin is None:
-            return 0.0
+            return 0.0 if math.isnan(self._day[0]) else self._day[0]
         return (self._origin if self._origin.tzinfo else self._origin.replace(tzinfo=UTC)).timestamp()
+
+    def numbers_in(self, key: str) -> list[str]:
+        """The cells of a column among the first rows, each once, where the rows of a few of them take turns."""
+        place = self.keys.index(key)
+        cells = [
+            cells[place].strip(' "') for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) > place
+        ]
+        found = list(dict.fromkeys(cells))
+        return found if 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 and all(map(str.isalnum, found)) else []
+
+    def only(self, key: str, cell: str) -> None:
+        """Read only the rows that have this cell in a column."""
+        self._only = self.keys.index(key), cell
+
+    def line_of(self, row: int) -> int:
+        """The line of a row (from 0) of the table that `columns` gave."""
+        return self._row + (row if self.places is None else int(self.places[row]))
 
     def fail(self, row: int, column: str | None, what: str) -> NoReturn:
         """Raise UserError for a row (from 0), and a column of it, of the table that `columns` gave."""
-        self._fail(row if self.places is None else int(self.places[row]), column, what)
+        self._fail(self.line_of(row) - self._row, column, what)
 
     def _fail(self, line: int, column: str | None, what: str) -> NoReturn:
         column = "" if column is None else f"column '{column}': "
@@ -142,7 +193,8 @@ class TextTable:
         lines, rows, blank, batch = 0, 0, False, self._batch
         places: list[NDArray[np.int64]] = []
         while batch:
-            if self._lines.unfinished and batch[0].strip():
+            batch = self._kept(batch, lines)
+            if self._lines.unfinished and batch and batch[0].strip():
                 # A line that was cut within its last number would be taken for another value.
                 note(f"{self.path}: line {self._row + lines} has no line end and may be cut off: left out")
                 break
@@ -181,6 +233,25 @@ class TextTable:
             whole.append(None if part is None else np.concatenate(part))
         return whole
 
+    def _kept(self, batch: list[str], before: int) -> list[str]:
+        """The lines of a block without those that repeat the header, and of one sensor alone. `before`: lines before
+        it, for the count of lines."""
+        if self._skip_bad:
+            return batch
+        again = {line for line in set(batch) if line.strip() in self._heads} if self._heads else set()
+        if again:
+            at = next(place for place, line in enumerate(batch) if line in again)
+            note(f"{self.path}: line {self._row + before + at} repeats the header: the log goes on there")
+            self.restarts.append(before + at)
+            batch, count = [line for line in batch if line not in again], len(batch)
+            self._row += count - len(batch)
+        if self._only is not None:
+            place, cell = self._only
+            batch = [
+                line for line in batch if len(cells := self._cells(line)) <= place or cells[place].strip(' "') == cell
+            ]
+        return batch
+
     def _header(self, knows: Callable[[Sequence[str]], bool]) -> tuple[str, int, int]:
         """The header line, its number, and the first row's; the lines after it are the rest."""
         batch = self._lines.more()
@@ -192,12 +263,15 @@ class TextTable:
                 continue
             bare = _bare(line)
             if plain < 0:
-                if bare != line.strip():
+                if bare != line.strip(" "):
                     comment = place
                 else:
                     plain = place
             if _is_header(bare, batch[place + 1 : place + 2], knows):
                 return self._begins(batch, place, place + 1, bare)
+            named = _with_units(bare, batch[place + 1 : place + 2])
+            if named and _is_header(named, batch[place + 2 : place + 3], knows):
+                return self._begins(batch, place, place + 2, named)
         if comment >= 0 and plain >= 0 and _ROW.fullmatch(batch[plain]):
             return self._begins(batch, comment, plain, _bare(batch[comment]))
         if 0 <= plain < MOST_LEADING_LINES:
@@ -211,7 +285,8 @@ class TextTable:
         if no_text := _NO_TEXT.search(text):
             raise UserError(_of_no_text(self.path, header + 1, no_text[0]))
         self._lines.rest = batch[row:]
-        self._before = batch[:header]
+        self.before = batch[:header]
+        self._heads = {line.strip() for line in batch[header:row]}
         return text, header + 1, row + 1
 
     def _separated(self, header: str, row: str, number: int) -> str:
@@ -232,6 +307,17 @@ class TextTable:
 
     def _headings(self, line: str) -> list[str]:
         return _words(line) if self._separator == " " else line.split(self._separator)
+
+    def _stated(self, headings: list[str]) -> list[str]:
+        """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""
+        cells = self._cells(self._batch[0])
+        self._ending = {}
+        for place, (heading, cell) in enumerate(zip(headings, cells, strict=False)):
+            match = _WITH_UNIT.fullmatch(cell)
+            if match is not None and units.known(unit := units.plain(match[1])) and not set("[(") & set(heading):
+                self._ending[place] = match[1]
+                headings[place] = f"{heading.strip(_QUOTED)} [{unit}]"
+        return headings
 
     def _heading(self, cell: str, number: int, place: int) -> str:
         where = f"{self.path}: line {number}: column {place + 1}: "
@@ -259,16 +345,21 @@ class TextTable:
                 self._decimal, text = ",", text.replace(",", ".")
             elif point:
                 self._decimal = "."
+        for unit in set(self._ending.values()):
+            for end in (self._separator, "\n"):
+                text = f"{text}\n".replace(f" {unit}{end}", end).removesuffix("\n")
         plain = _with_nan(text, self._separator).split("\n")
         if not all(line.count(self._separator) == len(self.keys) - 1 for line in plain):
             return None
         dates: Mapping[int | str, Callable[[str], Any]] | None = None if time is None else {index[time]: self._date}
+        day = self._day
         try:
             with np.errstate(all="ignore"):
                 table = np.loadtxt(
                     plain, delimiter=self._separator, comments=None, usecols=index, ndmin=2, converters=dates
                 )
         except (ValueError, TypeError):
+            self._day = day
             return None
         return table if len(table) == len(lines) else None
 
@@ -293,6 +384,8 @@ class TextTable:
                         value = math.nan
                     elif place < len(optional) and optional[place]:
                         value = self._optional(cells[column], place, parts)
+                    elif column in self._ending:
+                        value = self._value(cells[column].strip().removesuffix(f" {self._ending[column]}"), place)
                     else:
                         value = self._value(cells[column], place, dated=place == time)
                     values.append(value)
@@ -351,16 +444,29 @@ class TextTable:
         """Seconds since the first date. Raises ValueError, and TypeError where one has a zone and the other has not."""
         cell = cell.strip(' "')
         if not _ISO.fullmatch(cell):
-            raise ValueError(cell)
+            return self._since_first(cell)
         moment = datetime.fromisoformat(cell)
         if self._origin is None:
             self._origin = moment
         return (moment - self._origin).total_seconds()
 
+    def _since_first(self, cell: str) -> float:
+        """Seconds since the first time of day; at midnight a day goes on. Raises ValueError."""
+        match = _OF_DAY.fullmatch(cell)
+        if match is None or self._origin is not None:
+            raise ValueError(cell)
+        hour = int(match[1]) % 12 + 12 * (match[4] in "pP") if match[4] else int(match[1])
+        second = 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", ".").replace(":", "."))
+        first, last, days = self._day
+        if second < last - 0.5 * _DAY_S:
+            days += _DAY_S
+        self._day = (second if math.isnan(first) else first, second, days)
+        return second + days - self._day[0]
+
 
 def is_date(cell: str) -> bool:
-    """Whether a cell is a date with a time of day."""
-    return _ISO.fullmatch(cell) is not None
+    """Whether a cell is a date with a time of day, or a time of day to the second or finer."""
+    return _ISO.fullmatch(cell) is not None or _OF_DAY.fullmatch(cell) is not None
 
 
 def is_clock(cell: str) -> bool:
@@ -375,7 +481,7 @@ def _place(wanted: Sequence[int], place: int | None) -> int | None:
 def _bare(line: str) -> str:
     """A line without the sign of a comment before it."""
     sign = _COMMENT.match(line)
-    return line[sign.end() if sign else 0 :].strip()
+    return line[sign.end() if sign else 0 :].strip(" ")
 
 
 def _words(line: str) -> list[str]:
@@ -392,6 +498,25 @@ def _words(line: str) -> list[str]:
     return [" ".join(words) for words in found]
 
 
+def _with_signs(text: str) -> str:
+    """A text with the signs of units, in the lines before the first row, that some alphabets have as one byte."""
+    end = 0
+    for line in text.split("\n", MOST_LEADING_LINES)[:MOST_LEADING_LINES]:
+        if is_row(line):
+            break
+        end += len(line) + 1
+    return text[:end].translate(_SINGLE) + text[end:]
+
+
+def is_row(line: str) -> bool:
+    """Whether most cells of a line are numbers."""
+    for sign in (*_SEPARATORS, " "):
+        cells = [cell.strip(' "') for cell in line.split(None if sign == " " else sign, MOST_COLUMNS)]
+        if len(cells) > 1 and sum(_NUMBER.fullmatch(cell) is not None for cell in cells) > len(cells) / 2:
+            return True
+    return False
+
+
 def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]], bool]) -> bool:
     """Whether a line has a known heading and no number, and the line `after` it, if any, numbers in as many cells."""
     for sign in (*_SEPARATORS, " "):
@@ -403,9 +528,29 @@ def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]],
         if any(_NUMBER.fullmatch(cell) for cell in cells) or not knows(cells):
             continue
         row = [cell for line in after for cell in (line.split() if sign == " " else line.split(sign))]
-        if not after or (len(row) == len(cells) and any(_ROW.fullmatch(cell.strip(' "')) for cell in row)):
+        same = len(row) == len(cells) or (len(row) == len(cells) - 1 and cells[-1].lower() == _COMMENT_OF_ROWS)
+        if not after or (same and any(_ROW.fullmatch(cell.strip(' "')) for cell in row)):
             return True
     return False
+
+
+def _with_units(line: str, after: Sequence[str]) -> str:
+    """A line of headings with the units of the line after it, where that is nothing but units; else empty."""
+    for sign in (*_SEPARATORS, " "):
+        names, stated = (
+            [cell.strip(signs) for one in lines for cell in one.split(None if sign == " " else sign)]
+            for lines, signs in (([line], ' "'), (after, ' "[]'))
+        )
+        if len(names) != len(stated) or not 1 < len(names) <= MOST_COLUMNS or max(map(len, stated)) > LONGEST_HEADING:
+            continue
+        plain = [units.plain(unit) for unit in stated]
+        if any(_NUMBER.fullmatch(unit) for unit in stated) or sum(map(units.known, plain)) < len(names) / 2:
+            continue
+        return ("\t" if sign == " " else sign).join(
+            f"{name} [{unit}]" if units.known(unit) and "[" not in name and "(" not in name else name
+            for name, unit in zip(names, plain, strict=True)
+        )
+    return ""
 
 
 def _with_nan(text: str, separator: str) -> str:
@@ -473,6 +618,8 @@ class _Lines:
         self._carry, self._next, self._start = b"", 0, True
         self._packed, self._unpacked = packed, 0
         self._skip_bad, self.no_text = skip_bad, False
+        #: The lines are a serial monitor's, and what separates their columns.
+        self._monitor, self._between = False, ","
 
     def more(self) -> list[str]:
         """The lines of the next block; none at the end. Raises UserError for what is no text."""
@@ -493,11 +640,24 @@ class _Lines:
                 raise UserError(f"{self.path}: {more}: no sensor's readings do")
             if end:
                 lines = self._text(data[:end]).replace("\r\n", "\n").removesuffix("\n").split("\n")
+                if self.number == 0 == self._next:
+                    self._monitor = _MONITOR.match(lines[0]) is not None and _MONITOR.match(lines[-1]) is not None
+                    self._between = next((sign for sign in _SEPARATORS if sign in lines[-1]), " ")
+                if self._monitor:
+                    lines = [self._received(line) for line in lines]
                 self.number, self._next = self._next, self._next + len(lines)
                 return lines
             if not block:
                 break
         return []
+
+    def _received(self, line: str) -> str:
+        """A line of a serial monitor with the stamp, or its heading, as a column."""
+        match = _MONITOR.match(line)
+        if match is None:
+            return line
+        rest = line[match.end() :]
+        return f"{match[1] if _ROW.fullmatch(rest) else RECEIVED}{self._between}{rest}"
 
     def _block(self) -> bytes:
         """The next bytes of the text, in UTF-8; none at the end."""
@@ -513,7 +673,10 @@ class _Lines:
         try:
             text, self.no_text = data[skip:].decode("utf-8"), b"\0" in data
         except UnicodeDecodeError:
-            text, self.no_text = data[skip:].decode("utf-8", "surrogateescape"), True
+            text = data[skip:].decode("utf-8", "surrogateescape")
+            if self._start:
+                text = _with_signs(text)
+            self.no_text = _NO_TEXT.search(text) is not None
         if self.no_text and not self._skip_bad:
             found = _NO_TEXT.search(text)
             assert found is not None
