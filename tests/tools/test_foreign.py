@@ -70,7 +70,8 @@ _FORMS: dict[str, Callable[[_Truth], str]] = {
         "time_ms,Gx(G),Gy(G),Gz(G),Wx(deg/sec),Wy(deg/sec),Wz(deg/sec)\n" + _lines(of.t * 1e3, of.a / _G, of.g / _DEG)
     ),
     "units in a line of their own": lambda of: (
-        "Time,GyroX,GyroY,GyroZ,AccelX,AccelY,AccelZ\n[sec],[rad/sec],[rad/sec],[rad/sec],[m/sec^2],[m/sec^2],[m/(s^2)]\n"
+        "Time,GyroX,GyroY,GyroZ,AccelX,AccelY,AccelZ\n"
+        "[sec],[rad/sec],[rad/sec],[rad/sec],[m/sec^2],[m/sec^2],[m/(s^2)]\n"
         + _lines(of.t, of.g, of.a)
     ),
     "units in the cells": lambda of: (
@@ -104,7 +105,8 @@ _FORMS: dict[str, Callable[[_Truth], str]] = {
         "\tax[g]\tay[g]\taz[g]\tComment\n" + _lines(of.t, of.g / _DEG, of.a / _G, sign="\t").replace(".", ",")
     ),
     "Movella DOT": lambda of: (
-        "sep=,\nDeviceTag:,D422CD006C2B\nOutputRate:,80Hz\n\nPacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n"
+        "sep=,\nDeviceTag:,D422CD006C2B\nOutputRate:,80Hz\n\n"
+        "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n"
         + _lines(range(_ROWS), [int(4294000000 + 12500 * k) % 2**32 for k in range(_ROWS)], of.a, of.g / _DEG)
     ),
     "Xsens MT Manager": lambda of: (

@@ -897,7 +897,7 @@ def _text_parts(path: Path, rate: float | None, header: _Header, skip_bad: bool)
         if not sensors and text.optional:
             continue
         key = number_of(table.keys)
-        numbered = [(key, cell) for cell in table.numbers_in(key)] if key is not None else []
+        numbered: list[tuple[str, str] | None] = [(key, cell) for cell in table.numbers_in(key)] if key else []
         for sensor, only in [(one, only) for one in sensors or [Sensor("", {})] for only in numbered or [None]]:
             others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
             one = _Text(text, rate, header, skip_bad, sensor, others, only)
