@@ -14,6 +14,8 @@ from functools import lru_cache
 from selfcal import units
 from selfcal.limits import LONGEST_HEADING
 
+#: Characters of a heading of no program that is known.
+_LONGEST_NAME = 120
 #: Headings of a time column that states its unit, or holds dates.
 TIMES = ("time", "timestamp")
 #: Heading of the stamps that a serial monitor puts before a line.
@@ -207,7 +209,13 @@ def _native(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Meaning]
     times = [key for key, name in zip(keys, names, strict=True) if name.lower() in TIMES and key not in taken]
     if "t" not in names and len(times) == 1:
         return {times[0]: Meaning("t", split(times[0])[1])}
-    return {} if "t" in names else _time(FORMS[-1], [key for key in keys if key not in taken], taken, "")
+    return {} if "t" in names else _time(FORMS[-1], _free(FORMS[-1], keys, taken), taken, "")
+
+
+def _free(form: _Form, keys: Sequence[str], taken: Mapping[str, str]) -> list[str]:
+    """The headings that a form may look at: not those that the user maps, nor long ones, which take long."""
+    longest = _LONGEST_NAME if form is FORMS[-1] else LONGEST_HEADING
+    return [key for key in keys if key not in taken and len(key) <= longest]
 
 
 def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -> list[Sensor]:
@@ -216,7 +224,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
         return []
     if form.file and form.file not in file.lower():
         return []
-    free = [key for key in keys if key not in taken and len(key) <= LONGEST_HEADING]
+    free = _free(form, keys, taken)
     axes: dict[str, dict[str, Meaning]] = {}
     for letter, key, match, stated in _axes(form, free):
         axis = match["axis"].lower()
