@@ -113,6 +113,15 @@ _FORMS: dict[str, Callable[[_Truth], str]] = {
         "// Update Rate: 80.0Hz\nPacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z\tGyr_X\tGyr_Y\tGyr_Z\n"
         + _lines(range(_ROWS), [900 + 125 * k for k in range(_ROWS)], of.a, of.g, sign="\t")
     ),
+    "MicroStrain, with its units": lambda of: (
+        "DATA_START\nGPS TFlags,GPS Week,GPS TOW,"
+        "X Accel [g],Y Accel [g],Z Accel [g],X Gyro [rad/s],Y Gyro [rad/s],Z Gyro [rad/s]\n"
+        + _lines([7] * _ROWS, [1936] * _ROWS, of.t + 502880.55, of.a / _G, of.g)
+    ),
+    "Kalibr": lambda of: (
+        "timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z\n"
+        + _lines([1385030208726607500 + round(1e9 * one) for one in of.t.tolist()], of.g, of.a)
+    ),
     "Physics Toolbox": lambda of: "time,gFx,gFy,gFz,wx,wy,wz\n" + _lines(of.t, of.a / _G, of.g),
     "Shimmer": lambda of: (
         '"sep=\t"\nS_1_Timestamp_Unix_CAL\tS_1_Accel_LN_X_CAL\tS_1_Accel_LN_Y_CAL\tS_1_Accel_LN_Z_CAL\tS_1_Gyro_X_CAL'

@@ -94,6 +94,7 @@ _NUMBERS = ("i", "instance", "imu", "imu_id", "sensor", "sensor_id", "device", "
 FORMS = (
     # EuRoC and Kalibr
     _Form(rf"w_RS_S_{_AXIS}", rf"a_RS_S_{_AXIS}", (("#?timestamp", "ns"), ("time", "ns"))),
+    _Form(rf"omega_{_AXIS}", rf"alpha_{_AXIS}", (("timestamp", "ns"),), needs="alpha_x"),
     # PX4, as ulog2csv writes it: topic sensor_combined; then sensor_gyro and sensor_accel, which the file's name tells
     _Form(rf"gyro_rad{_PLACE}", rf"accelerometer_m_s2{_PLACE}", (("timestamp_sample", "us"), ("timestamp", "us"))),
     _Form(
@@ -145,8 +146,9 @@ FORMS = (
         (f"{_BEFORE}{_GYRO}{_AFTER}", f"{_FIRST}(?!g(?:_|$)|w){_GYRO}{_DATA}{_ENDS}"),
         (f"{_BEFORE}{_ACCEL}{_AFTER}", f"{_FIRST}(?!a(?:_|$)){_ACCEL}{_DATA}{_ENDS}"),
         (
-            (r"#?time(?:[_ ]?stamp)?(?:_(?P<unit>\w+))?", None), (r"t(?:_(?P<unit>\w+))?", None), ("timeus", "us"),
-            ("micros", "us"), ("millis", "ms"), (r"x[_ ]value", "s"), (_TIME, ""), (RECEIVED, None),
+            (r"#?time(?:[_ ]?stamp)?(?:_(?P<unit>\w+))?", None), (r"t(?:_(?P<unit>\w+))?", None),
+            ("timeus", "us"), ("micros", "us"), ("millis", "ms"), ("timestartup", "ns"), ("(?:gps[ _]?)?tow", "s"),
+            (r"x[_ ]value", "s"), (_TIME, ""), (RECEIVED, None),
         ),
         rf"{_BEFORE}temp(?:erature)?(?:_(?P<unit>\w+))?",
         gyro_unit=None,
