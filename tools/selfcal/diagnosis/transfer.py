@@ -232,7 +232,7 @@ def worth(state: State, one: Tried) -> float:
     own = one.structure.own
     start = max(0.0, state.with_columns(columns[own:])[0]) if own < len(columns) else 0.0
     gain = min(one.gain, state.rich_gain(columns)) - start
-    return net(gain, own + (one.structure.poles > 0), LN_STRUCTURES + LN_SLOW)
+    return net(gain, own + (one.structure.poles > 0), LN_STRUCTURES + own * LN_SLOW)
 
 
 def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Posterior:

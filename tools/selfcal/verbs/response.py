@@ -18,7 +18,7 @@ from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
-from selfcal.diagnosis.state import NET_LEAST, State
+from selfcal.diagnosis.state import ALIKE, NET_LEAST, State
 from selfcal.diagnosis.statemodel import Array
 from selfcal.diagnosis.transfer import PROBABILITY, Empirical, Input, Posterior, Tried
 from selfcal.document import check_writable, recording_entry, write_json
@@ -164,16 +164,19 @@ def _about(given: Input) -> Input:
 
 
 def _noise_of(values: Array) -> float:
-    """Deviation of a white noise by second differences, which hardly see what changes slowly."""
-    return math.sqrt(float(np.var(np.diff(values, 2))) / 6.0)
+    """Deviation of a white noise by differences. The order that sees least of what changes slowly."""
+    orders = range(2, 6)
+    return math.sqrt(min(float(np.var(np.diff(values, k))) / math.comb(2 * k, k) for k in orders))
 
 
 def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
     """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
     dt = state.dt
     each = [[transfer.tried(state, one) for one in transfer.structures(u.values, dt, u.widths_s)] for u in inputs]
-    found = max(each, key=lambda tried: max(one.score for one in tried))
-    given = inputs[each.index(found)]
+    # Of two that explain a record alike, the first is meant.
+    best = [max(one.score for one in tried) for tried in each]
+    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
+    found, given = each[place], inputs[place]
     u, unit = given.values, given.unit
     found = transfer.beside_two_terms(state, found)
     chosen = max(found, key=lambda one: one.score)
