@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy import integrate, stats
+from test_docs import assert_alike
 
 from selfcal.engines.library import Bank
 from selfcal.engines.reference import identify_axis
@@ -163,7 +164,7 @@ def test_a_module_that_begins_with_the_batch_knows_more(tmp_path: Path) -> None:
 
 
 def test_the_printed_example(tmp_path: Path) -> None:
-    """The README's batch, by its own code: the command prints the lines that stand there."""
+    """The README's batch, by its own code: the command prints the lines that stand there, long ones wrapped."""
     text = (ROOT / "tools" / "README.md").read_text().partition("### The population")[2]
     made, command, printed = (text.split("```python\n")[1].split("```")[0], *text.split("\n\n    ")[1:3])
     if not case_records(0, 1):
@@ -173,7 +174,7 @@ def test_the_printed_example(tmp_path: Path) -> None:
     words = [*COMMAND, *shlex.split(command.removeprefix(".venv/bin/selfcal "))]
     found = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=1800)
     print(found.stdout)
-    assert [line.strip() for line in printed.split("\n\n")[0].splitlines()] == found.stdout.splitlines()
+    assert_alike(printed.split("\n\n")[0], found.stdout)
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.35, 4.0])

@@ -52,7 +52,7 @@ UNTRIED = {
     "replay next.csv": "QEMU; test_warm.py",
     "replay log.csv": "QEMU; test_firmware.py",
     "replay tests/data": "QEMU; test_firmware.py",
-    "fleet ": "recordings of the reader's own; test_the_batch_is_as_printed, test_fleet.py",
+    "fleet ": "recordings of the reader's own; test_batch_priors.py, test_fleet.py",
     "plan ": "a model of the reader's own; test_plan.py",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
@@ -158,18 +158,6 @@ def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
     ]
     told = re.search(r"has gained ([0-9.]+) nats", text)
     assert told is not None and math.isclose(float(told[1]), best[1] - best[0], rel_tol=0.01)
-
-
-def test_the_batch_is_as_printed(tmp_path: Path) -> None:
-    """The 300 units of tools/README.md, drawn by its program; the numbers that the text repeats."""
-    if not CASE_RECORDS:
-        pytest.skip("SLOW: make cases")
-    text = WALKTHROUGH.read_text(encoding="utf-8")
-    (program,) = (block for block in blocks(WALKTHROUGH, "python") if 'save(f"ex/' in block)
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
-    (command,) = re.findall(r"^    \.venv/bin/selfcal (fleet 'ex/\*\.npz' .*)$", text, re.MULTILINE)
-    said = text.partition(command)[2].partition("\n- ")[0]
-    assert_alike(said, shell(f".venv/bin/selfcal {command}", tmp_path))
 
 
 def test_the_tour_is_as_printed(tmp_path: Path) -> None:
