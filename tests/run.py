@@ -32,7 +32,7 @@ LONGEST = 12
 #: At once; the machine that this is to be quick on has two cores.
 WORKERS = 2
 #: Left out of `make quick`: the slowest of the checks.
-SLOW_CHECKS = ("check-tidy",)
+SLOW_CHECKS = ("check-tidy", "check-c++")
 #: Variants of the C tests; the first one is plain, and alone in `make quick`.
 VARIANTS = ("plain", "sanitized", "fixed")
 #: The thin way of `make quick`: numbers against the textbook, the command, the wire, a recording through the firmware,
