@@ -8,6 +8,10 @@ noise. The prediction is the bias at the end, and with regressors what their coe
 
 --second: the extended model runs, in the host's library, over a second record of the same truth, whose noise, walk and
 channels are new. Reports every 120 s predict the mean of a minute 300 s later (ahead.py).
+
+--real FOLDER: the stated interval of the bias on real recordings at rest, by 1 s means. Rests of 10 min begin every
+10 min; each is identified by itself. The mean of BLOCK_S that begins 60 s or 300 s after it has the variance of the
+predicted bias and N^2 / BLOCK_S.
 """
 
 from __future__ import annotations
@@ -28,12 +32,15 @@ from selfcal.engines.library import Bank
 from selfcal.model import DEFAULT, Model
 from selfcal.recording import as_float, load
 from selfcal.regressors import columns_of, mask_of, offered
+from selfcal.result import HALF_90
 from selfcal.tables import make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 
 LENGTH_S, HORIZONS_S = 2400, (10, 60, 300)
+#: Of real recordings: their names, the rest, the horizons, and the block that shows the bias, s.
+RUNS, REST_S, AHEAD_S, BLOCK_S = (1, 2, 4), 600, (60, 300), 30
 #: Samples, of 1 Hz, between reports on a second record.
 EVERY = 120
 EFFECTS = {
@@ -137,6 +144,42 @@ def second_errors(effects: Sequence[str], seed: int, folder: Path) -> NDArray[np
     return np.array(found)
 
 
+def held_out(log: Path) -> dict[str, NDArray[np.float64]]:
+    """By axis, [rests, len(AHEAD_S)]: the block's mean less the predicted bias, over its stated sd."""
+    recording, model = load(log), Model.load()
+    axes = tuple(name for name in model.axes if name in recording.columns)
+    per_s = round(recording.rate_hz)
+    units = {name: model.group_of(name).unit for name in axes}
+    values = np.stack([as_float(recording.in_unit(name, units[name])) for name in axes], axis=1).astype(np.float64)
+    means = values[: len(values) // per_s * per_s].reshape(-1, per_s, len(axes)).mean(axis=1)
+    tables = make_tables(model, 1.0, axes, bank_rate_hz=1.0)
+    found: dict[str, list[list[float]]] = {name: [] for name in axes}
+    for start in range(0, len(means) - REST_S - max(AHEAD_S) - BLOCK_S + 1, REST_S):
+        bank = Bank(tables)
+        end = start + REST_S
+        bank.push(means[start:end])
+        for k, name in enumerate(axes):
+            row = []
+            for ahead in AHEAD_S:
+                report = bank.report(k, ahead_s=ahead + 0.5 * BLOCK_S)
+                noise = report.parameters[report.best]["N"].median ** 2 / BLOCK_S
+                shown = means[end + ahead : end + ahead + BLOCK_S, k].mean()
+                row.append((shown - report.bias_mean) / math.hypot(report.bias_sd, math.sqrt(noise)))
+            found[name].append(row)
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def show_held_out(folder: Path) -> None:
+    """A line an axis: rests, and the share of blocks in the stated 90 % interval at each horizon."""
+    runs = [held_out(folder / f"adis16405_run{run}.npz") for run in RUNS]
+    print(f"blocks of {BLOCK_S} s in the stated 90 %, {' and '.join(f'{ahead} s' for ahead in AHEAD_S)} after a rest")
+    for name in (*runs[0], "all"):
+        z = np.concatenate([one for run in runs for key, one in run.items() if name in (key, "all")])
+        shares = ", ".join(f"{100.0 * share:.1f} %" for share in (np.abs(z) < HALF_90).mean(axis=0))
+        rms = ", ".join(f"{value:.2f}" for value in np.sqrt((z**2).mean(axis=0)))
+        print(f"{name:4s} {len(z):4d} rests: {shares}; rms of error / sd {rms}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--records", type=int, default=5)
@@ -144,7 +187,11 @@ def main() -> None:
     parser.add_argument("--target", default="host")
     parser.add_argument("--cause", action="append", choices=list(EFFECTS))
     parser.add_argument("--second", action="store_true")
+    parser.add_argument("--real", type=Path)
     given = parser.parse_args()
+    if given.real:
+        show_held_out(given.real)
+        return
     if given.second:
         print(f"rms error 300 s ahead on a second record, {given.records} records, deg/s: base model -> extended one")
         for cause in given.cause or EFFECTS:

@@ -6,6 +6,7 @@ Truth: the flight in closed form, the simulated noise, and chi-squared.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from selfcal.engines.library import Bank
+from selfcal.model import Model
 from selfcal.navigation import (
     GPS_S,
     JUDGED,
@@ -27,8 +30,19 @@ from selfcal.navigation import (
     nees,
     true_noise,
 )
-from selfcal.parts import LAWS, Floats
-from selfcal.studies.navigate import FIGURES, TIMES, TITLES, identified_noise, navigate, sheet_noise, show
+from selfcal.parts import AXES, LAWS, Floats
+from selfcal.studies.navigate import (
+    FIGURES,
+    HORIZONS_S,
+    TIMES,
+    TITLES,
+    identified_noise,
+    matched,
+    navigate,
+    sheet_noise,
+    show,
+)
+from selfcal.tables import make_tables
 from selfcal.units import STANDARD_GRAVITY
 
 from conftest import run
@@ -99,6 +113,30 @@ def test_what_the_bank_identifies_for_it() -> None:
     part = Part.of("constant", [3])
     for found, true in zip(identified_noise(part.rest[0] / SCALE), true_noise("constant"), strict=True):
         assert found["N"] == pytest.approx(true["N"], rel=0.07)
+
+
+@pytest.mark.parametrize("alpha", (1.0 / 90.0, 1.0 / 700.0))
+def test_the_drift_of_predicted_variances(alpha: float) -> None:
+    """Variances of a Gauss-Markov drift give its parameters, those of a walk its K."""
+    now, variance = 0.3, 2.0
+    later = [variance - (variance - now) * math.exp(-2.0 * alpha * ahead) for ahead in HORIZONS_S]
+    found = matched(now, *later)
+    assert (found["sigma_m"] ** 2, found["alpha"]) == (pytest.approx(variance), pytest.approx(alpha))
+    assert matched(now, *(now + 0.01 * ahead for ahead in HORIZONS_S)) == {"K": pytest.approx(0.1)}
+
+
+def test_the_identified_drift_is_as_uncertain_as_the_bank_states() -> None:
+    """A walk and the bank's variance of its bias 60 and 360 s ahead, of all laws: the filter's drift has the same.
+    A walk has one parameter, so that it has the far one alone."""
+    rest = Part.of("random_walk", [4]).rest[0] / SCALE
+    bank = Bank(make_tables(Model.load(), 1.0, tuple(AXES), bank_rate_hz=1.0))
+    bank.push(rest)
+    for k, found in enumerate(identified_noise(rest)):
+        now, *later = (bank.report(k, ahead_s=ahead).bias_sd ** 2 for ahead in (0.0, *HORIZONS_S))
+        assert now > 0.0
+        for ahead, variance, tolerance in zip(HORIZONS_S, later, (0.02, 1e-3), strict=True):
+            kept, grown = Noise.of([[found] * len(AXES)]).step(ahead)
+            assert kept[0, k] ** 2 * now + grown[0, k] / SCALE[k] ** 2 == pytest.approx(variance, rel=tolerance)
 
 
 def test_the_document(tmp_path: Path) -> None:

@@ -5,17 +5,23 @@ Truth: the library over the same records in one piece, and the stretches that RE
 
 from __future__ import annotations
 
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
+from selfcal.allan import overlapping
 from selfcal.errors import UserError
 from selfcal.model import Model
-from selfcal.paper_figures import section3, section4
+from selfcal.paper_figures import section3, section4, survey
+from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.studies.paper import paper, show
+from selfcal.verbs.identify import identify
+from selfcal.verbs.part import part
 
 from conftest import SHARED_DATA, run
 
@@ -46,7 +52,11 @@ def test_the_page_without_real_recordings(
 ) -> None:
     """Few records, so that it is fast. Each figure has its words, and the absent ones say so on the page and aloud."""
     monkeypatch.setattr(section4, "SCATTER", 3)
+    monkeypatch.setattr(section4, "MARKS", (100, 1000, 3000))
+    monkeypatch.setattr(section4, "ALLAN_MARKS", (200, 1000))
     monkeypatch.setattr(section4, "AREA_RECORDS", 5)
+    monkeypatch.setattr(section3, "CHOICES", 2)
+    monkeypatch.setattr(survey, "TRACKS", {"area 1": 3, "area 4": 5})
     out = tmp_path / "paper.html"
     told = paper(out, data=tmp_path, records=4)
     show(told, out)
@@ -61,6 +71,75 @@ def test_the_page_without_real_recordings(
     assert not reader.loads
     assert reader.pictures > 30
     assert {one.verdict for one in told} <= {"agrees", "differs", "skipped"}
+    assert all(one.why for one in told if one.verdict == "differs" and one.name not in ("Fig. 1", "Fig. 2"))
+
+
+def test_the_laws_of_figs_3_and_4_share_no_noise() -> None:
+    """Steps of 600 independent readings: a correlation within 4 sd of 1 / sqrt(599) of 0. One seed makes 0.9."""
+    steps = [
+        np.diff(simulate_bank_samples(law, truth, 1.0, 600, section3.own_seed(law, 1))[0])
+        for law, truth in section3.ALIKE.items()
+    ]
+    assert abs(np.corrcoef(steps)[0, 1]) < 4.0 / math.sqrt(599)
+
+
+@pytest.mark.parametrize("law", section3.ALIKE)
+def test_the_true_curves(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean Allan variance and mean spectrum of 100 records lie within 4.5 standard errors of the true curves. Welch's
+    window leaks a walk's power into its first bins, which the comparison leaves out."""
+    monkeypatch.setattr(section3, "CHOICES", 1)
+    told = {one.name: one.figures.panels for one in section3.figures_3_and_4(1)}  # type: ignore[union-attr]
+    place = list(section3.SHOWN).index(law)
+    records = [
+        simulate_bank_samples(law, section3.ALIKE[law], 1.0, section3.ALIKE_SAMPLES, 5000 + k)[0] for k in range(100)
+    ]
+    power = np.array([signal.welch(y, nperseg=section3.PIECE, detrend="constant")[1][5:-1] for y in records])
+    m = told["Fig. 4"][place].curves[1].x
+    variance = np.array([[overlapping(y, int(one))[0] for one in m] for y in records])
+    for found, true in (
+        (power, told["Fig. 3"][place].curves[1].y[4:]),
+        (variance, told["Fig. 4"][place].curves[1].y ** 2),
+    ):
+        assert np.abs((found.mean(axis=0) - true) / (found.std(axis=0) / 10.0)).max() < 4.5
+
+
+def test_the_first_figure_begins_at_the_prior_and_has_the_papers_instants() -> None:
+    """At 0 half of the choices are wrong, and the rms of a uniform prior is its width / sqrt(12)."""
+    model = Model.load(section3.PAPER)
+    rows = [row for law in model.hypotheses for row in section3.rows_of(model, (law, 3))]
+    curve = section3.figure_1(rows).figures.panels[0].curves[0]  # type: ignore[union-attr]
+    assert {0, 100, 200, 300, 400, 500, 600, 1000} <= set(curve.x.tolist())
+    assert curve.y[0] == 0.5
+    start = next(row for row in rows if row["t"] == 0 and row["law"] == "gauss_markov")
+    assert (start["sd.sigma_m"], start["sd.alpha"]) == pytest.approx((1.5 / math.sqrt(12.0), 0.09 / math.sqrt(12.0)))
+
+
+def test_a_track_left_out_is_an_interpolation_of_the_others() -> None:
+    """The closed form, against the interpolation itself: mean of the left-out track given all others."""
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((12, 12))
+    covariance, measured = root @ root.T + np.eye(12), rng.standard_normal(12)
+    found = survey.differences(covariance, measured, 3)
+    for k in range(3):
+        own, others = np.arange(4 * k, 4 * k + 4), np.delete(np.arange(12), slice(4 * k, 4 * k + 4))
+        mapped = covariance[np.ix_(own, others)] @ np.linalg.solve(covariance[np.ix_(others, others)], measured[others])
+        assert found[k] == pytest.approx(measured[own] - mapped)
+
+
+def test_the_tracks_are_recordings_of_gravity(tmp_path: Path) -> None:
+    """`part` and `identify` read a track in mGal. Their priors are wider than the page's, which holds N low: sigma_m is
+    within 30 % of the page's, two of its sd after 100 samples."""
+    errors = survey.left_out(11, np.random.default_rng(2))
+    survey.write_tracks(tmp_path / "tracks", {"area 1": errors})
+    log, model = tmp_path / "tracks" / "area-1-track-02.csv", tmp_path / "survey.yaml"
+    assert log.read_text().startswith("t[s],gravity[mGal]\n")
+    part([log], model, axes=["gravity"])
+    answer = identify(log, model=model)["axes"]["gravity"]
+    _, (rms, _, _) = section4.of_map_error(section4.map_tables(Model.load(section3.PAPER)), 1e-5 * errors[1])
+    sigma = answer["parameters"]["gauss_markov"]["sigma_m"]
+    assert (sigma["median"], sigma["unit"]) == (pytest.approx(rms, rel=0.3), "mGal")
+    with pytest.raises(UserError, match="cannot make this folder"):
+        survey.write_tracks(tmp_path / "no" / "tracks", {"area 1": errors})
 
 
 def test_reports_over_time_are_those_of_the_whole_record() -> None:

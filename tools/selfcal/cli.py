@@ -915,13 +915,20 @@ def paper(
     ] = None,
     records: Annotated[int, typer.Option(metavar="N", help="Records per law in Figs 1 and 2")] = 500,
     seed: Annotated[int, typer.Option(metavar="N", help="Same seed, same page", min=0)] = 1,
+    tracks: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the map errors of Section 4.2, a recording a track"),
+    ] = None,
     scheduler: Scheduler = None,
     results: Results = None,
 ) -> None:
     """Make the figures of Stepanov & Motorin (2017) anew, on one page beside what the paper says."""
     from selfcal.studies import paper as verb
 
-    verb.show(verb.paper(output, data=data, records=records, seed=seed, scheduler=scheduler, results=results), output)
+    told = verb.paper(
+        output, data=data, records=records, seed=seed, scheduler=scheduler, results=results, tracks=tracks
+    )
+    verb.show(told, output)
 
 
 @app.command()

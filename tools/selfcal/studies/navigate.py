@@ -12,11 +12,11 @@ import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from scipy import stats
+from scipy import optimize, stats
 
 from selfcal.document import check_writable, write_json
 from selfcal.model import Model
-from selfcal.navigation import JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+from selfcal.navigation import GPS_S, JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.spread import Row, record_seeds, spread
 from selfcal.table import TABLE_WIDTH
@@ -41,6 +41,10 @@ FIGURES = {
     "accelerometer_bias_m_s2": "acc. bias, m/s^2",
     "nees": "NEES",
 }
+#: s over which the identified drift is as uncertain as the bank states: the outage, and the flight.
+HORIZONS_S = (float(OUTAGE_S), float(GPS_S + OUTAGE_S))
+#: A slower drift is a walk, 1/s; the least growth of a variance, as a share of it.
+SLOWEST, TINY = 1e-6, 1e-9
 #: Parts whose filters run side by side.
 TOGETHER = 25
 
@@ -94,7 +98,12 @@ def sheet_noise(factor: float = 1.0) -> list[Mapping[str, float]]:
 
 
 def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
-    """By AXES: medians of the most probable law of a rest [REST_S, axes] in their units."""
+    """By AXES: the noise of a rest [REST_S, axes] in their units, with the spread of its posterior.
+
+    N has the mean square of all laws. Where the constant is the most probable law, there is no drift. Else the drift
+    has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`): the variance of one law
+    at its median is too small where another law or a larger drift is possible.
+    """
     from selfcal.engines.library import Bank
 
     model = Model.load()
@@ -102,10 +111,29 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
     bank.push(rest)
     found: list[Mapping[str, float]] = []
     for k in range(len(AXES)):
-        result = bank.report(k)
-        law = max(result.probability, key=lambda name: result.probability[name])
-        found.append({name: estimate.median for name, estimate in result.parameters[law].items()})
+        now, *later = (bank.report(k, ahead_s=ahead) for ahead in (0.0, *HORIZONS_S))
+        white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
+        noise = {"N": math.sqrt(sum(p * (e.mean**2 + e.sd**2) for p, e in white))}
+        if now.best != "constant":
+            noise |= matched(now.bias_sd**2, *(one.bias_sd**2 for one in later))
+        found.append(noise)
     return found
+
+
+def matched(now: float, near: float, far: float) -> Mapping[str, float]:
+    """The drift whose variance grows from `now` to `near` and `far` over HORIZONS_S: Gauss-Markov, or a walk where the
+    growth does not slow down."""
+    first, last = HORIZONS_S
+    grown, whole = max(near - now, TINY * now), max(far - now, TINY * now)
+
+    def slower(alpha: float) -> float:
+        return math.expm1(-2.0 * alpha * last) / math.expm1(-2.0 * alpha * first) - whole / grown
+
+    if slower(SLOWEST) <= 0.0:
+        return {"K": math.sqrt(whole / last)}
+    fastest = 1.0 / first
+    alpha = optimize.brentq(slower, SLOWEST, fastest) if slower(fastest) < 0.0 else fastest
+    return {"sigma_m": math.sqrt(now - grown / math.expm1(-2.0 * alpha * first)), "alpha": alpha}
 
 
 def rows_of(job: Job) -> list[Row]:

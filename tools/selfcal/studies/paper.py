@@ -19,7 +19,7 @@ from selfcal.document import check_writable
 from selfcal.errors import UserError, note, printable
 from selfcal.model import Model
 from selfcal.output import write_text
-from selfcal.paper_figures import section3, section4
+from selfcal.paper_figures import section3, section4, survey
 from selfcal.paper_figures.told import Told
 from selfcal.spread import record_seeds
 
@@ -39,18 +39,23 @@ def paper(
     seed: int = 1,
     scheduler: str | None = None,
     results: Path | str | None = None,
+    tracks: Path | str | None = None,
 ) -> list[Told]:
     """Write the page to `output`; returns its figures.
 
     `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
     so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
-    `montecarlo`. All seeds follow from `seed`.
+    `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
+    `seed`.
     """
     check_writable(output)
     seeds = record_seeds(records, seed)
     folder = DATA if data is None else Path(data)
     if data is not None and not folder.is_dir():
         raise UserError(f"--data {folder}: there is no such folder")
+    areas = survey.surveys(seed)
+    if tracks is not None:
+        survey.write_tracks(Path(tracks), areas)
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
     rows = section3.ensemble(priors, seeds, seed, scheduler, results)
     told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
@@ -58,12 +63,12 @@ def paper(
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("Figs 5 to 8", total=5)
         simulated = section4.simulated(seed)
-        told += section4.figures_5_and_6(default, simulated, False)
+        told += section4.figures_5_and_6(default, simulated, False, seed)
         progress.advance(task)
         real = section4.real(folder, default)
         progress.advance(task)
         if len(real) == len(section4.STRETCHES):
-            told += with_reason(section4.figures_5_and_6(default, real, True), folder / EXPLAINED)
+            told += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED)
         else:
             missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
             note(
@@ -80,16 +85,16 @@ def paper(
                 )
             )
         progress.advance(task)
-        told.append(section4.figure_7(default, simulated | real, seed))
+        told += section4.figures_7(default, simulated | real, seed)
         progress.advance(task)
-        told.append(section4.figure_8(priors, seed))
+        told += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
         progress.advance(task)
     write_text(output, page(told, records, seed))
     return told
 
 
 def with_reason(told: Sequence[Told], log: Path) -> list[Told]:
-    """The figures of the real records with what the diagnosis finds in one of them."""
+    """The figures of the real records, Fig. 5 with what the diagnosis finds in one of them."""
     from selfcal.verbs.diagnose import diagnose
 
     entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
@@ -99,11 +104,10 @@ def with_reason(told: Sequence[Told], log: Path) -> list[Told]:
     ]
     more = f" and {len(causes) - MOST_CAUSES} more" if len(causes) > MOST_CAUSES else ""
     why = (
-        f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means: "
-        f"{', '.join(causes[:MOST_CAUSES]) or 'nothing'}{more}. "
-        "Neither law has these, so the bank compares two models that are both wrong, and the odds follow the record."
+        f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means "
+        f"{', '.join(causes[:MOST_CAUSES]) or 'nothing'}{more}, and neither law has these."
     )
-    return [replace(one, why=f"{why} {one.why}" if one.verdict == "differs" else one.why) for one in told]
+    return [replace(one, why=why) if one.verdict == "differs" and one.name == "Fig. 5, real" else one for one in told]
 
 
 def page(told: Sequence[Told], records: int, seed: int) -> str:
