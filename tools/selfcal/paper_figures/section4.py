@@ -338,12 +338,12 @@ def _both_ways(
     panels: dict[str, list[Panel]] = {"N": [], "drift": []}
     said: list[str] = []
     right: list[tuple[float, float]] = []
-    words = {"random_walk": "random walk", "gauss_markov": "Gauss–Markov"}
+    words = {"random_walk": "walk", "gauss_markov": "GM"}
     for law in TRUTHS:
         for filtered, name in bank[law]:
             theirs, ours = allan[law][filtered, name].ratio, bank[law][filtered, name].ratio
             curves = [Curve("Allan fit", t, theirs, "fitted"), Curve("bank", t, ours)]
-            title = f"{words[law]}, fitted {words[filtered]}"
+            title = f"{words[law]} as {words[filtered]}"
             panels["N" if name == "N" else "drift"].append(
                 Panel(title, "time, s", f"computed / real, {name}", curves, log_y=True)
             )
@@ -352,7 +352,11 @@ def _both_ways(
                 right.append(middle)
             said.append(f"{title}, {name}: {middle[0]:.2f} and {middle[1]:.2f}")
     figures = [
-        Figure(f"Fig. 7 both ways, {key}", f"Truth and fitted law. 1 is consistent. {SCATTER} records each.", shown)
+        Figure(
+            f"Fig. 7 both ways, {key}",
+            f"The truth as the fitted law; GM: Gauss–Markov. 1 is consistent. {SCATTER} records.",
+            shown,
+        )
         for key, shown in panels.items()
     ]
     agrees = all(theirs < ours and 1.0 / NEAR < ours < NEAR for theirs, ours in right)
@@ -360,7 +364,9 @@ def _both_ways(
         "Fig. 7, both ways",
         figures,
         "The Allan variance's computed rms is smaller than its real error, the bank's is consistent.",
-        "Computed over real rms of the logarithm, median over time, Allan fit and bank: " + "; ".join(said) + ".",
+        "Computed over real rms of the logarithm, median over time, Allan fit and bank, truth as fitted law: "
+        + "; ".join(said)
+        + ".",
         "agrees" if agrees else "differs",
         "A filter for the wrong law computes an rms of its own law's parameters: neither method's is consistent there."
         if agrees
