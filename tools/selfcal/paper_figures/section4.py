@@ -430,7 +430,7 @@ def figure_8(model: Model, seed: int) -> Told:
                         Curve("truth", interval, np.full(2, (rms, noise)[column]), "fitted"),
                     ],
                     log_x=True,
-                    log_y=True,
+                    log_y=column == 0,
                     marks=[minutes],
                     marked="true interval",
                 )

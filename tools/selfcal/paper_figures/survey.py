@@ -102,7 +102,7 @@ def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
     by_area = [
         Figure(
             f"Section 4.2, {what}",
-            f"{what} over the correlation interval, a dot a track.",
+            f"{what.capitalize()} over the correlation interval, a dot a track.",
             [
                 Panel(
                     f"{area}, {TRACKS[area]} tracks",
@@ -110,7 +110,7 @@ def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
                     f"{name}, mGal",
                     [Curve("a track", values[:, 1], values[:, column], "dots")],
                     log_x=True,
-                    log_y=True,
+                    log_y=column == 0,
                 )
                 for area, values in estimates.items()
             ],
@@ -132,6 +132,6 @@ def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
         )
         + f" (medians); mean calculated probability {sure:.0f} %.",
         "agrees" if agrees else "differs",
-        f"The survey is simulated: a field of {FIELD_MGAL:g} mGal over {FIELD_KM:g} km, and a slow error of "
-        f"{SLOW_MGAL:g} mGal over {SLOW_MIN:g} min on each track, for the paper's own data are not public.",
+        f"With few tracks the error is the field between them, smooth over {FIELD_KM:g} km, so that the interval does "
+        "not grow with the tracks; the survey is simulated, for the paper's data are not public.",
     )
