@@ -29,7 +29,8 @@ class Blocks:
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
     those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
     samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. `after`: samples from
-    the last whole block to the last usable sample, missing ones included. Blocks beyond MOST_DENSE intervals are not
+    the last whole block to the last usable sample, missing ones included. `begin`: sample instants from the record's
+    first one to the first block. Blocks beyond MOST_DENSE intervals are not
     worked out.
     """
 
@@ -39,6 +40,7 @@ class Blocks:
     kept_out: Mapping[str, int]
     z: NDArray[np.float64]
     after: int = 0
+    begin: int = 0
 
 
 def usable_blocks(
@@ -103,6 +105,7 @@ def block_means(
     at += np.arange(samples.size)
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
+    begin = int(at[np.argmax(usable)] - at[0])
     at -= at[np.argmax(usable)]
     columns = np.empty((samples.size, 0)) if columns is None else columns
     count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
@@ -129,4 +132,4 @@ def block_means(
     squares = float(np.square(scatter, out=scatter).sum())
     within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within, counts, z[first:], after)
+    return Blocks(mean[first:], r[first:], within, counts, z[first:], after, begin + first * block)

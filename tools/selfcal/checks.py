@@ -17,6 +17,7 @@ from selfcal.blocks import MOST_DENSE, Blocks
 from selfcal.lattice import BELOW_LATTICE
 from selfcal.model import Group, Prior
 from selfcal.readings import CLOCK_LEAST, Readings
+from selfcal.recording import Recording
 from selfcal.result import AxisResult, Estimate
 from selfcal.tables import Tables
 
@@ -72,6 +73,27 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
     checks = innovation_checks(blocks, tables, group, result, list(used))
     unlike = batch_check(tables, group, result)
     return Judged({**hidden, **unlike, **checks, **(allan_checks(curve) if curve else {})}, curve)
+
+
+def with_drift(
+    judged: Judged,
+    blocks: Blocks,
+    tables: Tables,
+    result: AxisResult,
+    recording: Recording,
+    others: Sequence[str],
+    used: Sequence[int] = (),
+) -> Judged:
+    """The same with the checks of the drift, where the others are made: `channel` and `jump` (drift_checks.py).
+    `others`: the recording's columns that may act on the axis; `used`: the model's columns in use."""
+    if not judged.checks or blocks.mean.size > MOST_DENSE:
+        return judged
+    from selfcal.drift_checks import drift_checks
+
+    if used:
+        z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+        blocks = replace(blocks, mean=blocks.mean - z @ coefficients_of(result))
+    return replace(judged, checks={**judged.checks, **drift_checks(blocks, tables, result, recording, others)})
 
 
 def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:

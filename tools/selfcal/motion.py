@@ -37,6 +37,8 @@ LOUD, LOUD_WITHIN, LOUD_LASTING = 8.0, 7.0, 12.0
 STILL = 0.5
 #: Loud blocks closer than this are one stretch, s; it begins and ends so much beyond them, s.
 APART_S, MARGIN_S = 2.0, 0.5
+#: A stretch this close to an end of the record reaches it, s: hands began before it, or ended after.
+EDGE_S = 5.0
 #: A stretch holds so many loud samples at least, and in this share of its blocks the level leaps or the spread is loud:
 #: two jumps of the bias are still between. In a stretch this short, s, two such blocks are enough: in, and out.
 SAMPLES_LEAST, ROUGH_LEAST, ROUGH_COUNT, SHORT_S = 3, 0.2, 4, 5.0
@@ -80,6 +82,8 @@ def loud(y: Array, rate_hz: float, lsb: float = 0.0) -> Moved | None:
     intervals = joined([interval for interval, _ in found])
     if not found or sum(b - a for a, b in intervals) > SHARE_MOST * y.size:
         return None
+    most = max(1, round(EDGE_S * rate_hz))
+    intervals = [(a if a > most else 0, b if b < y.size - most else y.size) for a, b in intervals]
     # Blocks of several lengths show the same stretch: it counts once.
     nats = sum(max(nats for (a, b), nats in found if first <= a and b <= end) for first, end in intervals)
     times = tuple((a / rate_hz, b / rate_hz) for a, b in intervals)

@@ -132,6 +132,16 @@ class Readings:
         noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
         return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
 
+    def without(self, moved: Sequence[Sequence[float]]) -> Readings:
+        """The same where other axes show that the sensor moved as well: stretches, seconds of the whole recording."""
+        if self.moved is None or not moved:
+            return self
+        time, mask = self.recording.start_s + self.recording.time_s, self.moving.copy()
+        for begin_s, end_s in moved:
+            mask |= (time >= begin_s) & (time < end_s)
+        working, times = np.where(mask, np.nan, self.working), tuple(_intervals(self.recording, mask))
+        return replace(self, moving=mask, working=working, moved=replace(self.moved, intervals=times))
+
     @property
     def intervals(self) -> list[list[float]]:
         """Start and end of every stuck stretch, s."""
@@ -148,7 +158,10 @@ def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
     even, changes = evened(recording)
     own, found = thinned(even, (axis,))
-    return replace(readings_of(own, axis, group), held=found, changes=changes)
+    seen = replace(readings_of(own, axis, group), held=found, changes=changes)
+    times = () if seen.moved is None else seen.moved.intervals
+    recording.motion_seen[axis] = [[a + own.start_s, b + own.start_s] for a, b in times]
+    return seen
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -123,6 +124,11 @@ class Recording:
     def powered(self) -> int:
         """Samples from power-on to the first row."""
         return round((self.since_power_on_s + self.start_s) * self.rate_hz)
+
+    @cached_property
+    def motion_seen(self) -> dict[str, list[list[float]]]:
+        """By axis the stretches of motion, seconds of the recording, of each one that was looked at (readings.py)."""
+        return {}
 
     @property
     def lost(self) -> int:

@@ -213,6 +213,15 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 more = len(outcome["intervals"]) - TIMES_MOST
                 times += f" and {more} more" if more > 0 else ""
                 failed.append(f"not adequate: {name}: motion, left out: {times}")
+            elif not outcome["passed"] and check == "channel":
+                told = f"{outcome['column']} ({outcome['form']}) explains {outcome['value']:.0f} nats of it"
+                failed.append(f"not adequate: {name}: channel: {told}: N, K and the bias include that")
+            elif not outcome["passed"] and check == "turn_on":
+                told = f"a bias that settles within {outcome['tau_s']:.2g} s or so, by {outcome['value']:.0f} nats"
+                failed.append(f"not adequate: {name}: turn_on: {told}: K includes that")
+            elif not outcome["passed"] and check == "jump":
+                told = f"the bias jumps at {outcome['time_s']:.6g} s, by {outcome['value']:.0f} nats"
+                failed.append(f"not adequate: {name}: jump: {told}: K includes that")
             elif not outcome["passed"] and not check.startswith("allan_"):
                 failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
         off = [

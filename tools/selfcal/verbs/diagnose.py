@@ -28,10 +28,11 @@ from selfcal.model import Model
 from selfcal.output import write_text
 from selfcal.priors import add_sources, for_record
 from selfcal.progress import Doing
+from selfcal.readings import look
 from selfcal.recording import Recording, list_of, load
 from selfcal.results import Diagnosis
 from selfcal.table import since
-from selfcal.verbs.identify import chosen_axes, identify_axis, stretch_of
+from selfcal.verbs.identify import chosen_axes, identify_axis, moved_beside, stretch_of
 from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Why an axis has no result.
@@ -254,6 +255,9 @@ def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     findings = [finding for axis in axes.values() for finding in axis["findings"]]
     moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
+    for name in axes if moved else ():
+        own = recording.along(name)
+        moved += moved_beside(own, model, name, look(own, name, model.group_of(name)))
     rest = recording.without(moved)
     for name, axis in axes.items():
         axis["posterior"] = None if ending.asked else _posterior(rest, name, model)

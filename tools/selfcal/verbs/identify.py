@@ -18,7 +18,7 @@ from rich.progress import Progress
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.checks import FEWEST, coefficients_of, judge, with_readings
+from selfcal.checks import FEWEST, coefficients_of, judge, with_drift, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import OutsidePriors, UserError
 from selfcal.export import FORMS, write_export
@@ -29,8 +29,8 @@ from selfcal.model import DEFAULT, Model
 from selfcal.one_over_f import weigh, with_white
 from selfcal.plot import check_picture
 from selfcal.priors import add_sources, for_record
-from selfcal.readings import look
-from selfcal.recording import Recording, as_float, list_of, load
+from selfcal.readings import Readings, look
+from selfcal.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
 from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
 from selfcal.rest import outside_priors
 from selfcal.result import AxisResult, in_unit
@@ -282,6 +282,7 @@ def identify_axis(
     group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
     readings = look(recording, name, group)
+    readings = readings.without(moved_beside(recording, model, name, readings))
     recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0
@@ -363,6 +364,7 @@ def identify_axis(
     mask = mask_of(regressors, choices[best])
     used = _used(mask)
     judged = judge(blocks, tables, group, results[best], used)
+    judged = with_drift(judged, blocks, tables, results[best], recording, may_act(model, recording, name), used)
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
@@ -379,6 +381,27 @@ def identify_axis(
         halved_after(inside, group, *at),
         beside.laws(known.probability) if beside else {},
     )
+
+
+def moved_beside(recording: Recording, model: Model, name: str, own: Readings) -> list[list[float]]:
+    """When the axes moved that moved together with an axis: stretches, seconds of the recording. Each axis shows a part
+    of a movement of the sensor. `own`: the readings of the axis."""
+    found: list[list[float]] = []
+    for other in model.axes if own.moved is not None else ():
+        if other == name or other not in recording.columns:
+            continue
+        if other not in recording.motion_seen:
+            look(recording, other, model.group_of(other))
+        times = recording.motion_seen[other]
+        if any(a < end and begin < b for a, b in times for begin, end in recording.motion_seen[name]):
+            found += times
+    return found
+
+
+def may_act(model: Model, recording: Recording, name: str) -> list[str]:
+    """The columns that may act on an axis: the side channels and the other axes."""
+    known = {*model.axes, *(column for column, _ in SIDE_CHANNELS.values())} - {name}
+    return [column for column in recording.columns if column in known]
 
 
 def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:

@@ -24,7 +24,7 @@ from rich.console import Console
 
 from selfcal.ahead import error_ahead, of_report
 from selfcal.blocks import usable_blocks
-from selfcal.checks import Judged, judge, with_readings
+from selfcal.checks import Judged, judge, with_drift, with_readings
 from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
 from selfcal.ending import held
@@ -59,7 +59,7 @@ from selfcal.tables import Tables, bank_block, make_tables
 from selfcal.units import factor as factor_of
 from selfcal.units import same_kind
 from selfcal.verbs.codegen import check_forms, write_tables
-from selfcal.verbs.identify import chosen_axes, with_reasons
+from selfcal.verbs.identify import chosen_axes, may_act, with_reasons
 from selfcal.warm import Start, warmed
 from selfcal.warm import load as load_start
 from selfcal.wire import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
@@ -623,9 +623,9 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     if not gate:
         used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
         readings = look(recording, name, group)
-        judged = with_readings(
-            judge(blocks, tables, group, result, used), readings, group, unit, tables.dt_s, as_fed=True
-        )
+        judged = judge(blocks, tables, group, result, used)
+        judged = with_drift(judged, blocks, tables, result, recording, may_act(model, recording, name), used)
+        judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=True)
     at = tables.dt_s, blocks.mean.size, tables.block
     told = in_unit(with_white(result, group, *at), group.unit, unit)
     mask = (1 << len(tables.regressors)) - 1 if scored is not None and scored.best == 1 else 0

@@ -87,7 +87,8 @@ def looks(state: State, record: Record) -> list[Look]:
     uneven = float((state.r != np.median(state.r)).mean()) > UNEVEN_MOST
     if state.y.size < 200 or uneven or state.extras != NONE:
         return []
-    if scan(state.series, state.best).gain.max() < SCREEN + 2.0:
+    # Two levels that jump often have the correlation of a Gauss-Markov drift, which leaves no jump to see.
+    if scan(state.series, state.best).gain.max() < SCREEN + 2.0 and _law(state) < SCREEN:
         return []
     series, block = blocks(state)
     y = series.y - state.best.c[1:] @ series.columns[1:]
