@@ -105,7 +105,7 @@ def shaken(path: Path, seed: int, axes: tuple[str, ...]) -> tuple[Path, dict[str
     """An hour of six axes at 1 Hz that hands shake at both ends, each axis by another factor; noise of each axis."""
     random = np.random.default_rng([seed, 72])
     n, ends = 3600, random.integers(6, 30, 2)
-    noise = {name: float(np.exp(random.uniform(-4.0, -2.0))) for name in ("gx", "gy", "gz", "ax", "ay", "az")}
+    noise = {name: float(np.exp(random.uniform(-5.0, -3.5))) for name in ("gx", "gy", "gz", "ax", "ay", "az")}
     columns: dict[str, Array] = {"t[s]": np.arange(float(n))}
     for name, sd in noise.items():
         y = random.normal(0.0, sd, n)
@@ -119,20 +119,16 @@ def shaken(path: Path, seed: int, axes: tuple[str, ...]) -> tuple[Path, dict[str
 
 
 def test_hands_that_one_axis_hardly_shows_leave_its_noise_right(tmp_path: Path) -> None:
-    """Every axis is left out where any of those that moved with it moves. N's sd is 1.2 %: 5 % is four of them."""
+    """An axis is left out where two others moved and it is louder. N's sd is 1.2 %: 5 % is four of them."""
     for seed in range(case_records(1, 20)):
         log, noise = shaken(tmp_path / "log.npz", seed, ("gx", "gy", "gz", "ax", "ay", "az"))
         found = identify(log, suspicion=False)["axes"]
         for name, sd in noise.items():
-            law = max(found[name]["hypotheses"], key=found[name]["hypotheses"].get)
-            if found[name]["checks"].get("motion"):
-                assert found[name]["parameters"][law]["N"]["median"] == pytest.approx(sd, rel=0.05), (seed, name)
-                assert found[name]["adequate"] is False
-        moved = [name for name in noise if "motion" in found[name]["checks"]]
-        assert len(moved) >= 4, (seed, moved)
-    axis = diagnose(log, axes=moved[:1])["axes"][moved[0]]
-    N_told = axis["posterior"]["parameters"]["constant"]["N"]["median"]
-    assert N_told == pytest.approx(noise[moved[0]], rel=0.05)
+            assert found[name]["parameters"]["constant"]["N"]["median"] == pytest.approx(sd, rel=0.05), (seed, name)
+            assert found[name]["adequate"] is False
+            assert found[name]["checks"]["motion"]["intervals"][0][0] == 0.0
+    N_told = diagnose(log, axes=["gx"])["axes"]["gx"]["posterior"]["parameters"]["constant"]["N"]["median"]
+    assert N_told == pytest.approx(noise["gx"], rel=0.05)
 
 
 def test_an_axis_that_rests_is_left_as_it_is(tmp_path: Path) -> None:

@@ -705,3 +705,18 @@ def test_no_warning_of_a_library_reaches_the_user(tmp_path: Path) -> None:
     save(tmp_path / "log.csv", {"gx": ("deg/s", np.where(np.abs(y - bias) < 0.32, bias[0], y))}, 10.0)
     for verb in ("identify", "diagnose"):
         assert "Warning" not in run(verb, tmp_path / "log.csv").stderr
+
+
+@pytest.mark.parametrize("limit", [1.1769249, 0.30000149, 27.182849, -2.7182849])
+def test_a_limit_of_many_digits_leaves_the_posterior_right(limit: float, tmp_path: Path) -> None:
+    """The extended model has the range to six digits, which may be less than the limit: the clipped readings are still
+    clipped ones. Without them N was 8 % low. Its sd is 1.3 %: 5 % is four of them. A range is the same on both sides of
+    zero, so an upper limit below zero is none."""
+    noise = 0.04 * abs(limit)
+    y = np.minimum(limit - 1.4 * noise + np.random.default_rng(81).normal(0.0, noise, 3600), limit)
+    log = tmp_path / "log.csv"
+    rows = np.column_stack([np.arange(3600.0), y])
+    np.savetxt(log, rows, delimiter=",", header="t[s],gx[deg/s]", comments="", fmt="%.9g")
+    axis = diagnose(log)["axes"]["gx"]
+    assert [finding["cause"] for finding in axis["findings"]] == ["saturation"]
+    assert axis["posterior"]["parameters"]["constant"]["N"]["median"] == pytest.approx(noise, rel=0.05)

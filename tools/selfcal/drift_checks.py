@@ -25,7 +25,7 @@ from selfcal.tables import Tables
 #: A check fails from this worth on, nats: as seldom as one at four standard deviations (checks.py), searches counted.
 LEAST = 9.67
 #: Drifts at which the likelihoods are taken: the medians' size over e to these.
-SIZES = (0.0, 1.5, 3.0, 4.5)
+SIZES = (0.0, 0.7, 1.5, 3.0, 4.5)
 #: A drift that is known from few of its own turns leaves slow columns a longer tail (diagnosis/forms.py).
 LN_SLOW = 1.8
 #: A jump is looked for where the record has this share of the information about the best known one.

@@ -82,6 +82,13 @@ class Clipped:
         return max(self.limits, key=lambda limit: int(self.limits[limit].sum()))
 
 
+#: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
+ROUNDED = 1e-5
+#: An axis moves with others if its mean square is so many standard deviations above that of the rest. A wild reading
+#: counts as so many of it at most.
+LOUDER_SD, WILD = 6.0, 30.0
+
+
 @dataclass(frozen=True)
 class Readings:
     """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
@@ -133,14 +140,27 @@ class Readings:
         return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
 
     def without(self, moved: Sequence[Sequence[float]]) -> Readings:
-        """The same where other axes show that the sensor moved as well: stretches, seconds of the whole recording."""
-        if self.moved is None or not moved:
-            return self
+        """The same where other axes show that the sensor moved: stretches, seconds of the whole recording. An axis that
+        shows no motion of its own must be louder in them than in the rest."""
         time, mask = self.recording.start_s + self.recording.time_s, self.moving.copy()
         for begin_s, end_s in moved:
             mask |= (time >= begin_s) & (time < end_s)
+        if not moved or (self.moved is None and not self._louder(mask)):
+            return self
         working, times = np.where(mask, np.nan, self.working), tuple(_intervals(self.recording, mask))
-        return replace(self, moving=mask, working=working, moved=replace(self.moved, intervals=times))
+        found = Moved(times, 0.0, 0.0) if self.moved is None else replace(self.moved, intervals=times)
+        return replace(self, moving=mask, working=working, moved=found)
+
+    def _louder(self, mask: Mask) -> bool:
+        """Whether differences of neighbours are larger inside a mask [n] than outside, beyond chance."""
+        square = np.diff(self.working) ** 2
+        inside, outside = square[mask[1:]], square[~mask[1:]]
+        inside, outside = inside[np.isfinite(inside)], outside[np.isfinite(outside)]
+        if not inside.size or not outside.size:
+            return False
+        # A squared difference of normal noise scatters by 1.7 times its mean: the two neighbours share a reading.
+        least = 1.0 + LOUDER_SD * math.sqrt(3.0 / inside.size)
+        return bool(np.minimum(inside, WILD * outside.mean()).mean() > least * outside.mean())
 
     @property
     def intervals(self) -> list[list[float]]:
@@ -169,7 +189,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
     # Readings beyond the part's range are none: the engines leave them out.
-    inside = np.abs(values) <= (group.range * (1.0 + 1e-6) if group.range > 0.0 else math.inf)
+    inside = np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none, none)
     sound = values if inside.all() else np.where(inside, values, np.nan)

@@ -132,6 +132,7 @@ def identify(
                 )
             except UserError as error:
                 found[name] = error
+        _left_out_together(found, recording, loaded_model, engine, decimate, draw=plot is not None)
         with_reasons(found, recording, loaded_model)
         document = to_document(recording, found, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
@@ -169,6 +170,25 @@ def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s:
     """The part of a recording that a verb looks at: `--start`, `--end`, `--gate`."""
     stretch = recording.between(start_s, end_s)
     return gated(stretch, model) if gate else stretch
+
+
+def _left_out_together(
+    found: dict[str, Identified | UserError],
+    recording: Recording,
+    model: Model,
+    engine: str,
+    decimate: float | None,
+    *,
+    draw: bool,
+) -> None:
+    """Identify axes anew that hardly show a movement of which two others or more show that it is one."""
+    checks = {name: one.judged.checks for name, one in found.items() if isinstance(one, Identified)}
+    moved = {name: each["motion"]["intervals"] for name, each in checks.items() if "motion" in each}
+    times = [one for each in moved.values() for one in each]
+    for name in found if len(moved) > 1 else ():
+        if name not in moved:
+            with suppress(UserError):
+                found[name] = identify_axis(recording, name, model, engine, decimate, draw=draw, moved=times)
 
 
 def with_reasons(found: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
@@ -274,15 +294,17 @@ def identify_axis(
     advance: Callable[[], object] = lambda: None,
     *,
     draw: bool = False,
+    moved: Sequence[Sequence[float]] = (),
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
     is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
-    `advance` is called after each. `draw`: with the Allan deviation of the samples."""
+    `advance` is called after each. `draw`: with the Allan deviation of the samples. `moved`: stretches in which other
+    axes moved, seconds of the recording."""
     recording = recording.along(name)
     group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
     readings = look(recording, name, group)
-    readings = readings.without(moved_beside(recording, model, name, readings))
+    readings = readings.without([*moved, *moved_beside(recording, model, name, readings)])
     recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0

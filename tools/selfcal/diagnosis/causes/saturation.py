@@ -16,8 +16,11 @@ def _within(record: Record, axis: str, limit: float) -> bool:
 
 
 def _extend(at: Extension) -> None:
-    """A model file states one range for a group: not one that keeps another axis out that was looked at."""
+    """A model file states one range for a group, the same on both sides of zero: not one that keeps the axis itself
+    out, nor another one that was looked at."""
     limit = abs(at.finding.look.estimate["limit"]["median"])
+    if abs(at.record.axes[at.axis].level) >= limit:
+        return
     others = (other for other in at.group["axes"] if other != at.axis and other in at.found)
     if all(_within(at.record, other, limit) for other in others):
         at.group["range"] = digits(limit)
