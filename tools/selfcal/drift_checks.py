@@ -30,6 +30,8 @@ SIZES = (0.0, 0.7, 1.5, 3.0, 4.5)
 LN_SLOW = 1.8
 #: A jump is looked for where the record has this share of the information about the best known one.
 KNOWN = 0.05
+#: Nats by which a smaller drift must be the likelier one beside a column.
+CLEARLY = 3.0
 #: Intervals that are looked at; longer records are averaged further. Fewer show no drift.
 MOST, FEWEST = 4000, 60
 #: Smoothing and lags of a side channel and of another axis, s: a channel's own noise hides its slow change.
@@ -66,30 +68,29 @@ def drift_checks(
     )
     less = np.array([by for *_, by in drifts])
     drifting = bool(none[np.isfinite(less)].max(initial=-math.inf) > none[~np.isfinite(less)].max(initial=-math.inf))
-    gains = _of_drift(beside, less) - none.max() if drifting else np.zeros(len(columns))
-    of_channels, of_settling = gains[: len(channels)], gains[len(channels) :]
+
+    def strongest(places: slice) -> tuple[int, float]:
+        """Of some columns the one that gains most, and how much if the drift beside it is clearly smaller, else 0."""
+        full, smaller = (beside[where, places].max(axis=0, initial=-math.inf) for where in (less == 0.0, less > 0.0))
+        at = int(np.maximum(full, smaller).argmax())
+        return at, float(smaller[at] - none.max()) if drifting and smaller[at] > full[at] + CLEARLY else 0.0
+
     checks = {}
     if channels:
-        told = channels[int(of_channels.argmax())]
-        checks["channel"] = {**_outcome(of_channels.max(), len(channels)), "column": told.column, "form": told.form}
-    tau_s = settling[int(of_settling.argmax())] * series.dt
-    checks["turn_on"] = {**_outcome(of_settling.max(), len(settling)), "tau_s": tau_s}
+        at, gain = strongest(slice(len(channels)))
+        told = {"column": channels[at].column, "form": channels[at].form}
+        checks["channel"] = {**_outcome(gain, len(channels)), **told}
+    at, gain = strongest(slice(len(channels), None))
+    checks["turn_on"] = {**_outcome(gain, len(settling)), "tau_s": settling[at] * series.dt}
     gains = jumps.max(axis=0) - none.max()
     begin_s = recording.start_s + blocks.begin / recording.rate_hz
-    checks["jump"] = {**_outcome(gains.max(), series.n), "time_s": begin_s + int(gains.argmax()) * series.dt}
+    checks["jump"] = {**_outcome(float(gains.max()), series.n), "time_s": begin_s + int(gains.argmax()) * series.dt}
     return checks
-
-
-def _of_drift(value: Array, less: Array) -> Array:
-    """The best ln likelihood [k] at a smaller drift of `value` [drifts, k], -inf where the drift itself has a better
-    one: beside that column the law's drift is as large as without."""
-    smaller = value[(less > 0.0) & np.isfinite(less)].max(axis=0, initial=-math.inf)
-    return np.where(smaller > value[less == 0.0].max(axis=0, initial=-math.inf), smaller, -math.inf)
 
 
 def _outcome(gain: float, looks: int) -> dict[str, Any]:
     """A gain net of the search among so many, and of the longer tail that an uncertain drift leaves slow columns."""
-    worth = net(float(gain), 1, math.log(looks) + LN_SLOW)
+    worth = net(gain, 1, math.log(looks) + LN_SLOW)
     return {"value": worth, "limit": LEAST, "passed": worth <= LEAST, "deviations": math.sqrt(2.0 * worth)}
 
 

@@ -217,7 +217,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 told = f"{outcome['column']} ({outcome['form']}) explains {outcome['value']:.0f} nats of it"
                 failed.append(f"not adequate: {name}: channel: {told}: N, K and the bias include that")
             elif not outcome["passed"] and check == "turn_on":
-                told = f"a bias that settles within {outcome['tau_s']:.2g} s or so, by {outcome['value']:.0f} nats"
+                told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {outcome['value']:.0f} nats"
                 failed.append(f"not adequate: {name}: turn_on: {told}: K includes that")
             elif not outcome["passed"] and check == "jump":
                 told = f"the bias jumps at {outcome['time_s']:.6g} s, by {outcome['value']:.0f} nats"
