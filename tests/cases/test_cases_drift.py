@@ -78,8 +78,8 @@ def identified(path: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("effect", CHECKS)
 def test_what_is_no_drift_is_told(effect: str, tmp_path: Path) -> None:
-    """K is that of the effect, 5 times the truth and more, so `identify` must not call the axis adequate. One of 20 may be missed: a
-    rate of another window leaves some drift beside it."""
+    """K is that of the effect, 5 times the truth and more, so `identify` must not call the axis adequate.
+    One of 20 may be missed: a rate of another window leaves some drift beside it."""
     check, told = CHECKS[effect]
     records, missed = case_records(1, 20), 0
     for seed in range(records):
