@@ -833,7 +833,7 @@ class _Header:
             unit = stated
         asked = mapped or stated is not None or scaled is not None
         optional = not asked and name != "t" and name not in self.sensors
-        dates = dates and name == "t" and unit is None
+        dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
         broken = ("[" in name or "]" in name) and not mapped
