@@ -11,6 +11,7 @@
 
 #define BINS (SELFCAL_COLUMN_BINS + 2U)
 #define TWO_PI R(6.283185307179586)
+#define LIKELY 0.05F /* least probability of a law that may state a coefficient */
 
 static selfcal_wide_t interval_of(const selfcal_model_t *model) {
     return (selfcal_wide_t)model->dt_s / (selfcal_wide_t)model->block;
@@ -353,22 +354,19 @@ void selfcal_form(selfcal_former_t *self, uint32_t missing, const float sample[]
     }
 }
 
-void selfcal_mix_coefficients(const selfcal_report_t *report, const selfcal_model_t *model,
-                              const selfcal_coefficients_t coefficients[], float probability,
-                              selfcal_sent_coefficient_t sent[]) {
+void selfcal_widest_coefficients(const selfcal_report_t *report, const selfcal_model_t *model,
+                                 const selfcal_coefficients_t coefficients[], float probability,
+                                 selfcal_sent_coefficient_t sent[]) {
     for (uint8_t k = 0; k < model->regressors->count; k++) {
-        selfcal_wide_t weight = 0.0, mean = 0.0, square = 0.0;
+        sent[k].mean = NAN;
+        sent[k].sd = NAN;
         for (uint8_t h = 0; h < model->hypotheses; h++) {
-            const selfcal_wide_t p = (selfcal_wide_t)report->hypothesis[h].probability;
-            const selfcal_wide_t m = (selfcal_wide_t)coefficients[h].mean[k], s = (selfcal_wide_t)coefficients[h].sd[k];
-            if (p > 0.0 && isfinite(coefficients[h].mean[k])) {
-                weight += p;
-                mean += p * m;
-                square += p * (m * m + s * s);
+            const float mean = coefficients[h].mean[k], sd = coefficients[h].sd[k];
+            if (report->hypothesis[h].probability >= LIKELY && isfinite(mean) && !(sd <= sent[k].sd)) {
+                sent[k].mean = mean;
+                sent[k].sd = sd;
             }
         }
-        sent[k].mean = weight > 0.0 ? (float)(mean / weight) : NAN;
-        sent[k].sd = weight > 0.0 ? (float)sqrt(fmax(square / weight - (mean / weight) * (mean / weight), 0.0)) : NAN;
         sent[k].probability = probability;
     }
 }

@@ -121,13 +121,16 @@ def test_a_stretch_that_is_none_is_one_line(
 
 
 def test_a_stretch_has_the_answer_of_a_file_of_its_own(tmp_path: Path) -> None:
-    """The rows of 100 to 700 s alone in a file: the same numbers, to the last digit."""
+    """The rows of 100 to 700 s alone in a file: the same numbers, to the last digit. A jump has its time in the
+    recording."""
     columns = quiet(2, 10.0, 900.0)
     shaken(columns, 10.0, 0.0, 90.0)
     save(tmp_path / "whole.npz", columns, 10.0)
     save(tmp_path / "part.npz", {name: (unit, y[1000:7000]) for name, (unit, y) in columns.items()}, 10.0)
     part = identify(tmp_path / "part.npz")
     found = identify(tmp_path / "whole.npz", start_s=100.0, end_s=700.0)
+    for whole, alone in zip(found["axes"].values(), part["axes"].values(), strict=True):
+        assert whole["checks"]["jump"].pop("time_s") == pytest.approx(100.0 + alone["checks"]["jump"].pop("time_s"))
     assert found["axes"] == part["axes"]
     assert found["recording"]["start_s"] == 100.0 and found["recording"]["duration_s"] == 600.0
 

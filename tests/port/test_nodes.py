@@ -22,6 +22,7 @@ from selfcal.engines.library import Bank
 from selfcal.errors import UserError
 from selfcal.known_models import KnownModels
 from selfcal.model import Model
+from selfcal.one_over_f import with_white
 from selfcal.recording import Recording, load
 from selfcal.tables import make_tables
 from selfcal.verbs import monitor as monitor_module
@@ -67,11 +68,14 @@ def assert_result(axis: dict[str, Any], want: Any) -> None:
 
 
 def test_a_model_of_sums_goes_over_the_wire(tmp_path: Path) -> None:
-    """Six laws, three of them sums: the firmware's answer is the library's."""
+    """Six laws, three of them sums: the firmware's answer is the library's, N of 1/f noise beside it in both."""
     recording = load(part_of_shipped(tmp_path / "part.npz"))
     model = Model.load(SUMS)
     found = replay(tmp_path / "part.npz", axes=("gx",), model=SUMS, report_every=600.0, plot=tmp_path / "run.png")
-    assert_result(found["axes"]["gx"], library(recording, model, ("gx",))["gx"])
+    tables = make_tables(model, recording.rate_hz, ("gx",))
+    at = tables.dt_s, int(recording.duration_s / tables.dt_s), tables.block
+    want = with_white(library(recording, model, ("gx",))["gx"], model.group_of("gx"), *at)
+    assert_result(found["axes"]["gx"], want)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -209,8 +209,9 @@ def test_replay_is_the_library_over_the_wire(
         assert axis["samples_kept_out"]["missing"] == 70
         assert axis["adequate"] is alone["axes"][name]["adequate"]
         checks = {check: outcome["value"] for check, outcome in alone["axes"][name]["checks"].items()}
-        # the drift in an average, four of the innovations, averaging times from 2 to 64 s; the lattice if there is one
-        assert len(checks) - ("lattice" in checks) == 1 + 4 + 6
+        # the drift in an average, four of the innovations, averaging times from 2 to 64 s, three of the drift; the
+        # lattice if there is one
+        assert len(checks) - ("lattice" in checks) == 1 + 4 + 6 + 3
         assert {check: outcome["value"] for check, outcome in axis["checks"].items()} == pytest.approx(checks, abs=0.02)
     said = capfd.readouterr().err
     # 600 s, a report each 100 s, the last at the end of the recording: 6 of 46 + 6 x 52 frames, and the last status

@@ -18,6 +18,7 @@ from selfcal.diagnosis.fit import Series, run, shifts
 from selfcal.diagnosis.state import net
 from selfcal.diagnosis.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Terms
 from selfcal.forms import formed, slope, variance_of
+from selfcal.laws import Law
 from selfcal.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.result import AxisResult
 from selfcal.tables import Tables
@@ -54,10 +55,16 @@ def drift_checks(
 ) -> dict[str, dict[str, Any]]:
     """`channel`: which of the columns `others` explains most of the record, its `form`, and the evidence net of the
     search, nats. `turn_on`: the same of a bias that settles, by `tau_s`. `jump`: of one that jumps, at `time_s` of the
-    recording. Nothing where the record is too short, or no simple law has parameters."""
+    recording. Nothing where the record is too short, and where the likeliest law is no simple one: then the simple ones
+    leave a drift that any column may take."""
     series, cells = _series(blocks, tables)
     drifts = list(_drifts(result, tables, series.dt))
-    if series.n < FEWEST or not drifts:
+    likeliest = max(result.probability, key=lambda law: result.probability[law])
+    if (
+        series.n < FEWEST
+        or not drifts
+        or not any(_simple(one.law) and one.name == likeliest for one in tables.hypotheses)
+    ):
         return {}
     channels = list(_candidates(series, blocks.begin, tables.block * cells, recording, others))
     settling = [share * series.y.size for share in SETTLING]
@@ -127,11 +134,19 @@ def _series(blocks: Blocks, tables: Tables) -> tuple[Series, int]:
     return Series(mean, tables.dt_s * cells, r, np.ones((1, count)), block=tables.block * cells), cells
 
 
+def _simple(law: Law) -> bool:
+    """Whether a law is white noise and one open term at most, no oscillation."""
+    terms = law.terms
+    return (
+        not law.coloured_noise and len(terms) < 2 and not any(one.kind == "oscillation" or one.stated for one in terms)
+    )
+
+
 def _drifts(result: AxisResult, tables: Tables, dt: float) -> Iterator[tuple[Terms, Array, float]]:
     """Each law of one open term or none, at its posterior medians and smaller by exp() of the last; inf: no drift."""
     for one in tables.hypotheses:
         terms = one.law.terms
-        if one.law.coloured_noise or len(terms) > 1 or any(term.kind == "oscillation" or term.stated for term in terms):
+        if not _simple(one.law):
             continue
         at = {name: estimate.median for name, estimate in result.parameters[one.name].items()}
         if not all(math.isfinite(value) and value > 0.0 for value in at.values()):
