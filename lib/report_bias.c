@@ -68,6 +68,14 @@ static void begin_bias(const selfcal_work_t *work, selfcal_bias_t *bias) {
     bias->mean_sq = (selfcal_real_t)(work->sum.mass_sq / work->sum.mass);
 }
 
+/* Where the grid is far too coarse for huge readings, a node that counts may have its level beyond a float. Held there,
+ * squares of it are still floats. */
+#define LEVEL_MOST 1e17
+
+static selfcal_wide_t held(selfcal_wide_t level) {
+    return fmin(fmax(level, -LEVEL_MOST), LEVEL_MOST);
+}
+
 /* Without regressors in use. */
 static void now_plain(const selfcal_work_t *work, uint16_t k, selfcal_real_t sigma_sq, selfcal_node_view_t *v,
                       selfcal_now_t *now) {
@@ -77,7 +85,7 @@ static void now_plain(const selfcal_work_t *work, uint16_t k, selfcal_real_t sig
                          prior_precision = (selfcal_wide_t)sigma_sq * per_sd * per_sd,
                          offset = (selfcal_wide_t)selfcal_bank_from_prior(work->bank, work->axis);
     const selfcal_wide_t per_precision = 1.0 / ((selfcal_wide_t)v->a + prior_precision),
-                         level = ((selfcal_wide_t)v->b - offset * prior_precision) * per_precision;
+                         level = held(((selfcal_wide_t)v->b - offset * prior_precision) * per_precision);
     const selfcal_real_t variance = (selfcal_real_t)per_precision, x0 = (selfcal_real_t)level,
                          left = (selfcal_real_t)v->bias_left, lost = R(1.0) - left;
     now->mean = v->drift + level * (selfcal_wide_t)left;
@@ -116,6 +124,7 @@ void selfcal_bias_step(selfcal_work_t *work) {
     } else {
         now_plain(work, k, sigma_sq, &field.node, &now);
     }
+    now.mean = held(now.mean);
     if (first) {
         work->bias.about = now.mean;
     }
