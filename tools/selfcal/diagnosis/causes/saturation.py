@@ -7,6 +7,7 @@ import numpy as np
 from selfcal.diagnosis.cause import Cause, Extension, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
+from selfcal.readings import ROUNDED
 
 
 def _within(record: Record, axis: str, limit: float) -> bool:
@@ -19,7 +20,7 @@ def _extend(at: Extension) -> None:
     """A model file states one range for a group, the same on both sides of zero: not one that keeps the axis itself
     out, nor another one that was looked at."""
     limit = abs(at.finding.look.estimate["limit"]["median"])
-    if abs(at.record.axes[at.axis].level) >= limit:
+    if abs(at.record.axes[at.axis].level) > limit * (1.0 + ROUNDED):
         return
     others = (other for other in at.group["axes"] if other != at.axis and other in at.found)
     if all(_within(at.record, other, limit) for other in others):
