@@ -128,6 +128,39 @@ def since(recording: Mapping[str, Any]) -> str:
     return f" from {start_s:g} s on" if start_s else ""
 
 
+def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
+    """What a failed check of an axis in `unit` shows, and what helps."""
+    value = outcome["value"]
+    match check:
+        case "lattice":
+            step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {unit} apart"
+            return f"lattice: {step}: noise is below that, N includes the rounding, the bias may stick"
+        case "drift_in_average":
+            share = f"the drift hides {100.0 * value:.0f} % of the white noise"
+            return f"drift_in_average: {share}: average less, with a higher --decimate"
+        case "batch":
+            return f"{value:.1f} sd from the batch of the model's priors: identify it with the model without that batch"
+        case "outliers":
+            share = f"{100.0 * value:.2g} % of the readings are {outcome['at']:.6g} {unit}"
+            return f"outliers: {share}, too many for noise: lost words of the bus?"
+        case "held_samples":
+            share = f"{100.0 * value:.2g} % of the rows repeat the one before at no fixed rate"
+            return f"held_samples: {share}: log at the sensor's own rate"
+        case "motion":
+            times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
+            more = len(outcome["intervals"]) - TIMES_MOST
+            return f"motion, left out: {times}{f' and {more} more' if more > 0 else ''}"
+        case "channel":
+            told = f"{outcome['column']} ({outcome['form']}) explains {value:.0f} nats of it"
+            return f"channel: {told}: N, K and the bias include that"
+        case "turn_on":
+            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {value:.0f} nats"
+            return f"turn_on: {told}: K includes that"
+        case "jump":
+            return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {value:.0f} nats: K includes that"
+    return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
+
+
 def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
     """The table without the intervals of its last `left_out` columns, and the lines below it."""
     recording = document["recording"]
@@ -189,41 +222,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
         if counts:
             kept.append(f"kept out: {name}: {', '.join(counts)}")
-        for check, outcome in axis["checks"].items():
-            if not outcome["passed"] and check == "lattice":
-                step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {bias['unit']} apart"
-                meaning = "noise is below that, N includes the rounding, the bias may stick"
-                failed.append(f"not adequate: {name}: lattice: {step}: {meaning}")
-            elif not outcome["passed"] and check == "drift_in_average":
-                share = f"the drift hides {100.0 * outcome['value']:.0f} % of the white noise"
-                failed.append(
-                    f"not adequate: {name}: drift_in_average: {share}: average less, with a higher --decimate"
-                )
-            elif not outcome["passed"] and check == "batch":
-                distance = f"{outcome['value']:.1f} sd from the batch of the model's priors"
-                failed.append(f"not adequate: {name}: {distance}: identify it with the model without that batch")
-            elif not outcome["passed"] and check == "outliers":
-                share = f"{100.0 * outcome['value']:.2g} % of the readings are {outcome['at']:.6g} {bias['unit']}"
-                failed.append(f"not adequate: {name}: outliers: {share}, too many for noise: lost words of the bus?")
-            elif not outcome["passed"] and check == "held_samples":
-                share = f"{100.0 * outcome['value']:.2g} % of the rows repeat the one before at no fixed rate"
-                failed.append(f"not adequate: {name}: held_samples: {share}: log at the sensor's own rate")
-            elif not outcome["passed"] and check == "motion":
-                times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
-                more = len(outcome["intervals"]) - TIMES_MOST
-                times += f" and {more} more" if more > 0 else ""
-                failed.append(f"not adequate: {name}: motion, left out: {times}")
-            elif not outcome["passed"] and check == "channel":
-                told = f"{outcome['column']} ({outcome['form']}) explains {outcome['value']:.0f} nats of it"
-                failed.append(f"not adequate: {name}: channel: {told}: N, K and the bias include that")
-            elif not outcome["passed"] and check == "turn_on":
-                told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {outcome['value']:.0f} nats"
-                failed.append(f"not adequate: {name}: turn_on: {told}: K includes that")
-            elif not outcome["passed"] and check == "jump":
-                told = f"the bias jumps at {outcome['time_s']:.6g} s, by {outcome['value']:.0f} nats"
-                failed.append(f"not adequate: {name}: jump: {told}: K includes that")
-            elif not outcome["passed"] and not check.startswith("allan_"):
-                failed.append(f"not adequate: {name}: {check} {outcome['value']:+.3f}, beyond ±{outcome['limit']:.3f}")
+        failed += [
+            f"not adequate: {name}: {_why(check, outcome, bias['unit'])}"
+            for check, outcome in axis["checks"].items()
+            if not outcome["passed"] and not check.startswith("allan_")
+        ]
         off = [
             f"{check.removeprefix('allan_')} {100.0 * outcome['value']:+.0f} %"
             for check, outcome in axis["checks"].items()
