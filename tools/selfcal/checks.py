@@ -55,10 +55,8 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
         return Judged({}, None)
     if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
         return Judged({}, None)
-    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
-    explained = z @ coefficients_of(result) if used else 0.0
     curve = curve_of(
-        blocks.mean - explained,
+        _unexplained(blocks, tables, result, used),
         tables.dt_s,
         law,
         result.parameters[law],
@@ -75,6 +73,14 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
     return Judged({**hidden, **unlike, **checks, **(allan_checks(curve) if curve else {})}, curve)
 
 
+def _unexplained(blocks: Blocks, tables: Tables, result: AxisResult, used: Sequence[int]) -> NDArray[np.float64]:
+    """The blocks' means [m] less what the columns `used` explain."""
+    if not used:
+        return blocks.mean
+    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+    return np.asarray(blocks.mean - z @ coefficients_of(result))
+
+
 def with_drift(
     judged: Judged,
     blocks: Blocks,
@@ -84,15 +90,13 @@ def with_drift(
     others: Sequence[str],
     used: Sequence[int] = (),
 ) -> Judged:
-    """The same with the checks of the drift, where the others are made: `channel` and `jump` (drift_checks.py).
+    """The same with the checks of the drift, where the others are made: `channel`, `turn_on`, `jump` (drift_checks.py).
     `others`: the recording's columns that may act on the axis; `used`: the model's columns in use."""
     if not judged.checks or blocks.mean.size > MOST_DENSE:
         return judged
     from selfcal.drift_checks import drift_checks
 
-    if used:
-        z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
-        blocks = replace(blocks, mean=blocks.mean - z @ coefficients_of(result))
+    blocks = replace(blocks, mean=_unexplained(blocks, tables, result, used))
     return replace(judged, checks={**judged.checks, **drift_checks(blocks, tables, result, recording, others)})
 
 
