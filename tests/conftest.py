@@ -79,9 +79,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if CAMPAIGN > 1 or CASE_RECORDS or any("::" in argument for argument in config.args):
         return
     left, kept = long_tests()
-    gone = [i for i in items if i.nodeid not in kept and left & {i.nodeid, i.nodeid.partition("[")[0]}]
-    config.hook.pytest_deselected(items=gone)
-    items[:] = [item for item in items if item not in set(gone)]
+    long = {i for i in items if i.nodeid not in kept and left & {i.nodeid, i.nodeid.partition("[")[0]}}
+    config.hook.pytest_deselected(items=list(long))
+    items[:] = [item for item in items if item not in long]
 
 
 @pytest.hookimpl(wrapper=True)

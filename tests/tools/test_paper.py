@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,9 +16,11 @@ import pytest
 from scipy import signal
 
 from selfcal.allan import overlapping
+from selfcal.diagnosis.chart import Figure, Panel
 from selfcal.errors import UserError
 from selfcal.model import Model
 from selfcal.paper_figures import section3, section4, survey
+from selfcal.paper_figures.told import Told
 from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.studies.paper import paper, show
 from selfcal.verbs.identify import identify
@@ -83,12 +86,18 @@ def test_the_laws_of_figs_3_and_4_share_no_noise() -> None:
     assert abs(np.corrcoef(steps)[0, 1]) < 4.0 / math.sqrt(599)
 
 
+def panels_of(told: Told) -> Sequence[Panel]:
+    """The panels of a figure of one picture."""
+    assert isinstance(told.figures, Figure)
+    return told.figures.panels
+
+
 @pytest.mark.parametrize("law", section3.ALIKE)
 def test_the_true_curves(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean Allan variance and mean spectrum of 100 records lie within 4.5 standard errors of the true curves. Welch's
     window leaks a walk's power into its first bins, which the comparison leaves out."""
     monkeypatch.setattr(section3, "CHOICES", 1)
-    told = {one.name: one.figures.panels for one in section3.figures_3_and_4(1)}  # type: ignore[union-attr]
+    told = {one.name: panels_of(one) for one in section3.figures_3_and_4(1)}
     place = list(section3.SHOWN).index(law)
     records = [
         simulate_bank_samples(law, section3.ALIKE[law], 1.0, section3.ALIKE_SAMPLES, 5000 + k)[0] for k in range(100)
@@ -107,7 +116,7 @@ def test_the_first_figure_begins_at_the_prior_and_has_the_papers_instants() -> N
     """At 0 half of the choices are wrong, and the rms of a uniform prior is its width / sqrt(12)."""
     model = Model.load(section3.PAPER)
     rows = [row for law in model.hypotheses for row in section3.rows_of(model, (law, 3))]
-    curve = section3.figure_1(rows).figures.panels[0].curves[0]  # type: ignore[union-attr]
+    curve = panels_of(section3.figure_1(rows))[0].curves[0]
     assert {0, 100, 200, 300, 400, 500, 600, 1000} <= set(curve.x.tolist())
     assert curve.y[0] == 0.5
     start = next(row for row in rows if row["t"] == 0 and row["law"] == "gauss_markov")
